@@ -78,6 +78,17 @@ def check_fields(settings: Any, check: Callable[..., float], names: Sequence[str
             object.__setattr__(settings, name, check(name, value, unit))
 
 
+def numbers_of(value: Any) -> NDArray[Any] | None:
+    """A copy as an array of real numbers in their own dtype, finite or not; None where they are none."""
+    try:
+        array = np.array(value)
+        if array.dtype.kind == "O":  # numbers of other libraries
+            array = array.astype(np.float64)
+    except (TypeError, ValueError):  # of no numbers, or of lists that are no array
+        return None
+    return array if array.dtype.kind in "fiub" else None
+
+
 def float_array(name: str, value: ArrayLike) -> Array:
     """The value as float64, any shape, finite or not."""
     try:

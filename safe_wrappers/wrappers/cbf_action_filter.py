@@ -1,10 +1,8 @@
 """CBFActionFilter: executes the policy's action, or one near it that every constraint admits, or a fallback."""
 
 import copy
-import inspect
 import math
 import time
-import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -23,10 +21,9 @@ from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, warn_caller
 from safe_wrappers.wrappers.common.receiver import action_array
 
-_WRAPPERS = __name__.rpartition(".")[0]
 SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""
 
@@ -269,14 +266,11 @@ class CBFActionFilter(LayerWrapper):
         return margin, unsafe
 
     def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
-        """Warn once per episode (unsafe) or filter, at the line that called the outermost of our wrappers."""
+        """Warn once per episode (unsafe) or filter."""
         if what in self.warned:
             return
         self.warned.add(what)
-        level, frame = 1, inspect.currentframe()
-        while frame is not None and str(frame.f_globals.get("__name__")).startswith(_WRAPPERS):
-            level, frame = level + 1, frame.f_back
-        warnings.warn(message, category, stacklevel=level)
+        warn_caller(message, category)
 
 
 def _unique(kinds: list[str]) -> list[str]:

@@ -1,7 +1,6 @@
 """ChunkHandover: from the chunks of a policy to one stream of commands with a bounded rate."""
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -9,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, settings_from
+from safe_wrappers.checks import non_negative, numbers_of, settings_from
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
 from safe_wrappers.deprecation import deprecated_parameters
@@ -24,7 +23,7 @@ from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_mode
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng, warn_caller
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs
@@ -227,10 +226,10 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     def _checked(self, action: Any) -> Array:
         expected = f"expected a chunk of shape {self.action_space.shape}"
-        try:
-            chunk = np.array(action, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ActionError(f"{expected}, got {action!r}") from None
+        given = numbers_of(action)
+        if given is None:
+            raise ActionError(f"{expected}, of numbers, got {action!r}")
+        chunk = given.astype(np.float64)
         if self.chunk_size == 1 and chunk.shape == (self._controls,):
             return chunk[None]  # an ordinary policy's action
         if chunk.shape != self.action_space.shape:
@@ -282,7 +281,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         if limited and not self._warned:
             self._warned = True
             message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
-            warnings.warn(message, UserWarning, stacklevel=3)
+            warn_caller(message)
         return {
             keys.HANDOVER_SEAM_JUMP: jump,
             keys.HANDOVER_PEAK_JERK: peak,

@@ -61,7 +61,7 @@ class CostFunction(LayerWrapper):
 
     def step(self, action: Any) -> Step:
         """Steps the env and judges where it is now."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self._pass_on(action)
         self._judge(info)
         return observation, reward, terminated, truncated, info
 

@@ -188,7 +188,7 @@ class OcclusionPenalty(LayerWrapper):
 
     def step(self, action: Any) -> Step:
         """Step the env with the action as it is, and look."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self._pass_on(action)
         elapsed = self._elapsed()
         self.tracking.advance(elapsed)
         self._sight.read(self._raw.data)

@@ -134,7 +134,7 @@ class RecordInterventions(LayerWrapper):
 
     def step(self, action: Any) -> Step:
         """Step the env; its info gains the running counts, and the summary at the episode's end."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self._pass_on(action)
         self._steps += 1
         penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
         self._return += float(reward) + float(penalties)

@@ -85,7 +85,7 @@ class SafetyOverlay(LayerWrapper):
         """Step the env; a window is drawn meanwhile."""
         if self.render_mode == "human":
             self._prepare()
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self._pass_on(action)
         self._last = dict(info)
         self._strip.add(info)
         return observation, reward, terminated, truncated, info

@@ -19,12 +19,13 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, CBFActionFilter
+from safe_wrappers.wrappers.common.episode_guard import EpisodeGuard
 from safe_wrappers.wrappers.common.receiver import action_array
 
 Mask = NDArray[np.bool_]
 
 
-class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
+class VectorCBFActionFilter(EpisodeGuard, VectorWrapper[Any, Any, Any, Any, Any]):
     """Filters the actions of all envs of a `SyncVectorEnv`.
 
     Every env has a `CBFActionFilter` of its own beside it, with the same guarantees; its executed actions are the

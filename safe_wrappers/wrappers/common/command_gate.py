@@ -1,6 +1,5 @@
 """CommandGate: base of the wrappers that decide whether a command or the fallback is executed."""
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step, warn_caller
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver
 
 
@@ -51,7 +50,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
         if not finite and not self._warned:
             self._warned = True
             message = f"the {whose} action is not finite ({numbers}); {consequence}"
-            warnings.warn(message, UserWarning, stacklevel=4)
+            warn_caller(message)
         return finite
 
     def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:

@@ -1,5 +1,7 @@
 """LayerWrapper: base of this library's wrappers; and random numbers for them."""
 
+import inspect
+import warnings
 import zlib
 from collections.abc import Mapping
 from typing import Any, ClassVar, SupportsFloat
@@ -8,10 +10,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.checks import numbers_of
+from safe_wrappers.errors import ActionError, UnsupportedEnvError
 from safe_wrappers.plants.default import PlantTemplate
+from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.serialize import recorded
 from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.wrappers.common.episode_guard import EpisodeGuard
 
 Array = NDArray[np.float64]
 Env = gym.Env[Any, Any]
@@ -21,7 +26,10 @@ Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 """What `step` returns: observation, reward, terminated, truncated and info."""
 
 
-class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+_WRAPPERS = __name__.rpartition(".common.")[0]
+
+
+class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
     """A wrapper with a place in the stack, whose arguments are recorded in the env's spec."""
 
     layer: ClassVar[Layer]
@@ -30,12 +38,32 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         refuse_vector_env(env, type(self).__name__)
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
+        innermost = not any(isinstance(inner, LayerWrapper) for inner in wrappers_of(env))
+        self._passes_numbers = innermost and isinstance(env.action_space, gym.spaces.Box)
+
+    def _pass_on(self, action: Any) -> Step:
+        """Step the env with an action that this wrapper only passes on, to the env itself if it is finite."""
+        if self._passes_numbers:
+            given = numbers_of(action)
+            if given is None or not np.isfinite(given).all():
+                raise ActionError(
+                    f"expected an action of finite numbers, got {action!r}; the env was not stepped"
+                )
+        return self.env.step(action)
 
     def _record(self, arguments: Mapping[str, Any], **plain: Any) -> None:
         """Record the constructor's arguments (its `locals()`), some as plain data; a plant as a template."""
         if plain.get("plant") is not None:
             plain["plant"] = PlantTemplate(plain["plant"])
         gym.utils.RecordConstructorArgs.__init__(self, **recorded(arguments, **plain))
+
+
+def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line that called the outermost of this library's wrappers."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and str(frame.f_globals.get("__name__")).startswith(_WRAPPERS):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
 
 
 def refuse_vector_env(env: Any, name: str) -> None:

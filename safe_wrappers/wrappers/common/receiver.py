@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import numbers_of
 from safe_wrappers.deprecation import deprecated_attribute, deprecated_method
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
@@ -70,11 +71,9 @@ def receiver_inside(env: Env) -> CommandReceiver | None:
 
 def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None) -> NDArray[Any]:
     """A copy of an action, in its own dtype unless told; an `ActionError` for another shape or no numbers."""
-    try:
-        given = np.array(action, dtype)
-        given.astype(np.float64, copy=False)
-    except (TypeError, ValueError):
-        raise ActionError(f"expected an action of shape {shape}, got {action!r}") from None
+    given = numbers_of(action)
+    if given is None:
+        raise ActionError(f"expected an action of shape {shape}, of numbers, got {action!r}")
     if given.shape != shape:
         raise ActionError(f"expected an action of shape {shape}, got shape {given.shape}")
-    return given
+    return given if dtype is None else given.astype(dtype, copy=False)

@@ -1,6 +1,5 @@
 """StepMonitor: base of the monitors, which look at the physics of every control step and change nothing."""
 
-import warnings
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
@@ -9,7 +8,7 @@ import mujoco
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.replay import Replay
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step, warn_caller
 
 
 class StepMonitor(LayerWrapper, ABC):
@@ -36,7 +35,7 @@ class StepMonitor(LayerWrapper, ABC):
     def step(self, action: Any) -> Step:
         """Step the env, and look at the physics of that step."""
         self._replay.before()
-        answer = self.env.step(action)
+        answer = self._pass_on(action)
         raw: Any = self.unwrapped
         self._begin(raw.model)
         whole = self._replay.after(self._visit)
@@ -66,4 +65,4 @@ class StepMonitor(LayerWrapper, ABC):
                 f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
                 f"substeps, or MuJoCo has reset it; only the contacts left behind are read (info[{self.partial!r}])"
             )
-            warnings.warn(message, UserWarning, stacklevel=3)
+            warn_caller(message)

@@ -76,7 +76,7 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
             self._last = arrived.action
         if self._inside is not None:
             self._inside.set_observation_time(None if arrived is None else arrived.observed_s)
-        observation, reward, terminated, truncated, info = self.env.step(copy.copy(self._last))
+        observation, reward, terminated, truncated, info = self._pass_on(copy.copy(self._last))
         self._steps_done += 1
         self._observed_s = self.now_s
         info[keys.FAULT_ACTIVE] = bool(active or (self._nested and info[keys.FAULT_ACTIVE]))

@@ -40,7 +40,7 @@ class ActionRepeat(LayerWrapper):
         """Step the env with the same action until `repeat` control steps are made or the episode ends."""
         total, infos = 0.0, []
         for _ in range(self.repeat):
-            observation, reward, terminated, truncated, info = self.env.step(action)
+            observation, reward, terminated, truncated, info = self._pass_on(action)
             total += float(reward)
             infos.append(info)
             if terminated or truncated:

@@ -107,7 +107,7 @@ class FilterObservation(LayerWrapper):
 
     def step(self, action: Any) -> Step:
         """Step the env, and look at the state that it has reached as the filter will."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self._pass_on(action)
         if self._acts:
             correction = info[keys.EXECUTED_ACTION] - info[keys.PROPOSED_ACTION]
         else:

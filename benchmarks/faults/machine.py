@@ -1,0 +1,181 @@
+"""Faults of the machine: a plant that is wrong, a sensor that is silent, a clock that is set."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+
+import mujoco
+import numpy as np
+
+import safe_wrappers as sw
+from benchmarks.faults.outcomes import Found, Outcome, flags, judged, reached_wrongly
+from benchmarks.faults.stacks import BEFORE, Answer, Row, Session
+from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, filter_inside
+from safe_wrappers.wrappers.common.receiver import CommandReceiver
+
+Cell = Callable[[Session], Found]
+_PARTS = {
+    "mass": ("body_mass", "body_inertia"),
+    "damping": ("dof_damping",),
+    "friction": ("geom_friction", "pair_friction"),
+}
+_WRONG = 0.2
+_SET_S = 100.0
+
+
+def _plant(what: str, factor: float) -> Callable[[Row], Cell]:
+    """The env is another machine than the filter's plant, whose limit is judged with the right one."""
+
+    def cell(row: Row) -> Cell:
+        def run(session: Session) -> Found:
+            session = row.open()
+            inside = None if hasattr(session.env, "filters") else filter_inside(session.env)
+            raw = session.raw()
+            if inside is None:
+                return Found(Outcome.NOT_APPLICABLE, "it forecasts nothing for the robot")
+            if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or inside.plant.simulates:
+                return Found(Outcome.NOT_APPLICABLE, "its plant is the env itself, or no MuJoCo model")
+            if what == "delay":
+                return _late(session, inside)
+            for name in _PARTS[what]:
+                getattr(raw.model, name)[:] *= factor
+            mujoco.mj_setConst(raw.model, mujoco.MjData(raw.model))
+            return _limits_kept(session, inside)
+
+        return run
+
+    return cell
+
+
+def _late(session: Session, inside: Any) -> Found:
+    """The env acts without a delay, and the plant believes in one."""
+    inside.plant.delay_s = _WRONG * inside.plant.control_dt
+    inside.plant.bind(inside.env)
+    return _limits_kept(session, inside)
+
+
+def _limits_kept(session: Session, inside: Any) -> Found:
+    judge = sw.CBFActionFilter(inside.env, inside.constraints)
+    session.begin(0)
+    judge.filter.start()
+    violated, flagged = 0, True
+    pending = False
+    for action in session.actions:
+        answer = session.step(action)
+        if answer.error is not None:
+            return Found(Outcome.CRASHED, f"{type(answer.error).__name__}: {answer.error}")
+        wrong = reached_wrongly(session, [answer])
+        if wrong is not None:
+            return wrong
+        said = bool(flags(answer.info, {"cbf/intervened": True}))
+        if pending and not said:
+            flagged = False
+        judge.filter.executed(answer.info["executed_action"])
+        judge.filter.observe()
+        pending = not judge.filter.margin >= -SAFE_TOLERANCE and not said
+        violated += not judge.filter.margin >= -SAFE_TOLERANCE
+        if session.ended(answer):
+            break
+    if not violated:
+        return Found(Outcome.KEPT)
+    return Found(Outcome.FLAGGED if flagged else Outcome.SILENT, f"{violated} states outside the limit")
+
+
+def _silent(row: Row) -> Cell:
+    """Nothing arrives at a receiver, nothing is seen by a camera, a published fact is gone."""
+
+    def run(session: Session) -> Found:
+        session.begin()
+        usual = row.open().begin()
+        receivers = [one for one in session.layers() if isinstance(one, CommandReceiver)]
+        cameras = [one for one in session.layers() if isinstance(one, sw.OcclusionPenalty)]
+        published = _published(row)
+        if not (receivers or cameras or published):
+            return Found(Outcome.NOT_APPLICABLE, "it reads the simulation's own state")
+        for camera in cameras:
+            camera._sight.sees = lambda points, bodies: np.zeros(len(points), dtype=bool)
+        if not (receivers or cameras):
+            session.bottoms[0].__dict__.update(dict.fromkeys(published))
+        found = Found(Outcome.HARMLESS, "and was not needed")
+        for action in session.actions[BEFORE:]:
+            for receiver in receivers[:1]:
+                receiver.set_observation_time(None)
+            expected = usual.step(action)
+            answer = session.step(action)
+            found = judged(row, session, answer, expected, None)
+            if found.outcome is Outcome.SILENT and cameras:
+                found = _seen_in_info(answer.info)
+            if found.outcome is not Outcome.HARMLESS or session.ended(answer):
+                break
+        for name in published:
+            session.bottoms[0].__dict__.pop(name, None)
+        for camera in cameras:
+            del camera._sight.sees
+        return found
+
+    return run
+
+
+def _seen_in_info(info: dict[str, Any]) -> Found:
+    visible = np.any(info["occlusion/visible"])
+    return Found(
+        Outcome.SILENT if visible else Outcome.FLAGGED, "occlusion/visible is False, occlusion/sigma grows"
+    )
+
+
+def _published(row: Row) -> list[str]:
+    """The attributes of the env that the constraints read."""
+    session = row.open()
+    asked: list[str] = []
+    for plant in {id(engine.plant): engine.plant for engine in session.engines()}.values():
+        real = plant.attribute
+        plant.attribute = lambda name, real=real: (asked.append(name), real(name))[1]
+    session.begin(1)
+    return sorted(name for name in set(asked) if hasattr(session.raw(), name))
+
+
+def _clock(by_s: float) -> Callable[[Row], Cell]:
+    """The clocks of the machine, of the simulation, and of who stamps commands."""
+
+    def cell(row: Row) -> Cell:
+        def run(session: Session) -> Found:
+            session.begin()
+            receiver = next((one for one in session.layers() if isinstance(one, CommandReceiver)), None)
+            action = session.actions[BEFORE]
+            if receiver is not None:
+                receiver.set_observation_time(receiver.now_s + by_s)
+            _set_time(session, by_s)
+            counter = time.perf_counter
+            with mock.patch.object(time, "perf_counter", lambda: counter() + by_s):
+                answer = session.step(action)
+
+            def alone() -> Answer:
+                bare = row.bare().begin()
+                _set_time(bare, by_s)
+                return bare.step(action)
+
+            return judged(row, session, answer, row.open().begin().step(action), alone)
+
+        return run
+
+    return cell
+
+
+def _set_time(session: Session, by_s: float) -> None:
+    raw = session.raw()
+    if hasattr(raw, "data"):
+        raw.data.time += by_s
+
+
+def machine(row: Row) -> dict[tuple[str, str], Cell]:
+    """The cells of a row."""
+    cells: dict[tuple[str, str], Cell] = {}
+    for what in _PARTS:
+        for factor in (1.0 - _WRONG, 1.0 + _WRONG):
+            cells[f"{what} 20 % wrong", f"times {factor:g}"] = _plant(what, factor)(row)
+    cells["delay 20 % wrong", ""] = _plant("delay", 1.0)(row)
+    cells["sensor silent", ""] = _silent(row)
+    cells["clock set back", ""] = _clock(-_SET_S)(row)
+    cells["clock set forward", ""] = _clock(_SET_S)(row)
+    return cells
