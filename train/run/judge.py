@@ -67,17 +67,18 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         observation, info = self.env.reset(seed=seed, options=options)
         self._plant.executed(None)
         self._memories = [constraint.start() for constraint in self._constraints]
-        self._judge(info)
+        self._judge(observation, info)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Steps the env and judges where it is now."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._judge(info)
+        self._judge(observation, info)
         return observation, reward, terminated, truncated, info
 
-    def _judge(self, info: dict[str, Any]) -> None:
+    def _judge(self, observation: Any, info: dict[str, Any]) -> None:
         refuse_own_cost(self.unwrapped, info)
+        self._plant.received(observation, info)
         self._plant.observe()
         cost, still = 0.0, np.zeros(self._plant.lower.size)
         for i, constraint in enumerate(self._constraints):

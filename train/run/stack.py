@@ -11,7 +11,7 @@ from stable_baselines3.common.monitor import Monitor
 
 import safe_wrappers
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.cost_function import CostFunction
@@ -56,8 +56,12 @@ def make_stack(
     check_env_id(env.id)  # a spawned process has not yet registered what the first one did
     try:
         task: gym.Env[Any, Any] = gym.make(env.id, **kwargs)
-    except (TypeError, gym.error.Error, ImportError) as error:
-        raise ConfigurationError(f"env: {env.id} with kwargs {kwargs} cannot be made: {error}") from error
+    except SafeWrappersError:
+        raise
+    except Exception as error:  # whatever a task's own constructor says of its arguments
+        raise ConfigurationError(
+            f"env: {env.id} with kwargs {kwargs} cannot be made: {type(error).__name__}: {error}"
+        ) from error
     if env.cost is not None:
         task = CostFunction(task, _function(env.cost, "env.cost"))
     if env.judge is not None:

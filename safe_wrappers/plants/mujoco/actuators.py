@@ -249,6 +249,8 @@ class AffineActuators(Remade):
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
         """Length and velocity of the transmissions where the joints alone determine every clamp, else None."""
         m = self._model
+        if not m.njnt:
+            return None
         if self._on_joints is None:
             depends = m.actuator_biasprm[:, 1:3].any(axis=1) | m.actuator_gainprm[:, 1:3].any(axis=1)
             depends &= m.actuator_forcelimited.astype(bool)
