@@ -13,18 +13,17 @@ the filter changed the action.
 """
 
 import argparse
-import json
 import multiprocessing
 import time
 import warnings
 from collections.abc import Iterable
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks import chunks
 from benchmarks.cases import CASES, HARD, PROTECTED, Case
 from benchmarks.descriptions import constrained, promised, reserve
 from safe_wrappers.errors import UnsafeStateWarning
@@ -230,30 +229,13 @@ def main() -> None:
     name = "protected_hard" if arguments.hard else "protected"
     arguments.results.mkdir(parents=True, exist_ok=True)
     path = arguments.results / f"{name}.jsonl"
-    known = _known(path) if arguments.resume else {}
-    rows = {job: known[job] for job in wanted if job in known}
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
-    left = [job for job in wanted if job not in rows]
-    with ExitStack() as stack:
-        file = stack.enter_context(path.open("a"))
-        done: Iterable[dict[str, Any]] = map(run, left)
-        if arguments.workers > 1:
-            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(arguments.workers))
-            done = pool.imap(run, left)
-        for job, row in zip(left, done, strict=True):
-            rows[job] = row
-            file.write(json.dumps(row) + "\n")
-            file.flush()
+    found = chunks.known(path, Job) if arguments.resume else {}
+    kept = {job: found[job] for job in wanted if job in found}
+    rows = chunks.measured(path, wanted, run, arguments.workers, kept)
     ordered = [rows[job] for job in wanted]
     text = table_of_drivers(ordered) if arguments.hard else table_of_envs(cases, ordered)
     (arguments.results / f"{name}.md").write_text(text + "\n")
     print(text)
-
-
-def _known(path: Path) -> dict[Job, dict[str, Any]]:
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    found = [json.loads(line) for line in lines if line.endswith("\n")]  # a killed run's last one may be cut
-    return {Job(**{key: row[key] for key in Job.__dataclass_fields__}): row for row in found}
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ SCALES: Final = {
     "Reacher-v5": 5.0,  # rad/s, the limit
     "SafeHalfCheetahVelocity-v0": 3.2096,  # m/s, the limit
 }
-"""Env id -> a margin that is far from the limit, in the unit of h."""
+"""Env id -> a margin that is far from the limit, in the unit of h; 1 m for others."""
 NEARNESS: Final = 0.1
 """Reward of a step that begins at the limit; a violation is 1."""
 DECADES: Final = 4.0
@@ -47,8 +47,8 @@ DECADES: Final = 4.0
 EPISODES: Final = 20
 _FIRST_SEED: Final = 1_000_000
 """Of the evaluation: no training episode has it."""
-_FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
-_EXAMPLES: Final = 20
+FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
+EXAMPLES: Final = 20
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class Tally:
         least = [t.smallest for t in (self, other) if t.smallest is not None]
         sums = {
             name: getattr(self, name) + getattr(other, name)
-            for name in ("steps", "violations", "unflagged", *_FLAGS)
+            for name in ("steps", "violations", "unflagged", *FLAGS)
         }
-        examples = (self.examples + other.examples)[:_EXAMPLES]
+        examples = (self.examples + other.examples)[:EXAMPLES]
         return Tally(**sums, smallest=min(least, default=None), examples=examples)
 
 
@@ -90,7 +90,7 @@ class Adversary(gym.Wrapper[Any, Any, Any, Any]):
     """Pays for violations and nearness instead of the task, and counts.
 
     Args:
-        env_id: One of `SCALES`.
+        env_id: One of `SCALES`, or another of `cases.CASES`.
         filtered: Through `protect`; without it there is no nearness and no flag.
 
     Attributes:
@@ -101,7 +101,7 @@ class Adversary(gym.Wrapper[Any, Any, Any, Any]):
         case = CASES[env_id]
         bare = case.make()
         super().__init__(case.protect(bare) if filtered else bare)
-        self._filtered, self._scale = filtered, SCALES[env_id]
+        self._filtered, self._scale = filtered, SCALES.get(env_id, 1.0)
         self._judge = case.judge(self.unwrapped)
         self.tally = Tally()
 
@@ -119,14 +119,14 @@ class Adversary(gym.Wrapper[Any, Any, Any, Any]):
         tally.violations += int(violated)
         reward = float(violated)
         if self._filtered:
-            for name in _FLAGS:
+            for name in FLAGS:
                 setattr(tally, name, getattr(tally, name) + int(info[f"cbf/{name}"]))
             margin = float(info["cbf/margin"])
             tally.smallest = margin if tally.smallest is None else min(tally.smallest, margin)
             reward += NEARNESS * nearness(margin, self._scale)
             if violated and not (info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]):
                 tally.unflagged += 1
-                if len(tally.examples) < _EXAMPLES:
+                if len(tally.examples) < EXAMPLES:
                     names = {"qpos": before[0], "qvel": before[1], "missed": missed, "margin": margin}
                     actions = {"proposed": np.asarray(action).tolist(), "executed": executed.tolist()}
                     tally.examples.append(names | actions | {"stage": int(info["cbf/stage"])})
@@ -157,7 +157,8 @@ def run(job: Job, minutes: float | None = None, episodes: int = EPISODES) -> dic
     made = [Adversary(job.env) for _ in range(4)]
     envs = VecNormalize(DummyVecEnv([lambda env=env: env for env in made]), gamma=0.99)  # type: ignore[misc]
     settings = {"n_steps": 512, "batch_size": 256, "n_epochs": 10, "learning_rate": 3e-4, "gamma": 0.99}
-    model = PPO("MlpPolicy", envs, seed=job.seed, device="cpu", **settings)
+    policy = "MultiInputPolicy" if isinstance(envs.observation_space, gym.spaces.Dict) else "MlpPolicy"
+    model = PPO(policy, envs, seed=job.seed, device="cpu", **settings)
     begin = time.monotonic()
     model.learn(job.steps, callback=None if minutes is None else Deadline(60.0 * minutes))
     training = Tally()
@@ -203,7 +204,7 @@ def table(rows: list[dict[str, Any]]) -> str:
                 f"{t['unflagged']:,}",
                 f"{t['smallest'] or 0.0:.3g}",
                 f"{t['intervened'] / max(t['steps'], 1):.1%}",
-                *(f"{t[name]:,}" for name in _FLAGS[1:]),
+                *(f"{t[name]:,}" for name in FLAGS[1:]),
             ]
             lines.append("| " + " | ".join(counts + (["-"] * 6 if part == "unfiltered" else filtered)) + " |")
     filtered_parts = [row[part] for row in rows for part in list(parts)[:-1]]
