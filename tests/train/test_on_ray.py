@@ -4,15 +4,18 @@ import io
 import json
 import threading
 import time
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.cli import main
+from safe_wrappers.train.config import read_config
 from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
 from safe_wrappers.train.processes.job import Job
 from safe_wrappers.train.processes.parallel import RunsFailedError, run_jobs
+from safe_wrappers.train.sweep import sweep_experiment
 from safe_wrappers.train.tables import read_rows
 
 ray = pytest.importorskip("ray", reason="ray is not installed: pip install 'safe-wrappers[ray]'")
@@ -116,6 +119,22 @@ def test_a_run_that_nobody_wants_saves_and_ends(cluster, fake_experiment):
         jobs, 1, console(), "T", unwanted=lambda _: len(read_rows(folder / "episodes.csv")) > 20, on="ray"
     )
     assert list(folder.glob("checkpoints/step_*"))
+
+
+@pytest.mark.slow
+def test_a_sweep_tries_on_a_cluster_what_it_tries_here(cluster, tmp_path):
+    pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")
+    overrides = ["total_steps=128", "seeds=[0]", "evaluation.episodes=1", "workers=2"]
+    rate = {"hyperparameters.learning_rate": {"low": 1e-5, "high": 1e-2, "log": True}}
+    searched = {
+        **read_config(Path(FAKE), overrides),
+        "sweep": {"parameters": rate, "trials": 4, "at_once": 2},
+    }
+    tables = []
+    for name, on in (("there", "ray"), ("here", None)):
+        sweep_experiment({**searched, "output": str(tmp_path / name)}, Path(FAKE), (), console(), on)
+        tables.append((tmp_path / name / "fake" / "sweep" / "sweep.csv").read_text())
+    assert tables[0] == tables[1] and tables[0].count("at cost zero") == 2
 
 
 @pytest.mark.parametrize("on", ["slurm", "ray:", "rays"])

@@ -103,6 +103,26 @@ def test_a_study_of_other_settings_is_refused_but_for_more_trials(tmp_path, in_p
     assert len(rows(tmp_path)) == 2
 
 
+def test_a_study_lies_where_its_storage_says_and_another_sweep_may_lie_there_too(tmp_path, in_process):
+    storage = f"sqlite:///{tmp_path}/studies.db"
+    sweep_experiment(settings(tmp_path / "own", trials=2), FAKE, (), QUIET)
+    sweep_experiment(settings(tmp_path / "a", trials=2, storage=storage), FAKE, (), QUIET)
+    sweep_experiment({**settings(tmp_path / "a", storage=storage, trials=1), "name": "b"}, FAKE, (), QUIET)
+    assert not list((tmp_path / "a").rglob("study.db"))
+    assert set(optuna.get_all_study_names(storage)) == {"b", "fake"}
+    assert rows(tmp_path / "a") == rows(tmp_path / "own")
+
+
+@pytest.mark.parametrize(
+    "storage", ["studies", "sqlite:////no/such/folder/studies.db", "oracle://host/studies"]
+)
+def test_a_storage_that_cannot_be_opened_is_told_with_its_url(tmp_path, in_process, storage):
+    with pytest.raises(
+        ConfigurationError, match=rf"sweep.storage: '{storage}' cannot be opened \(.*sqlite:////"
+    ):
+        sweep_experiment(settings(tmp_path, storage=storage), FAKE, (), QUIET)
+
+
 def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_process, monkeypatch):
     run = batch.run_jobs
 

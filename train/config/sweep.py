@@ -79,5 +79,5 @@ class SweepConfig(Section):
     seed: NonNegative = 0
     """Of the search."""
     storage: str | None = None
-    """URL of a database server that keeps the study (`postgresql://...`); by default `sweep/study.db` in the
-    experiment's folder."""
+    """URL of the database that keeps the study, as SQLAlchemy has it (`postgresql://...`, `sqlite:///...`); by
+    default `sweep/study.db` in the experiment's folder."""

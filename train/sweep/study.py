@@ -41,15 +41,23 @@ def open_study(space: Space, folder: Path) -> optuna.Study:
         folder: The sweep's own folder.
 
     Raises:
+        ConfigurationError: There is no such storage.
         RunStateError: The study there is another sweep's; shows what differs.
     """
     import optuna
+    from sqlalchemy.exc import SQLAlchemyError
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = space.config.storage or f"sqlite:///{(folder / STUDY_FILE).resolve()}"
-    study = optuna.create_study(
-        storage=storage, study_name=space.experiment.name, direction="maximize", load_if_exists=True
-    )
+    try:
+        study = optuna.create_study(
+            storage=storage, study_name=space.experiment.name, direction="maximize", load_if_exists=True
+        )
+    except (SQLAlchemyError, ImportError) as error:
+        raise ConfigurationError(
+            f"sweep.storage: {storage!r} cannot be opened ({str(error).splitlines()[0]}); expected a URL as"
+            " SQLAlchemy has it, such as postgresql://user@host/studies with its driver installed, or sqlite:////folder/studies.db"
+        ) from error
     theirs, ours = study.user_attrs.get(_IDENTITY), space.identity
     if theirs is None:
         study.set_user_attr(_IDENTITY, ours)
