@@ -151,7 +151,7 @@ def in_a_fork(work: Callable[[], int], log: Path) -> int:
     try:
         os._exit(work())
     except BaseException:
-        traceback.print_exc()
+        os.write(2, traceback.format_exc().encode())
         os._exit(70)
 
 
