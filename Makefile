@@ -109,6 +109,7 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.whole_body
 	$(BIN)/python -m benchmarks.balance
 	$(BIN)/python -m benchmarks.teleop
+	$(BIN)/python -m benchmarks.kills
 	$(BIN)/python -m benchmarks.scaling
 	$(BIN)/python -m benchmarks.wrapper_cost
 	$(BIN)/python -m benchmarks.occlusion_cost

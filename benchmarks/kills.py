@@ -151,7 +151,7 @@ def in_a_fork(work: Callable[[], int], log: Path) -> int:
     try:
         os._exit(work())
     except BaseException:
-        traceback.print_exc()
+        os.write(2, traceback.format_exc().encode())
         os._exit(70)
 
 
@@ -410,7 +410,7 @@ def main() -> None:
     while sum(len(each["kills"]) for each in rounds) < options.kills:
         number = len(rounds)
         rounds.append(round_of_kills(number, options.folder / f"round_{number}", typical))
-        path.write_text(json.dumps(rounds, indent=1) + "\n")
+        path.write_text("[\n" + ",\n".join(map(json.dumps, rounds)) + "\n]\n")
         print(rounds[-1], flush=True)
     (options.results / "kills.md").write_text(
         summary(rounds, f"python -m benchmarks.kills --kills {options.kills}")

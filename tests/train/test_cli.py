@@ -279,6 +279,10 @@ def test_train_evaluate_and_report_one_after_the_other(tmp_path, capsys):
             "env: Pendulum-v1 with kwargs {'no_such': 1} cannot",
         ),
         (["arms.filtered.filter=protect"], "no recipe for"),
+        (["env=Reachr-v5"], "Reachr-v5"),
+        (["arms.filtered.filter={factory: 'nowhere:shield'}"], "cannot import 'nowhere'"),
+        (["total_steps=-1"], "total_steps"),
+        (["arms.filtered.start_from=nowhere.zip"], "no file 'nowhere.zip'"),
     ],
 )
 def test_arms_that_cannot_be_made_are_refused_before_anything_starts(tmp_path, capsys, overrides, message):
@@ -287,10 +291,11 @@ def test_arms_that_cannot_be_made_are_refused_before_anything_starts(tmp_path, c
     assert captured.err.startswith("error: ")
     assert message in captured.err
     assert "started" not in captured.out
+    assert not list(tmp_path.iterdir())  # nothing that the corrected command could stumble over
 
 
 def test_another_configs_folder_is_refused_before_anything_starts(tmp_path, capsys):
-    (tmp_path / "fake" / "filtered" / "seed_1").mkdir(parents=True)
+    (tmp_path / "fake" / "filtered" / "seed_1" / "checkpoints" / "step_000000009000").mkdir(parents=True)
     (tmp_path / "fake" / "filtered" / "seed_1" / "run.json").write_text(
         '{"arm": "filtered", "seed": 1, "config": {"total_steps": 9000}}'
     )
