@@ -3,14 +3,20 @@ BIN := .venv/bin
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-library test-slow mutants fuzz lint check bench table shelf figures gallery docs clean
+.PHONY: demo test test-library matrix test-slow mutants fuzz lint check lock audit sbom bench table shelf figures gallery docs clean
 
 # Tests draw nothing; the demo tries which GL can.
 test test-library test-slow fuzz: export MUJOCO_GL ?= disabled
 
+# LOCKED=1: only files whose hashes are in requirements.lock; on Linux with the CUDA build of torch.
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
+ifdef LOCKED
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+else
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+endif
 	@touch $@
 
 demo: .venv/installed
@@ -55,7 +61,29 @@ lint: .venv/installed
 	ln -s $(CURDIR)/safe_wrappers/* $(CURDIR)/envs $(CURDIR)/train $(CURDIR)/examples build/types/safe_wrappers/
 	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p safe_wrappers
 
-check: lint test
+check: lint test audit
+
+TOOLS = uv==0.13.9 pip-audit==2.10.1 cyclonedx-bom==7.5.0
+.venv-tools/installed: Makefile
+	$(PYTHON) -m venv .venv-tools
+	.venv-tools/bin/python -m pip install --quiet --disable-pip-version-check $(TOOLS)
+	@touch $@
+
+# constraints.txt with the hashes of all files, for every system and Python; after a change of either file.
+lock: .venv-tools/installed
+	.venv-tools/bin/uv pip compile --quiet --universal --generate-hashes --no-annotate --custom-compile-command "make lock" \
+		--python-version 3.11 -c constraints.txt --extra dev pyproject.toml -o requirements.lock
+
+# Known vulnerabilities of these packages. Green where nobody can be asked, with a word.
+audit: .venv/installed
+	@$(MAKE) --no-print-directory .venv-tools/installed || { echo "Audit: no pip-audit (no network). Nothing was checked."; exit 0; }; \
+	$(BIN)/python -m benchmarks.audit .venv-tools/bin
+
+# All packages with their hashes, as CycloneDX has it.
+sbom: .venv-tools/installed
+	mkdir -p build
+	.venv-tools/bin/cyclonedx-py requirements requirements.lock --pyproject pyproject.toml --of JSON -o build/sbom.json
+	@echo "build/sbom.json"
 
 .venv/bench: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'

@@ -99,7 +99,9 @@ def _diagnose(options: argparse.Namespace, console: Console) -> None:
     output = options.output or Path("diagnosis.html")
     steps = DIAGNOSED_STEPS if options.steps is None else options.steps
     words = ["safe-wrappers", *(sys.argv[1:] if options.given is None else options.given)]
-    diagnose_command(options.words[0], options.policy, steps, output, shlex.join(words), console)
+    diagnose_command(
+        options.words[0], options.policy, steps, output, shlex.join(words), console, options.imports or ()
+    )
 
 
 def _enjoy(options: argparse.Namespace, console: Console) -> None:
@@ -113,6 +115,7 @@ def _enjoy(options: argparse.Namespace, console: Console) -> None:
         options.render,
         options.output,
         console,
+        options.imports or (),
     )
 
 

@@ -32,6 +32,7 @@ _TAKEN_BY: Final = {
     "episodes": ("enjoy",),
     "filter": ("enjoy",),
     "render": ("enjoy",),
+    "imports": ("enjoy", "diagnose"),
 }
 """Which commands take an option."""
 
@@ -128,5 +129,11 @@ def make_parser() -> argparse.ArgumentParser:
         help="of enjoy: another filter than it was trained with (default: trained)",
     )
     parser.add_argument("--render", action="store_true", help="of enjoy: draw in a window")
+    parser.add_argument(
+        "--imports",
+        action="append",
+        metavar="MODULE",
+        help="of enjoy and diagnose: a module that a policy's folder may import; may be given several times",
+    )
     parser.add_argument("--version", action="version", version=version("safe-wrappers"))
     return parser

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +22,13 @@ FilterName = Literal["trained", "none", "protect"]
 
 
 def enjoy_command(
-    run: str, episodes: int, action_filter: FilterName, window: bool, film: Path | None, console: Console
+    run: str,
+    episodes: int,
+    action_filter: FilterName,
+    window: bool,
+    film: Path | None,
+    console: Console,
+    imports: Collection[str] = (),
 ) -> None:
     """Lets a run's policy act, and prints a line per episode.
 
@@ -32,11 +39,12 @@ def enjoy_command(
         window: The task draws itself in a window.
         film: Where to write a film of the first episode (WebP).
         console: Where to print.
+        imports: As `load_policy` takes it.
 
     Raises:
         ConfigurationError: No such run, or the task cannot be drawn in this way.
     """
-    trained = load_policy(run, other_filter=action_filter != "trained")
+    trained = load_policy(run, other_filter=action_filter != "trained", imports=imports)
     env = _drawn(trained, action_filter, "human" if window else "rgb_array" if film is not None else None)
     try:
         for seed in range(episodes):

@@ -15,6 +15,7 @@ from rich.console import Console
 from test_run import Reports
 
 from safe_wrappers.errors import RunStateError
+from safe_wrappers.train.diagnosis.trained import of_file
 from safe_wrappers.train.enjoy import enjoy_command
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
@@ -69,6 +70,15 @@ def poison(checkpoint, name, payload):
     state = json.loads((checkpoint / "state.json").read_text())
     state["files"][name] = hashlib.sha256(path.read_bytes()).hexdigest()
     (checkpoint / "state.json").write_text(json.dumps(state))
+
+
+def test_a_file_to_diagnose_that_would_run_something_is_refused(run, tmp_path):
+    _, _, checkpoint = run
+    assert of_file(checkpoint / "model.zip").num_timesteps == 32
+    poison(checkpoint, "model.zip", Touch(tmp_path / "made"))
+    with pytest.raises(RunStateError, match=r"model\.zip' is refused"):
+        of_file(checkpoint / "model.zip")
+    assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.parametrize("name", ["model.zip", "vecnormalize.pkl"])

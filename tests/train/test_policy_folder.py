@@ -312,3 +312,35 @@ def test_what_cannot_go_there_is_refused(policy, hub, tmp_path, monkeypatch, cap
     with pytest.raises(SystemExit):
         main(["push", str(policy)])
     assert "push takes a RUN and owner/name" in capsys.readouterr().err
+
+
+# Modules --------------------------------------------------------------------------------------------------------
+
+
+def test_a_policy_imports_no_module_that_was_not_named(reacher, policy, tmp_path, monkeypatch):
+    (tmp_path / "unread.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\ndef f(env): return env\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plain = json.loads((policy / "config.json").read_text())
+    factory = {"kind": "factory", "factory": "unread:f", "kwargs": {}}
+    arm = plain["config"]
+    for place, config in {
+        "filter.factory": {**arm, "filter": factory},
+        "env.cost": {**arm, "env": {**arm["env"], "cost": "unread:f"}},
+        "env.judge.factory": {**arm, "env": {**arm["env"], "judge": factory}},
+        "env.observation.factory": {**arm, "env": {**arm["env"], "observation": factory}},
+        "learner.anchor": {**arm, "learner": {"kind": "safe_set_map", "anchor": "unread:f"}},
+        "env.id": {**arm, "env": {**arm["env"], "id": "unread:Reacher-v5"}},
+    }.items():
+        (policy / "config.json").write_text(json.dumps({**plain, "config": config}))
+        with pytest.raises(
+            ConfigurationError, match=rf"wants the module 'unread' \({place} of its config.json\)"
+        ):
+            load_policy(policy)
+        with pytest.raises(ConfigurationError, match="wants the module 'unread'"):
+            load_policy(policy, imports=["json"], other_filter=True)
+        assert not (tmp_path / "ran").exists()
+    assert main(["enjoy", str(policy), "--episodes", "1"]) == 1
+    assert not (tmp_path / "ran").exists()
+    assert main(["enjoy", str(policy), "--episodes", "1", "--imports", "unread"]) == 0
+    assert (tmp_path / "ran").exists()
+    sys.modules.pop("unread")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,13 @@ from .trained import of_file, of_run
 
 
 def diagnose_command(
-    env_id: str, policy: Path | None, steps: int, output: Path, command: str, console: Console
+    env_id: str,
+    policy: Path | None,
+    steps: int,
+    output: Path,
+    command: str,
+    console: Console,
+    imports: Collection[str] = (),
 ) -> Diagnosis:
     """Diagnose an env by its id, and write the page, and beside it the same as JSON and its plots as CSV.
 
@@ -28,10 +35,11 @@ def diagnose_command(
         output: The page.
         command: For the page.
         console: Where the table goes.
+        imports: As `load_policy` takes it.
     """
     acts: Any = None
     if policy is not None and policy.suffix != ".zip":
-        env, acts = of_run(policy, env_id)
+        env, acts = of_run(policy, env_id, imports)
     else:
         env = gym.make(check_env_id(env_id))
         acts = acts if policy is None else of_file(policy)

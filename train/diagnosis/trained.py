@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,18 +16,19 @@ from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 from ..config.algorithms import ALGORITHMS
 from ..policies import load_policy
+from ..run.data_pickles import pickles_of_model
 
 Policy = Callable[[Any], Any]
 _OF_PACKAGE: Final = {"recurrent": "RecurrentPPO", "maskable": "MaskablePPO"}
 
 
-def of_run(folder: Path, env_id: str) -> tuple[gym.Env[Any, Any], Policy]:
+def of_run(folder: Path, env_id: str, imports: Collection[str] = ()) -> tuple[gym.Env[Any, Any], Policy]:
     """The policy of a run's newest checkpoint, and its env without the filter.
 
     Raises:
         ConfigurationError: The folder holds no run, no checkpoint, or the policy of another env.
     """
-    trained = load_policy(folder)
+    trained = load_policy(folder, imports=imports)
     if trained.arm.env.id != env_id:
         raise ConfigurationError(
             f"--policy: {str(folder)!r} was trained on {trained.arm.env.id}, not on {env_id}: diagnose that env"
@@ -43,16 +44,18 @@ def of_file(path: Path) -> Any:
 
     Raises:
         ConfigurationError: There is no such file, or it is no model.
+        RunStateError: A pickle in it names what is no data.
     """
     try:
-        data, _, _ = load_from_zip_file(path, device="cpu")
+        pickled = pickles_of_model(path)
+        data, _, _ = load_from_zip_file(path, device="cpu", custom_objects=pickled)
         assert data is not None
         name = _algorithm(data)
     except (OSError, zipfile.BadZipFile, ValueError, AssertionError, KeyError, AttributeError) as error:
         raise ConfigurationError(
             f"--policy: {str(path)!r} is no model that Stable-Baselines3 has saved ({error})"
         ) from None
-    return ALGORITHMS[name].load(path, device="cpu")
+    return ALGORITHMS[name].load(path, device="cpu", custom_objects=pickled)
 
 
 def _algorithm(data: dict[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import gymnasium as gym
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
+from ..config import ArmConfig
 from ..config.stored import stored_arm
 from ..run.checkpoint import latest_checkpoint
 from ..run.folder import CHECKPOINTS, RUN_FILE
@@ -25,6 +27,7 @@ def load_policy(
     *,
     other_env: bool = False,
     other_filter: bool = False,
+    imports: Collection[str] = (),
 ) -> TrainedPolicy:
     """Load a trained policy.
 
@@ -36,16 +39,20 @@ def load_policy(
         other_env: It may be another task, as long as the spaces are the same.
         other_filter: The filter may be another one, or none; that of `make_env` too, where this version of the
             library makes another one of the same config.
+        imports: Names of modules, beside this library's, from which a policy's folder may have functions and envs.
+            What an import runs is up to the module: read it first. A run's folder is taken for one's own, and
+            imports what its config names.
 
     Returns:
         The policy, a function of an observation; its `make_env` has the env that it was trained in.
 
     Raises:
-        ConfigurationError: There is no policy, or it was trained in another env, or through another filter.
+        ConfigurationError: There is no policy, or it was trained in another env, or through another filter; or
+            its config names a module that `imports` does not.
         RunStateError: Files are unreadable or damaged.
     """
     folder = download(run.removeprefix(HUB)) if isinstance(run, str) and run.startswith(HUB) else Path(run)
-    trained = _of_run(folder) if (folder / RUN_FILE).is_file() else _of_folder(folder, other_filter)
+    trained = _of_run(folder) if (folder / RUN_FILE).is_file() else _of_folder(folder, other_filter, imports)
     if env is not None:
         _refuse_misfit(trained, env, other_env, other_filter)
     return trained
@@ -64,13 +71,20 @@ def _of_run(folder: Path) -> TrainedPolicy:
     return TrainedPolicy(stored_arm(name, fingerprint), checkpoint)
 
 
-def _of_folder(folder: Path, other_filter: bool) -> TrainedPolicy:
+def _of_folder(folder: Path, other_filter: bool, imports: Collection[str]) -> TrainedPolicy:
     if not (folder / CONFIG).is_file():
         raise ConfigurationError(
             f"{str(folder)!r} is no run's folder (it has no {RUN_FILE}), and no policy's (it has no {CONFIG}): give"
             f" runs/NAME/ARM/seed_N, or the folder `{POLICY}` of a run"
         )
     saved = read_policy(folder)
+    for place, module in _modules(saved.arm):
+        if module not in imports:
+            raise ConfigurationError(
+                f"the policy in {str(folder)!r} wants the module {module!r} ({place} of its {CONFIG}), and an import"
+                f" runs what is in it. If you know the module: load_policy(..., imports=[{module!r}]), or --imports"
+                f" {module}"
+            )
     here = filter_spec(saved.arm)["constraints"]
     if here != saved.spec["constraints"] and not other_filter:
         raise ConfigurationError(
@@ -79,6 +93,22 @@ def _of_folder(folder: Path, other_filter: bool) -> TrainedPolicy:
             "load_policy(..., other_filter=True) loads it anyway"
         )
     return TrainedPolicy(saved.arm, saved)
+
+
+def _modules(arm: ArmConfig) -> Iterator[tuple[str, str]]:
+    """Where a config names a module that is not of this library, and the module."""
+    env, learner = arm.env, arm.learner
+    names = {"env.id": env.id, "env.cost": env.cost, "learner.anchor": learner.anchor}
+    for place, used in (
+        ("filter", arm.filter),
+        ("env.judge", env.judge),
+        ("env.observation", env.observation),
+    ):
+        names[f"{place}.factory"] = None if used is None else used.factory
+    for place, name in names.items():
+        module, colon, _ = (name or "").rpartition(":")
+        if colon and module.partition(".")[0] != "safe_wrappers":
+            yield place, module
 
 
 def _refuse_misfit(
