@@ -3,7 +3,7 @@ BIN := .venv/bin
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-library matrix test-slow mutants fuzz lint check lock audit sbom bench table shelf figures gallery docs clean
+.PHONY: demo test test-library matrix test-slow mutants fuzz lint check lock audit sbom bench table shelf endurance figures gallery docs clean
 
 # Tests draw nothing; the demo tries which GL can.
 test test-library test-slow fuzz: export MUJOCO_GL ?= disabled
@@ -107,6 +107,10 @@ shelf: .venv/shelf
 table: .venv/installed
 	$(BIN)/python -m benchmarks.table
 	for task in SafePointGoal1 SafeCarGoal1 SafePointGoal2; do $(BIN)/python -m benchmarks.stuck_steps --task $${task}_sac --episodes 40 || exit 1; done
+
+# Attackers against the proved filters, 20,000,000 steps: hours on one core; goes on where it was stopped.
+endurance: .venv/installed
+	$(BIN)/python -m benchmarks.endurance
 
 # Every long figure of the README and docs/results: about eight hours on two cores, but for the table.
 figures: .venv/installed

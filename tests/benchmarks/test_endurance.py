@@ -12,7 +12,8 @@ pytest.importorskip("gymnasium_robotics")
 
 from benchmarks import endurance
 from benchmarks.cases import CASES
-from benchmarks.endurance import Chunk, collected, memory, plan, run, speed, table
+from benchmarks.endurance import Chunk, plan, run
+from benchmarks.endurance_report import collected, memory, speed, table
 from benchmarks.searching_drivers import HORIZON, SearchingDriver, cross_entropy, differences
 from benchmarks.trained_adversary import Tally
 
