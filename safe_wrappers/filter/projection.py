@@ -138,11 +138,12 @@ def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
 
 
 def cast_inside(control: Array, dtype: Any, normals: Array, offsets: Array, low: Array, high: Array) -> Any:
-    """A control inside its rows and a box that is exact in `dtype`, cast to it.
+    """A control inside its rows and a box that is exact in `dtype`, cast to it; finite where the box is not.
 
     Where rounding broke a row, each component moves by one unit in the last place towards feasibility.
     """
-    sent = np.clip(control, low, high).astype(dtype)
+    most = np.finfo(dtype).max
+    sent = np.clip(control, np.maximum(low, -most), np.minimum(high, most)).astype(dtype)
     if not offsets.size or dtype == np.float64:
         return sent
     excess = normals @ sent.astype(np.float64) - np.maximum(offsets, normals @ control)

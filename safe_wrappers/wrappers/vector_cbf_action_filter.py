@@ -72,6 +72,7 @@ class VectorCBFActionFilter(EpisodeGuard, VectorWrapper[Any, Any, Any, Any, Any]
         margin: float = 0.0,
     ) -> None:
         super().__init__(env)
+        self.await_reset()
         envs = single_envs(env)
         plants = [copy.deepcopy(plant) for _ in envs]
         self.filters = [

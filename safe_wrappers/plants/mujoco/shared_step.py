@@ -12,6 +12,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Recorder
 
 _STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_SLEEP: Final = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # before 3.4 nothing sleeps
 _MJ_STEP: Final = mujoco.mj_step
 _KNOWN: Final = ("gymnasium.envs.mujoco.", "safe_wrappers.envs.velocity")
 """Envs whose shared step was measured equal bit for bit (`tests/plants/test_shared_step.py`)."""
@@ -27,13 +28,15 @@ def shared_step(
     """
     raw = env.unwrapped
     inherits = getattr(type(raw), "_step_mujoco_simulation", None) is MujocoEnv._step_mujoco_simulation
-    if wanted and not (exact and inherits):
+    # MuJoCo's state, from which rollouts start, does not say which bodies sleep.
+    same = exact and inherits and not raw.model.opt.enableflags & _SLEEP
+    if wanted and not same:
         raise ConfigurationError(
-            "share_step=True needs the env's own model, no delay, and an env that steps as Gymnasium's MujocoEnv "
-            f"does; {raw} and its plant do not have all of these: leave it out"
+            "share_step=True needs the env's own model, no delay, no flag sleep, and an env that steps as Gymnasium's "
+            f"MujocoEnv does; {raw} and its plant do not have all of these: leave it out"
         )
     known = wanted or (wanted is None and type(raw).__module__.startswith(_KNOWN))
-    return SharedStep(raw, substeps) if exact and inherits and known else None
+    return SharedStep(raw, substeps) if same and known else None
 
 
 class SharedStep:

@@ -38,6 +38,7 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
         refuse_vector_env(env, type(self).__name__)
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
+        self.await_reset()
         innermost = not any(isinstance(inner, LayerWrapper) for inner in wrappers_of(env))
         self._passes_numbers = innermost and isinstance(env.action_space, gym.spaces.Box)
 
