@@ -153,7 +153,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._queue = ChunkQueue(*queue, overlap=springs is not None)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
-        self._warned = False
+        self._warned: set[str] = set()
         self._start()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -236,6 +236,11 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             raise ActionError(f"{expected} (chunk_size, controls), got {chunk.shape}")
         return chunk
 
+    def _warn_once(self, what: str, message: str) -> None:
+        if what not in self._warned:
+            self._warned.add(what)
+            warn_caller(message)
+
     def _admits(self, commands: Array) -> bool:
         return self._inside is None or self._inside.admits_chunk(commands)
 
@@ -246,6 +251,11 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             return True
         if not np.isfinite(chunk).all():
             return False
+        space: Any = self.action_space
+        if ((chunk < space.low) | (chunk > space.high)).any():
+            self._warn_once(
+                "clipped", "the policy's action left the action space; entries of the chunk are clipped to it"
+            )
         observed_s = self._observed_s
         if self.now_s < observed_s <= self.now_s + self._clock_error_s + SAME_STEP * self.control_dt:
             observed_s = self.now_s
@@ -278,10 +288,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._executed, self._in_seam = self._executed[-DIFFERENCES:], []
         blends = [c.blend_steps for c in commands if c.blend_steps]
         limited = sum(c.limited for c in commands)
-        if limited and not self._warned:
-            self._warned = True
+        if limited:
             message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
-            warn_caller(message)
+            self._warn_once("limited", message)
         return {
             keys.HANDOVER_SEAM_JUMP: jump,
             keys.HANDOVER_PEAK_JERK: peak,
