@@ -42,7 +42,7 @@ def _state(row: Row, value: float) -> Cell:
         if found.outcome is not Outcome.SILENT:
             return found
         said = flags(first.info, before.info)
-        if not said and not session.bound() and plain(second.reached) == plain(after.reached):
+        if not said and not session.bound() and plain(tuple(second.reached)) == plain(tuple(after.reached)):
             return Found(Outcome.PASSED, "it reads no state; the observation shows it")
         return Found(Outcome.FLAGGED, ", ".join(said)) if said else found
 
