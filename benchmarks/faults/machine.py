@@ -116,7 +116,8 @@ def _silent(row: Row) -> Cell:
             said = _less_is_known(answer.info, expected.info)
             if found.outcome is Outcome.SILENT and said:
                 found = Found(Outcome.FLAGGED, said)
-            if found.outcome is not Outcome.HARMLESS or session.ended(answer):
+            # What is in force goes on for a while, as it is meant to; then it has to be said.
+            if found.outcome not in (Outcome.HARMLESS, Outcome.SILENT) or session.ended(answer):
                 break
         for name in published:
             session.bottoms[0].__dict__.pop(name, None)

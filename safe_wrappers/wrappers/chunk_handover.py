@@ -23,7 +23,7 @@ from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_mode
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng, warn_caller
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs
@@ -153,7 +153,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._queue = ChunkQueue(*queue, overlap=springs is not None)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
-        self._warned: set[str] = set()
         self._start()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -235,11 +234,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         if chunk.shape != self.action_space.shape:
             raise ActionError(f"{expected} (chunk_size, controls), got {chunk.shape}")
         return chunk
-
-    def _warn_once(self, what: str, message: str) -> None:
-        if what not in self._warned:
-            self._warned.add(what)
-            warn_caller(message)
 
     def _admits(self, commands: Array) -> bool:
         return self._inside is None or self._inside.admits_chunk(commands)

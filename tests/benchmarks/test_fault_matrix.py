@@ -145,3 +145,51 @@ def test_a_copy_that_has_lost_its_state_asks_for_a_reset_and_one_that_has_not_go
     barrier = next(row for row in rows("Barrier"))  # Pendulum is copied with its state
     (kept,) = fault_matrix.judge(barrier, only={("deep-copied in the middle", "")})
     assert kept["outcome"] == Outcome.HARMLESS
+
+
+def test_a_recorder_over_a_filter_leaves_what_is_not_finite_to_the_filter():
+    env = sw.RecordInterventions(
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
+    )
+    env.reset(seed=0)
+    assert env.step(np.full(2, np.nan))[4]["cbf/nonfinite"]
+    alone = sw.RecordInterventions(gym.make("Reacher-v5"))
+    alone.reset(seed=0)
+    for bad in (np.full(2, np.nan), ["0.1", "0.1"], [[0.1], [0.1, 0.2]], np.array([0.1j, 0.1])):
+        with pytest.raises(sw.SafeWrappersError, match="finite numbers"):
+            alone.step(bad)
+
+
+def test_commands_from_the_future_are_counted_as_lost():
+    env = sw.TeleopChannel(gym.make("Reacher-v5"), 0.0, 0.0)
+    env.reset(seed=0)
+    assert env.step(np.zeros(2, np.float32))[4]["teleop/lost"] == 0
+    env.set_observation_time(env.now_s + 1.0)
+    assert env.step(np.zeros(2, np.float32))[4]["teleop/lost"] == 1
+
+
+def test_a_budget_reads_nothing_of_a_state_that_is_broken_elsewhere():
+    budget = sw.StoppingBudget(sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"]), closing_speed=1.0)
+    env = sw.LeaseExpiry(gym.make("Reacher-v5"), budget, fallback="zero")
+    env.reset(seed=0)
+    assert not env.step(np.zeros(2, np.float32))[4]["lease/refused"]
+    env.unwrapped.data.qpos[0] = np.nan  # of joint0
+    assert env.step(np.zeros(2, np.float32))[4]["lease/refused"]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda env: sw.ChunkHandover(env, 1, 1, fallback="zero"),
+        lambda env: sw.TeleopChannel(env, 0.0, 0.0),
+    ],
+)
+def test_who_decides_nothing_warns_once_of_an_action_outside_the_space(make, recwarn):
+    env = make(gym.make("Reacher-v5"))
+    env.reset(seed=0)
+    env.step(np.array([0.5, 1.0]))
+    assert not [w for w in recwarn if "left the action space" in str(w.message)]
+    env.step(np.array([0.5, 1.5]))
+    env.step(np.array([0.5, 1.5]))
+    (warned,) = [w for w in recwarn if "left the action space" in str(w.message)]
+    assert warned.filename == __file__
