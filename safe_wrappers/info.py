@@ -233,7 +233,7 @@ TELEOP_IN_FLIGHT_J: Final = _key("teleop/in_flight_j", "float64", unit="J")
 TELEOP_CREATED_J: Final = _key("teleop/created_j", "float64", unit="J")
 """The largest excess of energy out and in flight over energy in, so far; 0 is passive."""
 TELEOP_LOST: Final = _key("teleop/lost", "int64", chunk="sum")
-"""Packets of this step, in both directions, that got lost; actions that are not finite count as lost."""
+"""Packets of this step that got lost, both ways; actions that are not finite, or from the future, count as lost."""
 TELEOP_LATE: Final = _key("teleop/late", "int64", chunk="sum")
 """Commands that arrived in this step behind or together with a newer one."""
 

@@ -1,5 +1,6 @@
 """Faults of the machine: a plant that is wrong, a sensor that is silent, a clock that is set."""
 
+import inspect
 import time
 from collections.abc import Callable
 from typing import Any
@@ -36,8 +37,6 @@ def _plant(what: str, factor: float) -> Callable[[Row], Cell]:
                 return Found(Outcome.NOT_APPLICABLE, "it forecasts nothing for the robot")
             if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or inside.plant.simulates:
                 return Found(Outcome.NOT_APPLICABLE, "its plant is the env itself, or no MuJoCo model")
-            if what == "delay":
-                return _late(session, inside)
             for name in _PARTS[what]:
                 getattr(raw.model, name)[:] *= factor
             mujoco.mj_setConst(raw.model, mujoco.MjData(raw.model))
@@ -48,11 +47,21 @@ def _plant(what: str, factor: float) -> Callable[[Row], Cell]:
     return cell
 
 
-def _late(session: Session, inside: Any) -> Found:
+def _late(row: Row) -> Cell:
     """The env acts without a delay, and the plant believes in one."""
-    inside.plant.delay_s = _WRONG * inside.plant.control_dt
-    inside.plant.bind(inside.env)
-    return _limits_kept(session, inside)
+
+    def run(session: Session) -> Found:
+        plant = getattr(session.env, "plant", None)
+        takes = "plant" in inspect.signature(type(session.env).__init__).parameters
+        if not isinstance(plant, sw.MujocoPlant) or not takes or hasattr(session.env, "filters"):
+            return Found(Outcome.NOT_APPLICABLE, "it has no MujocoPlant of its own")
+        try:
+            session = row.open(plant=sw.MujocoPlant(delay_s=_WRONG * plant.control_dt))
+        except sw.SafeWrappersError as error:
+            return Found(Outcome.REFUSED, f"{type(error).__name__}: {error}")
+        return _limits_kept(session, session.env)
+
+    return run
 
 
 def _limits_kept(session: Session, inside: Any) -> Found:
@@ -104,9 +113,11 @@ def _silent(row: Row) -> Cell:
             expected = usual.step(action)
             answer = session.step(action)
             found = judged(row, session, answer, expected, None)
-            if found.outcome is Outcome.SILENT and cameras:
-                found = _seen_in_info(answer.info)
-            if found.outcome is not Outcome.HARMLESS or session.ended(answer):
+            said = _less_is_known(answer.info, expected.info)
+            if found.outcome is Outcome.SILENT and said:
+                found = Found(Outcome.FLAGGED, said)
+            # What is in force goes on for a while, as it is meant to; then it has to be said.
+            if found.outcome not in (Outcome.HARMLESS, Outcome.SILENT) or session.ended(answer):
                 break
         for name in published:
             session.bottoms[0].__dict__.pop(name, None)
@@ -117,11 +128,14 @@ def _silent(row: Row) -> Cell:
     return run
 
 
-def _seen_in_info(info: dict[str, Any]) -> Found:
-    visible = np.any(info["occlusion/visible"])
-    return Found(
-        Outcome.SILENT if visible else Outcome.FLAGGED, "occlusion/visible is False, occlusion/sigma grows"
-    )
+def _less_is_known(info: dict[str, Any], usual: dict[str, Any]) -> str:
+    """What info says of a silence: nothing in sight, a lease that runs down, an old image, no new chunk."""
+    if "occlusion/visible" in info and not np.any(info["occlusion/visible"]):
+        return "occlusion/visible is False, occlusion/sigma grows"
+    for key, sign in (("lease/remaining_s", -1), ("teleop/round_trip_s", 1), ("handover/latency", -1)):
+        if key in info and sign * (info[key] - usual[key]) > 0.0:
+            return key
+    return ""
 
 
 def _published(row: Row) -> list[str]:
@@ -155,7 +169,12 @@ def _clock(by_s: float) -> Callable[[Row], Cell]:
                 _set_time(bare, by_s)
                 return bare.step(action)
 
-            return judged(row, session, answer, row.open().begin().step(action), alone)
+            usual = row.open().begin().step(action)
+            found = judged(row, session, answer, usual, alone)
+            corrected = answer.info.get("cbf/correction", 0.0) > usual.info.get("cbf/correction", 0.0)
+            if found.outcome is Outcome.SILENT and corrected and answer.info["cbf/intervened"]:
+                return Found(Outcome.FLAGGED, "cbf/intervened: it begins to measure anew, and corrects more")
+            return found
 
         return run
 
@@ -174,7 +193,7 @@ def machine(row: Row) -> dict[tuple[str, str], Cell]:
     for what in _PARTS:
         for factor in (1.0 - _WRONG, 1.0 + _WRONG):
             cells[f"{what} 20 % wrong", f"times {factor:g}"] = _plant(what, factor)(row)
-    cells["delay 20 % wrong", ""] = _plant("delay", 1.0)(row)
+    cells["delay 20 % wrong", ""] = _late(row)
     cells["sensor silent", ""] = _silent(row)
     cells["clock set back", ""] = _clock(-_SET_S)(row)
     cells["clock set forward", ""] = _clock(_SET_S)(row)

@@ -31,11 +31,11 @@ class Outcome(StrEnum):
 
 
 MEANS: dict[Outcome, str] = {
-    Outcome.REFUSED: "an error of this library that says what was expected; the env was not stepped",
+    Outcome.REFUSED: "an error of this library that says what was expected, before the env was stepped",
     Outcome.FLAGGED: "info says so, or a warning; what was executed is finite and in the action space",
-    Outcome.ERROR: "the error of the env, of the solver or of `pickle` itself comes through; no step was made",
+    Outcome.ERROR: "the error of the env, a solver or `pickle`, or one of ours about what the env returned",
     Outcome.HARMLESS: "bit for bit as without the fault",
-    Outcome.PASSED: "the wrapper decides nothing: the env got what it would have got alone, finite numbers",
+    Outcome.PASSED: "the wrapper decides nothing here: the env got what it would have got without it, finite numbers",
     Outcome.KEPT: "the limit was kept, judged with the right model",
     Outcome.WAITS: "the step takes as long as what hangs",
     Outcome.NOT_APPLICABLE: "there is nothing that the fault could hit",
@@ -93,14 +93,15 @@ def judged(
     """
     error = answer.error
     wrong = reached_wrongly(session, [answer])
-    as_alone = row.looks and alone is not None
+    as_alone = row.passes and alone is not None
     if wrong is not None and not (wrong.outcome is Outcome.OUTSIDE and as_alone):
         return wrong
     if error is not None:
         text = f"{type(error).__name__}: {error}"
         if isinstance(error, OF_OURS) and not answer.reached:
             return Found(Outcome.REFUSED, text)
-        own = alone is not None and type(alone().error) is type(error)
+        # What this library says of what the env has returned, or the env's own.
+        own = isinstance(error, OF_OURS) or (alone is not None and type(alone().error) is type(error))
         return Found(Outcome.ERROR if own else Outcome.CRASHED, text)
     if wrong is None and same(answer, usual):
         return Found(Outcome.HARMLESS)

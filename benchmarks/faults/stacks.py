@@ -17,6 +17,8 @@ from safe_wrappers.plants.env_checks import wrappers_of
 LONG, BEFORE = 24, 6
 """Steps of an episode, and those before the fault."""
 VECTOR = "VectorCBFActionFilter"
+PASSING = (*wrapper_examples.ONLY_LOOKING, "LeaseExpiry", "TeleopChannel")
+"""Wrappers that judge no action: it is for a filter inside to keep the action space."""
 
 
 class BrokenEnvError(RuntimeError):
@@ -86,13 +88,13 @@ class Row:
         name: As it is exported.
         case: Of a wrapper's examples; "" of a constraint.
         build: Makes it; takes what is put around the task, and more arguments of the wrapper.
-        looks: It only looks on, and passes every action as it is.
+        passes: It judges no action, and passes finite ones as they are.
     """
 
     name: str
     case: str
     build: Callable[..., Any] = field(repr=False)
-    looks: bool = False
+    passes: bool = False
 
     @property
     def kind(self) -> str:
@@ -192,11 +194,8 @@ class Session:
         """The constraints, and those that a budget reads."""
         found = [constraint for engine in self.engines() for constraint in engine.bound]
         for layer in self.layers():
-            budgets = [
-                getattr(layer, "_budget", None),
-                getattr(getattr(layer, "_watch", None), "budget", None),
-            ]
-            found += [one.constraint for one in budgets if one is not None and one.constraint is not None]
+            budgets = getattr(layer, "_budget", None), getattr(getattr(layer, "_watch", None), "budget", None)
+            found += [one._bound for one in budgets if one is not None and one._bound is not None]
         return found
 
 
@@ -226,7 +225,7 @@ def rows(only: str = "") -> Iterator[Row]:
     """All rows, wrappers first; of one name alone."""
     for name, case in wrapper_examples.CASES:
         if only in ("", name):
-            yield Row(name, case, _wrapper(name, case), name in wrapper_examples.ONLY_LOOKING)
+            yield Row(name, case, _wrapper(name, case), name in PASSING)
     if only in ("", VECTOR):
         yield Row(VECTOR, "two envs", _vector)
     for name in constraint_examples.EXAMPLES:

@@ -18,8 +18,6 @@ Env = gym.Env[Any, Any]
 
 TASK, CROSSING = "SafePointGoal1-v0", "OccludedCrossing-v0"
 DISCRETE = "tests/ThreeTorques-v0"
-REFUSING = (TASK, CROSSING)
-"""Tasks that refuse an action that is not finite themselves."""
 
 
 class ThreeTorques(InvertedPendulumEnv):
@@ -320,7 +318,7 @@ ONLY_LOOKING = (
     "OcclusionPenalty",
     "RecordInterventions",
 )
-"""Wrappers that look on and pass every action as it is."""
+"""Wrappers that look on and pass every finite action as it is."""
 SILENT = ("ActionRepeat", "FilterObservation", "SafetyOverlay")
 """They add nothing to info."""
 

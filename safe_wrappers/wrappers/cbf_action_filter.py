@@ -21,7 +21,7 @@ from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, warn_caller
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array
 
 SAFE_TOLERANCE = 1e-6
@@ -103,7 +103,6 @@ class CBFActionFilter(LayerWrapper):
         self.plant.bind(env)
         self._fallback, self._solver = fallback, solver
         self.filter = self._filter()
-        self.warned: set[str] = set()
         self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
 
@@ -264,13 +263,6 @@ class CBFActionFilter(LayerWrapper):
             )
             self._warn_once("unsafe", message, UnsafeStateWarning)
         return margin, unsafe
-
-    def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
-        """Warn once per episode (unsafe) or filter."""
-        if what in self.warned:
-            return
-        self.warned.add(what)
-        warn_caller(message, category)
 
 
 def _unique(kinds: list[str]) -> list[str]:

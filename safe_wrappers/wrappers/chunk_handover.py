@@ -23,7 +23,7 @@ from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_mode
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng, warn_caller
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs
@@ -153,7 +153,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._queue = ChunkQueue(*queue, overlap=springs is not None)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
-        self._warned = False
         self._start()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -246,6 +245,11 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             return True
         if not np.isfinite(chunk).all():
             return False
+        space: Any = self.action_space
+        if ((chunk < space.low) | (chunk > space.high)).any():
+            self._warn_once(
+                "clipped", "the policy's action left the action space; entries of the chunk are clipped to it"
+            )
         observed_s = self._observed_s
         if self.now_s < observed_s <= self.now_s + self._clock_error_s + SAME_STEP * self.control_dt:
             observed_s = self.now_s
@@ -278,10 +282,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._executed, self._in_seam = self._executed[-DIFFERENCES:], []
         blends = [c.blend_steps for c in commands if c.blend_steps]
         limited = sum(c.limited for c in commands)
-        if limited and not self._warned:
-            self._warned = True
+        if limited:
             message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
-            warn_caller(message)
+            self._warn_once("limited", message)
         return {
             keys.HANDOVER_SEAM_JUMP: jump,
             keys.HANDOVER_PEAK_JERK: peak,

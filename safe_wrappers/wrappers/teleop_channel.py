@@ -199,6 +199,7 @@ class TeleopChannel(CommandGate):
     def _send_up(self, action: NDArray[Any] | None, now_s: float) -> None:
         observed_s, self._observed_s = self._observed_s, self.now_s + self.control_dt
         if observed_s is None or observed_s > now_s + self._same_s:
+            self._lost += action is not None and observed_s is not None
             action = None
         self._moved = flow = None if action is None else self._flow_of(action)
         extra = self._coding.near(flow)

@@ -9,7 +9,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step, warn_caller
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver
 
 
@@ -26,7 +26,6 @@ class CommandGate(LayerWrapper, CommandReceiver):
         self._shape, self._dtype = space.shape, space.dtype
         self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))
         self._filtered = filter_inside(env) is not None  # then the filter reports what was executed
-        self._warned = False
 
     def _start(self, info: dict[str, Any]) -> None:
         """Begin an episode, in which nothing has been executed yet."""
@@ -44,13 +43,14 @@ class CommandGate(LayerWrapper, CommandReceiver):
         return self._boxed(np.zeros(self._shape)).astype(self._dtype)
 
     def _is_finite(self, action: NDArray[Any], whose: str, consequence: str) -> bool:
-        """Whether an action is finite; the first one that is not is warned of, at the caller of `step`."""
+        """Whether an action is finite; the first one that is not, or is outside the space, is warned of."""
         numbers = action.astype(np.float64)
         finite = bool(np.isfinite(numbers).all())
-        if not finite and not self._warned:
-            self._warned = True
-            message = f"the {whose} action is not finite ({numbers}); {consequence}"
-            warn_caller(message)
+        if not finite:
+            self._warn_once("nonfinite", f"the {whose} action is not finite ({numbers}); {consequence}")
+        elif not self._filtered and ((numbers < self._low) | (numbers > self._high)).any():
+            message = f"the {whose} action left the action space; no CBFActionFilter inside boxes it"
+            self._warn_once("outside", message)
         return finite
 
     def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:

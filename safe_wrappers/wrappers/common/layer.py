@@ -39,6 +39,7 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
         self.await_reset()
+        self.warned: set[str] = set()
         innermost = not any(isinstance(inner, LayerWrapper) for inner in wrappers_of(env))
         self._passes_numbers = innermost and isinstance(env.action_space, gym.spaces.Box)
 
@@ -52,19 +53,21 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
                 )
         return self.env.step(action)
 
+    def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
+        """Warn, unless `warned` has it, at the line that called the outermost of this library's wrappers."""
+        if what in self.warned:
+            return
+        self.warned.add(what)
+        level, frame = 1, inspect.currentframe()
+        while frame is not None and str(frame.f_globals.get("__name__")).startswith(_WRAPPERS):
+            level, frame = level + 1, frame.f_back
+        warnings.warn(message, category, stacklevel=level)
+
     def _record(self, arguments: Mapping[str, Any], **plain: Any) -> None:
         """Record the constructor's arguments (its `locals()`), some as plain data; a plant as a template."""
         if plain.get("plant") is not None:
             plain["plant"] = PlantTemplate(plain["plant"])
         gym.utils.RecordConstructorArgs.__init__(self, **recorded(arguments, **plain))
-
-
-def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the line that called the outermost of this library's wrappers."""
-    level, frame = 1, inspect.currentframe()
-    while frame is not None and str(frame.f_globals.get("__name__")).startswith(_WRAPPERS):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(message, category, stacklevel=level)
 
 
 def refuse_vector_env(env: Any, name: str) -> None:

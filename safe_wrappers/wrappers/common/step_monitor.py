@@ -8,7 +8,7 @@ import mujoco
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.replay import Replay
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step, warn_caller
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step
 
 
 class StepMonitor(LayerWrapper, ABC):
@@ -30,7 +30,6 @@ class StepMonitor(LayerWrapper, ABC):
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
             raise UnsupportedEnvError(f"{name} needs an env with MuJoCo's .model and .data; {raw} has none")
         self._replay = Replay(raw)
-        self._warned = False
 
     def step(self, action: Any) -> Step:
         """Step the env, and look at the physics of that step."""
@@ -40,7 +39,11 @@ class StepMonitor(LayerWrapper, ABC):
         self._begin(raw.model)
         whole = self._replay.after(self._visit)
         if not whole:
-            self._warn(raw)
+            message = (
+                f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
+                f"substeps, or MuJoCo has reset it; only the contacts left behind are read (info[{self.partial!r}])"
+            )
+            self._warn_once("partial", message)
             self._begin(raw.model)
             self._visit(raw.data, float(raw.model.opt.timestep))
         answer[4].update(self._figures(raw.data) | {self.partial: not whole})
@@ -57,12 +60,3 @@ class StepMonitor(LayerWrapper, ABC):
     @abstractmethod
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
         """The info of what was visited and of the state after the step."""
-
-    def _warn(self, raw: Any) -> None:
-        if not self._warned:
-            self._warned = True
-            message = (
-                f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
-                f"substeps, or MuJoCo has reset it; only the contacts left behind are read (info[{self.partial!r}])"
-            )
-            warn_caller(message)

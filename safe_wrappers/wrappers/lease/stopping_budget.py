@@ -157,6 +157,9 @@ class BoundBudget:
             self.clearance, self.speed = self._of_function()
             return
         self._observe(self._bound)
+        if not np.isfinite(self._bound.plant.state).all():  # of which it may read only a part
+            self.clearance = self.speed = np.full(1, np.nan)
+            return
         approach = self._bound.approach()
         if approach is not None:
             self.clearance, self.speed = approach
