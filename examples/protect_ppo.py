@@ -19,7 +19,7 @@ steps = parser.parse_args().steps
 env = sw.protect(gym.make("SafePointGoal1-v0"))  # every action is checked
 recorder = sw.RecordInterventions(env)  # and what that cost is counted
 model = PPO("MlpPolicy", Monitor(recorder), n_steps=min(2048, steps), seed=0, device="cpu")
-model.learn(steps, callback=InterventionCallback())  # figures in SB3's log, under safety/
+model.learn(steps, callback=InterventionCallback())  # figures in SB3's log, under interventions/
 
 observation = recorder.reset(seed=1)[0]
 done = False

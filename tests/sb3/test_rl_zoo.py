@@ -102,7 +102,7 @@ def test_the_zoo_trains_with_the_page_s_file_and_command(tmp_path):
         [sys.executable, *command.split(), *short], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert "safety/" in done.stdout and "intervention_rate" in done.stdout  # of InterventionCallback
+    assert "| interventions/ " in done.stdout and "step_rate " in done.stdout  # of InterventionCallback
     folder = tmp_path / "ppo" / "SafePointGoal1-v0_1"
     PPO.load(folder / "SafePointGoal1-v0.zip", device="cpu")
     assert "safe_wrappers.protect" in (folder / "SafePointGoal1-v0" / "config.yml").read_text()
