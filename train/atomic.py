@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import json
 import os
@@ -25,7 +26,8 @@ def write_bytes(path: Path, data: bytes) -> None:
         error.filename = str(path)  # a write that fails does not say to which file
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a read-only disk refuses this, too
+            temporary.unlink()
 
 
 def _clear(temporary: Path) -> None:
@@ -33,11 +35,11 @@ def _clear(temporary: Path) -> None:
     mine = temporary.name.removesuffix(f"{os.getpid()}.tmp")
     for left in temporary.parent.glob(f"{glob.escape(mine)}*.tmp"):
         pid = left.name[len(mine) : -len(".tmp")]
-        if pid.isdigit() and not alive(int(pid)):
+        if pid.isdigit() and not _alive(int(pid)):
             left.unlink(missing_ok=True)
 
 
-def alive(pid: int) -> bool:
+def _alive(pid: int) -> bool:
     """Whether this machine has a process with this number."""
     try:
         os.kill(pid, 0)

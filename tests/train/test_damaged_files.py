@@ -76,6 +76,7 @@ def test_of_a_finished_run(tmp_path):
     experiment = read(tmp_path / "whole")
     restart(experiment)
     expected = numbers(experiment)
+    finished = (run_of(experiment) / "finished.json").read_bytes()
     refused, made_again, files = set(), set(), 0
     for path, how, copy in damaged(tmp_path / "whole", tmp_path):
         files += 1
@@ -90,6 +91,7 @@ def test_of_a_finished_run(tmp_path):
             refused.add(path.parent.name if path.parent.parent.name == "checkpoints" else path.name)
             continue
         assert numbers(copy) == expected, (path, how)
+        assert (run_of(copy) / "finished.json").read_bytes() == finished, (path, how)  # times and all
         made_again.add(path.name)
     assert files >= 3 * 18
     # The last checkpoint and the settings are all that a finished run cannot do without.

@@ -105,7 +105,7 @@ class ProgressCallback(BaseCallback):
 class CheckpointCallback(BaseCallback):
     """Saves between two rollouts, when the buffer is empty and the last update is done."""
 
-    def __init__(self, every: int, save: Callable[[], None]) -> None:
+    def __init__(self, every: int, save: Callable[[], object]) -> None:
         super().__init__()
         self.every = every
         self.save = save
