@@ -36,6 +36,10 @@ test-library:
 	$(LIBRARY_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c $(LIBRARY_VENV)/constraints.txt -e '.[test]'
 	$(LIBRARY_VENV)/bin/python -m pytest $(PARALLEL) --ignore tests/train --ignore tests/sb3
 
+# Oldest, pinned and newest versions on every Python that is here; goes on where it stands.
+matrix:
+	$(PYTHON) -m benchmarks.matrix $(MATRIX)
+
 test-slow: .venv/installed
 	$(BIN)/python -m pytest -n 2 -m slow
 

@@ -240,13 +240,13 @@ def _damage(folder: Path) -> str | None:
 
 
 def _random_states() -> dict[str, Any]:
-    kind, keys, *rest = np.random.get_state(legacy=True)
-    torch_state = torch.get_rng_state().tolist()
-    return {"python": random.getstate(), "numpy": [kind, keys.tolist(), *rest], "torch": torch_state}
+    of_numpy = np.random.get_state(legacy=False)
+    of_numpy["state"]["key"] = of_numpy["state"]["key"].tolist()
+    return {"python": random.getstate(), "numpy": of_numpy, "torch": torch.get_rng_state().tolist()}
 
 
 def _set_random_states(states: dict[str, Any]) -> None:
     version, internal, gauss = states["python"]
     random.setstate((version, tuple(internal), gauss))
-    np.random.set_state(tuple(states["numpy"]))
+    np.random.set_state(states["numpy"])
     torch.set_rng_state(torch.tensor(states["torch"], dtype=torch.uint8))
