@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule, run_state_machine_as_test
 
 import safe_wrappers as sw
+from benchmarks.faults.wrapper_examples import CASES, build
 from safe_wrappers import info as keys
 from safe_wrappers.errors import SafeWrappersError
 
@@ -58,7 +59,7 @@ def slow(x):
 
 
 def made(env_id):
-    return Bottom(gym.make(env_id, max_episode_steps=HORIZON))
+    return Bottom(gym.make(env_id, max_episode_steps=HORIZON, disable_env_checker=True))
 
 
 def point_goal():
@@ -336,3 +337,20 @@ def test_any_calls_on_a_stack(stack):
 @pytest.mark.parametrize("machine", [VectorCalls, ReacherVectorCalls])
 def test_any_calls_on_the_filter_of_a_vector_env(machine):
     run(machine, 3, 12)
+
+
+@pytest.mark.parametrize(("name", "case"), CASES)
+def test_a_step_without_an_episode_is_refused(name, case):
+    env = build(name, case)
+    action = env.action_space.sample()
+    with pytest.raises(gym.error.ResetNeeded, match=r"is new, .*call reset before step"):
+        env.step(action)
+    with pytest.raises(gym.error.ResetNeeded, match="is new"):
+        pickle.loads(pickle.dumps(env)).step(action)
+    env.reset(seed=0)
+    with pytest.raises(REFUSALS):
+        env.reset(seed=-1)
+    with pytest.raises(gym.error.ResetNeeded, match="its last reset failed; call reset"):
+        env.step(action)
+    env.reset(seed=0)
+    env.step(action)

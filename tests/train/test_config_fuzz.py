@@ -199,6 +199,16 @@ def test_aliases_share_nothing(folder):
     assert read_config(path, ["a.b=2"]) == {"a": {"b": 2}, "c": {"b": 1}}
 
 
+@pytest.mark.parametrize("line", LINES)
+def test_strange_yaml_is_read_or_refused(folder, line):
+    path = folder / "config.yaml"
+    path.write_text(f"name: x\nz: {line}\n")
+    try:
+        assert read_config(path)["name"]
+    except SafeWrappersError as refusal:
+        assert str(path) in str(refusal)
+
+
 # What a task, a wrapper or an algorithm refuses ---------------------------------------------------------------
 
 
@@ -259,3 +269,16 @@ def test_what_cannot_be_trained_is_refused_before_its_first_step(folder, env, pa
         except SafeWrappersError as refusal:
             assert str(refusal).strip()
     assert os.listdir(folder) == ["config.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("env", "override"),
+    [
+        ("SafePointGoal1-v0", "arms.a.filter.escape={progress: {}}"),
+        ("InvertedPendulum-v5", "env.kwargs={render_mode: {}}"),
+    ],
+)
+def test_what_was_once_a_traceback_is_refused(folder, env, override):
+    (folder / "config.yaml").write_text(yaml.dump(MINIMAL))
+    with pytest.raises(SafeWrappersError, match="progress is a finite|cannot be made: AttributeError"):
+        check_training(parse_experiment(read_config(folder / "config.yaml", [f"env.id={env}", override])))
