@@ -190,9 +190,7 @@ class RandomModel:
             joint.attrib |= self._maybe(0.05 * self._odd, actuatorfrcrange=self._range(-3, 3))
 
     def _geom(self, body: Element, name: str) -> None:
-        kind = self._pick(
-            ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"), (4, 4, 1, 2, 3, 0.5)
-        )
+        kind = self._pick(("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"), (4, 4, 1, 2, 3, 0.5))
         sizes = {"sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "mesh": 0}[kind]
         geom = ET.SubElement(body, "geom", name=name, type=kind, pos=self._uniform(-0.3, 0.3, 3))
         if sizes:
@@ -282,7 +280,9 @@ class RandomModel:
 
     def _actuators(self) -> None:
         section = ET.SubElement(self._root, "actuator")
-        for i in range(self._random.choice((0, 1, 1, 2, 2, 3, 4)) if self._odd else self._random.randint(1, 4)):
+        for i in range(
+            self._random.choice((0, 1, 1, 2, 2, 3, 4)) if self._odd else self._random.randint(1, 4)
+        ):
             strange = self._odd and self._share(0.2)
             kind = self._pick(_OTHER if strange else _AFFINE)
             transmission = self._transmission(kind, strange)
@@ -320,7 +320,9 @@ class RandomModel:
         if kind == "damper":
             actuator.set("ctrlrange", f"0 {self._uniform(0.1, 3)}")
         elif kind != "adhesion" and self._share(0.8):
-            ends = self._pick(("-1 1", "-0.4 0.4", "0 1", "0.5 2", "-1e-6 1e-6", "-1e6 1e6"), (9, 3, 3, 1, 1, 1))
+            ends = self._pick(
+                ("-1 1", "-0.4 0.4", "0 1", "0.5 2", "-1e-6 1e-6", "-1e6 1e6"), (9, 3, 3, 1, 1, 1)
+            )
             actuator.set("ctrlrange", self._range(-3, 3) if self._share(0.3) else ends)
         if kind not in ("muscle", "damper", "adhesion", "dcmotor"):
             actuator.attrib |= self._maybe(0.05, ctrllimited="false")
@@ -363,7 +365,9 @@ class RandomModel:
         options = [("clock", {}), ("subtreecom", {"body": self._bodies[0]})]
         options += [(kind, {"joint": j}) for j in self._scalar[:1] for kind in ("jointpos", "jointvel")]
         options += [
-            (kind, {"site": s}) for s in self._sites[:1] for kind in ("accelerometer", "gyro", "touch", "rangefinder")
+            (kind, {"site": s})
+            for s in self._sites[:1]
+            for kind in ("accelerometer", "gyro", "touch", "rangefinder")
         ]
         for kind, of in self._random.sample(options, self._random.randint(0, len(options))):
             sensor = ET.SubElement(section, kind, **of)

@@ -5,11 +5,12 @@
     python -m benchmarks.random_models --seed 17         # one of them: its XML, and what became of it
 
 A model that MuJoCo compiles and can simulate becomes one of Gymnasium's MuJoCo envs, twice: one is filtered, the twin
-is given what was executed. It is *supported* if every forecast of an executed control is the env's step and the twin's
-to the last bit (to 0.001 where bodies may sleep, which MuJoCo's state does not tell), every executed control is finite
-and in the action space, and f + g u is MuJoCo's acceleration where no constraint is active. It is *refused* if the library says so and names the part of the model. Everything else is a
-*defect*: another exception, a crash, more than two minutes, a number that is wrong. Models run in batches, each in a
-process of its own, so that a crash is seen and has a seed.
+gets what was executed. It is *supported* if every forecast of an executed control is the env's step and the twin's to
+the last bit (to 0.001 where bodies may sleep, which MuJoCo's state does not tell), every executed control is finite
+and in the action space, and f + g u is MuJoCo's acceleration where no constraint is active. It is *refused* if the
+library says so and names the part of the model. Everything else is a *defect*: another exception, a crash, more than
+two minutes, a number that is wrong. Models run in batches, each in a process of its own, so that a crash is seen and
+has a seed. A defect that was found is tried again when the command is.
 """
 
 import argparse
@@ -44,7 +45,19 @@ LONGEST_S = 120.0
 """Of one model, the first one's imports and compilation included."""
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _HINGE_OR_SLIDE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-_READ = ("qpos", "qvel", "act", "qacc", "ctrl", "xpos", "xipos", "sensordata", "qfrc_actuator", "cfrc_ext", "mocap_pos")
+_READ = (
+    "qpos",
+    "qvel",
+    "act",
+    "qacc",
+    "ctrl",
+    "xpos",
+    "xipos",
+    "sensordata",
+    "qfrc_actuator",
+    "cfrc_ext",
+    "mocap_pos",
+)
 
 
 class Machine(MujocoEnv):
@@ -62,7 +75,9 @@ class Machine(MujocoEnv):
     def _set_action_space(self) -> gym.spaces.Box:
         limited, bounds = self.model.actuator_ctrllimited == 1, self.model.actuator_ctrlrange
         low, high = np.where(limited, bounds.T, [[-np.inf], [np.inf]])
-        self.action_space = gym.spaces.Box(low.astype(self._dtype), high.astype(self._dtype), dtype=self._dtype)
+        self.action_space = gym.spaces.Box(
+            low.astype(self._dtype), high.astype(self._dtype), dtype=self._dtype
+        )
         return self.action_space
 
     def reset_model(self) -> Any:
@@ -78,7 +93,7 @@ class Machine(MujocoEnv):
         return np.zeros(1, np.float32), 0.0, False, False, {}
 
 
-class Defect(Exception):
+class DefectError(Exception):
     """What the library did is wrong."""
 
 
@@ -136,8 +151,10 @@ def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random)
         proposed = _proposal(machine.action_space, rng)
         *_, info = env.step(proposed)
         executed = info["executed_action"]
-        if not (np.isfinite(executed).all() and machine.action_space.contains(executed.astype(proposed.dtype))):
-            raise Defect(f"executed {executed} of {machine.action_space}")
+        if not (
+            np.isfinite(executed).all() and machine.action_space.contains(executed.astype(proposed.dtype))
+        ):
+            raise DefectError(f"executed {executed} of {machine.action_space}")
         _check_forecast(onlooker, machine, executed)
         twin.step(executed.astype(proposed.dtype))
         _check_twin(machine, twin)
@@ -170,12 +187,14 @@ def _filtered(machine: Machine, plants: dict[str, Any], rng: random.Random) -> t
     for constraint in [*(first if rng.random() < 0.6 else []), *options]:
         also = [options[0]] if rng.random() < 0.2 and constraint is not options[0] else []
         try:
-            return sw.CBFActionFilter(machine, [constraint, *also], sw.MujocoPlant(**plants)), " | ".join(unfit)
+            return sw.CBFActionFilter(machine, [constraint, *also], sw.MujocoPlant(**plants)), " | ".join(
+                unfit
+            )
         except SafeWrappersError as error:
             if not _names_a_part(str(error), model):
                 raise
             unfit.append(str(error))
-    raise Defect(f"no constraint fits: {unfit}")
+    raise DefectError(f"no constraint fits: {unfit}")
 
 
 def _proposal(space: gym.spaces.Box, rng: random.Random) -> Any:
@@ -200,7 +219,7 @@ def _check_forecast(onlooker: sw.MujocoPlant, machine: Machine, executed: Any) -
     was_reset = machine.data.warning.number[mujoco.mjtWarning.mjWARN_BADQPOS :].any() and np.isnan(end).all()
     rounding = 1e-3 if _sleeps(machine.model) else 0.0  # MuJoCo's state does not say who sleeps
     if not (was_reset or np.allclose(end, reached, rtol=0.0, atol=rounding, equal_nan=True)):
-        raise Defect(f"the forecast is {np.abs(end - reached).max():.3g} away from the env")
+        raise DefectError(f"the forecast is {np.abs(end - reached).max():.3g} away from the env")
 
 
 def _check_twin(machine: Machine, twin: Machine) -> None:
@@ -210,7 +229,7 @@ def _check_twin(machine: Machine, twin: Machine) -> None:
         mujoco.mj_getState(m.model, m.data, state, _FULL)
     differ = [n for n in _READ if getattr(machine.data, n).tobytes() != getattr(twin.data, n).tobytes()]
     if states[0].tobytes() != states[1].tobytes() or differ:
-        raise Defect(f"the filtered env is elsewhere than its twin; they differ in {differ}")
+        raise DefectError(f"the filtered env is elsewhere than its twin; they differ in {differ}")
 
 
 def _check_response(onlooker: sw.MujocoPlant, rng: random.Random) -> None:
@@ -219,7 +238,7 @@ def _check_response(onlooker: sw.MujocoPlant, rng: random.Random) -> None:
     data = onlooker.forward()
     if data.nefc or not np.isfinite(effect).all():
         if not np.isfinite(effect).all():
-            raise Defect("g is not finite")
+            raise DefectError("g is not finite")
         return
     low, high = onlooker.actuators.acting_range(data.actuator_length, data.actuator_velocity)
     low = np.maximum(low, np.minimum(high, 3.0) - 6.0)
@@ -231,7 +250,7 @@ def _check_response(onlooker: sw.MujocoPlant, rng: random.Random) -> None:
     size = 1.0 + np.abs(expected.qacc).max(initial=0.0) + np.abs(effect * control).max(initial=0.0)
     missed = np.abs(drift + effect @ control - expected.qacc).max(initial=0.0)
     if not missed <= 1e-7 * size:
-        raise Defect(f"f + g u is {missed:.3g} away from an acceleration of {size - 1.0:.3g}")
+        raise DefectError(f"f + g u is {missed:.3g} away from an acceleration of {size - 1.0:.3g}")
 
 
 def _ask(onlooker: sw.MujocoPlant, executed: Any) -> None:
@@ -252,7 +271,7 @@ def _ask(onlooker: sw.MujocoPlant, executed: Any) -> None:
     onlooker.contact_forecast(executed)
     for what, found in asked.items():
         if not np.isfinite(found).all():
-            raise Defect(f"{what} is not finite at a finite state")
+            raise DefectError(f"{what} is not finite at a finite state")
 
 
 def child(first: int, last: int) -> None:
@@ -271,7 +290,9 @@ def outcomes(first: int, last: int) -> Iterator[tuple[int, str, str]]:
         with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes its log into the working directory
             command = [sys.executable, "-m", "benchmarks.random_models", "--child", str(first), str(last)]
             where = os.environ | {"PYTHONPATH": str(RESULTS.parents[1]), "MUJOCO_GL": "disabled"}
-            process = subprocess.Popen(command, stdout=subprocess.PIPE, cwd=folder, env=where, text=True, bufsize=1)
+            process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, cwd=folder, env=where, text=True, bufsize=1
+            )
             assert process.stdout is not None
             for line in _lines_in_time(process):
                 if line.strip().isdigit():
@@ -302,6 +323,7 @@ def _lines_in_time(process: "subprocess.Popen[str]") -> Iterator[str]:
 def kind_of(refusal: str) -> str:
     """A refusal without the names and numbers of one model."""
     first = refusal.partition("Use AnalyticPlant")[0].partition("Covered would be")[0]
+    first = first.partition("; the model has")[0].partition(" ('")[0]
     plain = re.sub(r"<[^>]* object at \w+>", "the env", first)
     return re.sub(r"'[^']*'", "'...'", re.sub(r"-?\d[\d.e+-]*", "N", plain))[:140].strip()
 
@@ -326,7 +348,14 @@ def main() -> None:
 def run(models: int, results: Path) -> None:
     """Count until there are so many models, and keep the counts after every batch."""
     path = results / "random_models.json"
-    new: dict[str, Any] = {"next_seed": 0, "mujoco": 0, "supported": 0, "refused": {}, "unfit": {}, "defects": []}
+    new: dict[str, Any] = {
+        "next_seed": 0,
+        "mujoco": 0,
+        "supported": 0,
+        "refused": {},
+        "unfit": {},
+        "defects": [],
+    }
     counts = json.loads(path.read_text()) if path.exists() else new
     again, counts["defects"] = counts["defects"], []
     for defect in again:  # they may have been mended

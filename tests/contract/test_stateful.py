@@ -16,9 +16,17 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 import safe_wrappers as sw
+from benchmarks.faults.wrapper_examples import CASES, build
 from safe_wrappers import info as keys
 from safe_wrappers.errors import SafeWrappersError
 
@@ -58,7 +66,7 @@ def slow(x):
 
 
 def made(env_id):
-    return Bottom(gym.make(env_id, max_episode_steps=HORIZON))
+    return Bottom(gym.make(env_id, max_episode_steps=HORIZON, disable_env_checker=True))
 
 
 def point_goal():
@@ -73,7 +81,9 @@ def reacher():
 
 def pendulum():
     plant = sw.AnalyticPlant(drift, push, angle_and_speed, lower=-2.0, upper=2.0, control_dt=0.05)
-    return sw.RecordInterventions(sw.CBFActionFilter(made("Pendulum-v1"), [sw.constraints.Barrier(slow)], plant))
+    return sw.RecordInterventions(
+        sw.CBFActionFilter(made("Pendulum-v1"), [sw.constraints.Barrier(slow)], plant)
+    )
 
 
 STACKS = [point_goal, reacher, pendulum]
@@ -129,7 +139,7 @@ def same(one, other, where=""):
         assert len(one) == len(other), where
         for i, (a, b) in enumerate(zip(one, other, strict=True)):
             same(a, b, f"{where}[{i}]")
-    elif getattr(one, "dtype", None) == object:
+    elif np.asarray(one).dtype.kind == "O":
         same(tuple(one), tuple(other), where)
     else:
         assert np.asarray(one).tobytes() == np.asarray(other).tobytes(), (where, one, other)
@@ -198,7 +208,10 @@ class Calls(RuleBasedStateMachine):
         changed = [bool(i[keys.CBF_INTERVENED]) for i in infos]
         corrections = [float(i[keys.CBF_CORRECTION]) for i in infos]
         margins = [float(i[keys.CBF_MARGIN]) for i in infos]
-        running = {name: info[f"interventions/{name}"] for name in ("rate", "correction_mean", "fallback", "margin_min")}
+        running = {
+            name: info[f"interventions/{name}"]
+            for name in ("rate", "correction_mean", "fallback", "margin_min")
+        }
         assert running["rate"] == sum(changed) / steps
         assert running["correction_mean"] == sum(corrections) / steps
         assert running["fallback"] == sum(bool(i[keys.CBF_FALLBACK]) for i in infos)
@@ -209,7 +222,9 @@ class Calls(RuleBasedStateMachine):
             summary = info[keys.EPISODE_SUMMARY]
             assert summary["length"] == steps
             assert summary["nonfinite"] == sum(bool(i[keys.CBF_NONFINITE]) for i in infos)
-            rewards = [float(step[1]) + float(step[4].get(keys.ADAPTION_PENALTY, 0.0)) for step in self.episode]
+            rewards = [
+                float(step[1]) + float(step[4].get(keys.ADAPTION_PENALTY, 0.0)) for step in self.episode
+            ]
             assert summary["return"] == pytest.approx(sum(rewards), abs=1e-9)
 
     @rule(margin=MARGINS)
@@ -224,7 +239,10 @@ class Calls(RuleBasedStateMachine):
     def look_on(self):
         self.stack.get_wrapper_attr("look")()
 
-    @rule(again=st.sampled_from([copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]), seed=st.integers(0, 5))
+    @rule(
+        again=st.sampled_from([copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]),
+        seed=st.integers(0, 5),
+    )
     def copy(self, again, seed):
         """A copy has the episodes of a stack that is made anew; the original does not notice."""
         copied, anew = again(self.stack), self.make()
@@ -297,7 +315,10 @@ class VectorCalls(RuleBasedStateMachine):
     def step_too_early(self, shares):
         assert answer(self.stack.step, inside(self.stack.action_space, shares))[1] is not None
 
-    @rule(again=st.sampled_from([copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]), seed=st.integers(0, 5))
+    @rule(
+        again=st.sampled_from([copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]),
+        seed=st.integers(0, 5),
+    )
     def copy(self, again, seed):
         copied, anew = again(self.stack), SyncVectorEnv([self.single] * 2)
         same(copied.reset(seed=seed), anew.reset(seed=seed), "the copy's reset")
@@ -336,3 +357,20 @@ def test_any_calls_on_a_stack(stack):
 @pytest.mark.parametrize("machine", [VectorCalls, ReacherVectorCalls])
 def test_any_calls_on_the_filter_of_a_vector_env(machine):
     run(machine, 3, 12)
+
+
+@pytest.mark.parametrize(("name", "case"), CASES)
+def test_a_step_without_an_episode_is_refused(name, case):
+    env = build(name, case)
+    action = env.action_space.sample()
+    with pytest.raises(gym.error.ResetNeeded, match=r"is new, .*call reset before step"):
+        env.step(action)
+    with pytest.raises(gym.error.ResetNeeded, match=r"is (new|a copy)"):
+        pickle.loads(pickle.dumps(env)).step(action)
+    env.reset(seed=0)
+    with pytest.raises(REFUSALS):
+        env.reset(seed=-1)
+    with pytest.raises(gym.error.ResetNeeded, match="its last reset failed"):
+        env.step(action)
+    env.reset(seed=0)
+    env.step(action)

@@ -38,3 +38,11 @@ def test_when_every_solver_gives_up_the_status_says_failed(monkeypatch, rows, of
     assert answer.status == "failed"
     assert (np.abs(answer.control) <= 1.0).all()
     assert answer.violation == pytest.approx((rows @ answer.control - offsets).max())
+
+
+def test_a_control_beyond_the_action_s_dtype_is_cast_to_its_largest_number():
+    far = np.array([1e300, -1e39, 0.5])
+    no_rows = np.zeros((0, 3)), np.zeros(0)
+    sent = projection.cast_inside(far, np.float32, *no_rows, np.full(3, -np.inf), np.full(3, np.inf))
+    most = np.finfo(np.float32).max
+    assert sent.dtype == np.float32 and sent.tolist() == [most, -most, 0.5]

@@ -303,6 +303,16 @@ def test_a_lease_does_not_take_other_units_for_setpoints():
         sw.LeaseExpiry(Machine(), budget, fallback="zero", motion_limits={"max_acceleration": 1.0})
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_probe_that_diverges_says_nothing_of_the_actions():
+    """MuJoCo then resets the state, and the control with it."""
+    wide = {"push": "", "low": [-1e10, -2.0], "high": [1e10, 1.0]}
+    assert bound(Machine(0.0, 1.0, **wide)).action_map is None
+    np.testing.assert_allclose(bound(Machine(0.0, [2.0, 1.0], **wide)).action_map.scale, [2.0, 1.0])
+    with pytest.raises(UnsupportedEnvError, match=r"in 102 of 102 steps its simulation diverged"):
+        bound(Machine([9e9, 0.0], [1e-3, 1.0], push='ctrlrange="-1e10 1e10"'))
+
+
 class MovedWall(Machine):
     """Every episode has its wall elsewhere."""
 

@@ -272,6 +272,23 @@ def test_a_delayed_actuator_is_refused():
         bound(env)
 
 
+@pytest.mark.parametrize("option", ['actuatorgroupdisable="2"', '><flag actuation="disable"/></option'])
+def test_a_disabled_actuator_is_refused(option):
+    xml = scene('<actuator><motor name="off" joint="hinge" group="2"/></actuator>').xml
+    closed = "" if "flag" in option else "/"
+    disabled = xml.replace('gravity="0 0 0"/>', f'gravity="0 0 0" {option}{closed}>')
+    with pytest.raises(UnsupportedEnvError, match="'off' is disabled"):
+        bound(Scene(disabled))
+
+
+def test_a_model_without_joints_has_an_acting_range():
+    xml = '<mujoco><worldbody><site name="tip"/><geom size=".1"/></worldbody>%s</mujoco>'
+    pull = '<actuator><position site="tip" kp="2" kv="1" forcerange="-1 1" ctrlrange="-9 9"/></actuator>'
+    plant = bound(Scene(xml % pull))
+    plant.observe()
+    assert (plant.acting_range[0] <= -0.5).all() and plant.f.size == 0
+
+
 @pytest.mark.skipif(mujoco.mj_version() < 3_012_000, reason="before 3.12 every actuator has a control")
 @pytest.mark.parametrize("motor_first", [True, False])
 def test_an_actuator_without_control_is_refused(motor_first):

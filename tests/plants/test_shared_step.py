@@ -190,6 +190,15 @@ def test_sharing_is_refused_where_it_cannot_be():
             sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(9.0)], plant=plant)
 
 
+@pytest.mark.skipif(not hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP"), reason="in this MuJoCo nothing sleeps")
+def test_nothing_is_shared_where_bodies_may_sleep():
+    env = gym.make("Hopper-v5")
+    env.unwrapped.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+    sw.MujocoPlant().bind(env)  # an env that was measured
+    with pytest.raises(ConfigurationError, match="no flag sleep"):
+        sw.MujocoPlant(share_step=True).bind(env)
+
+
 def test_an_env_that_nobody_measured_shares_on_request():
     class Own(gym.envs.mujoco.hopper_v5.HopperEnv):
         """The same robot from another module."""

@@ -1,7 +1,7 @@
-"""Configs of any kind: an experiment, or one line for people and exit status 1; no traceback, and nothing left behind.
+"""Configs of any kind: an experiment, or a line for people and exit status 1; no traceback, and nothing left behind.
 
-What is drawn: the configs of the repo with settings deleted, renamed, replaced and added; mappings of the schema's keys
-with values of any kind; YAML of any kind, and bytes that are none. `make fuzz` draws thousands.
+What is drawn: the configs of the repo with settings deleted, renamed, replaced and added; mappings of the schema's
+keys with values of any kind; YAML of any kind, and bytes that are none. `make fuzz` draws thousands.
 """
 
 import copy
@@ -27,9 +27,9 @@ from safe_wrappers.train.config.models import ArmConfig
 from safe_wrappers.train.config.stored import stored_arm
 from safe_wrappers.train.experiment import check_training
 from safe_wrappers.wrappers.faults import FAULTS
+from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
 from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
-from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
 CONFIGS = {p.stem: p.read_text() for p in sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))}
@@ -42,11 +42,37 @@ MINIMAL = {
     "seeds": [0],
 }
 WORDS = [
-    *("", "x", "none", "protect", "constraints", "PPO", "SAC", "nan", "linear_3e-4", "linear_0", "a/b", "../..", "\0"),
-    *("math:sqrt", "nowhere:f", "Pendulum-v1", "brake", "HerReplayBuffer", "wandb", "both", "é" * 99, "a.zip"),
+    *(
+        "",
+        "x",
+        "none",
+        "protect",
+        "constraints",
+        "PPO",
+        "SAC",
+        "nan",
+        "linear_3e-4",
+        "linear_0",
+        "a/b",
+        "../..",
+        "\0",
+    ),
+    *(
+        "math:sqrt",
+        "nowhere:f",
+        "Pendulum-v1",
+        "brake",
+        "HerReplayBuffer",
+        "wandb",
+        "both",
+        "é" * 99,
+        "a.zip",
+    ),
 ]
 NUMBERS = [0, -1, 1, 3, 2**63, 10**30, 0.5, -0.0, 1e-320, 1e308, math.nan, math.inf, -math.inf]
-LEAVES = st.one_of(st.none(), st.booleans(), st.sampled_from(NUMBERS), st.sampled_from(WORDS), st.text(max_size=4))
+LEAVES = st.one_of(
+    st.none(), st.booleans(), st.sampled_from(NUMBERS), st.sampled_from(WORDS), st.text(max_size=4)
+)
 JUNK = st.recursive(
     st.one_of(LEAVES, st.dates(), st.binary(max_size=3)),
     lambda inner: (
@@ -57,9 +83,38 @@ JUNK = st.recursive(
 )
 LINES = [
     "!!python/object/apply:os.abort []",
-    *("a: &a [*a]", "*nope", "<<: 3", "? [1]\n: 3", "{? {a: 1} : 2}", "!!omap [a: 1]", "!!set {a}", "!!binary 'x'"),
-    *("!!bool x", "!!int ''", "!!float .", "!!timestamp x", "2020-13-45", "2020-01-01", "0b", "0x_", "!mine x", "\t- a"),
-    *("%YAML 9.9\n---", "--- \n---", "name: a\nname: b", "[" * 2000, "0x" + "f" * 5000, "9" * 5000, ":::", "= : 1"),
+    *(
+        "a: &a [*a]",
+        "*nope",
+        "<<: 3",
+        "? [1]\n: 3",
+        "{? {a: 1} : 2}",
+        "!!omap [a: 1]",
+        "!!set {a}",
+        "!!binary 'x'",
+    ),
+    *(
+        "!!bool x",
+        "!!int ''",
+        "!!float .",
+        "!!timestamp x",
+        "2020-13-45",
+        "2020-01-01",
+        "0b",
+        "0x_",
+        "!mine x",
+        "\t- a",
+    ),
+    *(
+        "%YAML 9.9\n---",
+        "--- \n---",
+        "name: a\nname: b",
+        "[" * 2000,
+        "0x" + "f" * 5000,
+        "9" * 5000,
+        ":::",
+        "= : 1",
+    ),
     "a: &a [1,1,1,1,1,1,1,1]\nb: &b [*a,*a,*a,*a,*a,*a,*a]\nc: &c [*b,*b,*b,*b,*b,*b,*b]\nd: &d [*c,*c,*c,*c,*c,*c]\n"
     "e: &e [*d,*d,*d,*d,*d,*d,*d]\nf: [*e,*e,*e,*e,*e,*e,*e,*e]",
 ]
@@ -76,7 +131,9 @@ def places(data, at=()):
     """The keys that lead to each value in it."""
     if at:
         yield at
-    for key, value in data.items() if isinstance(data, dict) else enumerate(data if isinstance(data, list) else ()):
+    for key, value in (
+        data.items() if isinstance(data, dict) else enumerate(data if isinstance(data, list) else ())
+    ):
         yield from places(value, (*at, key))
 
 
@@ -145,7 +202,10 @@ def damaged(draw, texts):
 
 TEXTS = st.one_of(mutated(), WHOLE).map(yaml.dump)
 CONTENTS = st.one_of(
-    TEXTS.map(str.encode), damaged(TEXTS), damaged(st.sampled_from(sorted(CONFIGS.values()))), st.binary(max_size=20)
+    TEXTS.map(str.encode),
+    damaged(TEXTS),
+    damaged(st.sampled_from(sorted(CONFIGS.values()))),
+    st.binary(max_size=20),
 )
 OVERRIDES = st.lists(
     st.builds(
@@ -163,7 +223,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@many(250, 3000)
+@many(150, 3000)
 @given(content=CONTENTS, overrides=OVERRIDES)
 @example(b"", [])
 @example(b"\xff\xfe", [])
@@ -199,6 +259,16 @@ def test_aliases_share_nothing(folder):
     assert read_config(path, ["a.b=2"]) == {"a": {"b": 2}, "c": {"b": 1}}
 
 
+@pytest.mark.parametrize("line", LINES)
+def test_strange_yaml_is_read_or_refused(folder, line):
+    path = folder / "config.yaml"
+    path.write_text(f"name: x\nz: {line}\n")
+    try:
+        assert read_config(path)["name"]
+    except SafeWrappersError as refusal:
+        assert str(path) in str(refusal)
+
+
 # What a task, a wrapper or an algorithm refuses ---------------------------------------------------------------
 
 
@@ -209,7 +279,9 @@ def options_of(names):
 
 BUDGET = [field.name for field in fields(StoppingBudget)]
 PARTS = {
-    "env.kwargs": options_of(["render_mode", "frame_skip", "xml_file", "reset_noise_scale", "max_episode_steps"]),
+    "env.kwargs": options_of(
+        ["render_mode", "frame_skip", "xml_file", "reset_noise_scale", "max_episode_steps"]
+    ),
     "env.occlusion": options_of(arguments(OcclusionPenalty)),
     "env.faults": st.sampled_from(sorted(FAULTS)).flatmap(
         lambda fault: st.fixed_dictionaries({fault: options_of(arguments(FAULTS[fault]))})
@@ -231,7 +303,9 @@ PARTS = {
     ),
     "arms.a.learner": st.sampled_from(["safe_set_map", {"kind": "safe_set_map", "anchor": "nowhere:f"}]),
     "arms.a.start_from": st.sampled_from(["b", "a.zip", "/", ".zip"]),
-    "hyperparameters": options_of(["policy", "policy_kwargs", "ent_coef", "train_freq", "rollout_buffer_class"]),
+    "hyperparameters": options_of(
+        ["policy", "policy_kwargs", "ent_coef", "train_freq", "rollout_buffer_class"]
+    ),
 }
 
 
@@ -259,3 +333,16 @@ def test_what_cannot_be_trained_is_refused_before_its_first_step(folder, env, pa
         except SafeWrappersError as refusal:
             assert str(refusal).strip()
     assert os.listdir(folder) == ["config.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("env", "override"),
+    [
+        ("SafePointGoal1-v0", "arms.a.filter.escape={progress: {}}"),
+        ("InvertedPendulum-v5", "env.kwargs={render_mode: {}}"),
+    ],
+)
+def test_what_was_once_a_traceback_is_refused(folder, env, override):
+    (folder / "config.yaml").write_text(yaml.dump(MINIMAL))
+    with pytest.raises(SafeWrappersError, match=r"progress is a finite|cannot be made: AttributeError"):
+        check_training(parse_experiment(read_config(folder / "config.yaml", [f"env.id={env}", override])))

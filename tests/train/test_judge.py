@@ -289,3 +289,13 @@ def test_the_label_says_that_the_filters_own_limits_judged(fake_experiment):
         assert "judged by the filter" in said and "own limits" in said
     assert summary.table["bare"]["filter_off"]["violations"].seeds == 1
     assert summary.table["safe"]["filter_on"]["violations"].iqm == 0
+
+
+def test_a_judge_that_reads_the_observation_is_given_it():
+    protect = FilterConfig(protect={})
+    env = make_stack(EnvConfig("Pendulum-v1", judge=protect), FilterConfig())
+    env.reset(seed=0)
+    for _ in range(25):  # full torque one way takes it beyond the recipe's 6 rad/s
+        observation, *_, info = env.step(np.array([2.0], np.float32))
+        assert info[keys.COST] == float(abs(observation[2]) > 6.0)
+    assert info["interventions/cost"] > 0.0

@@ -25,7 +25,11 @@ class _Loader(yaml.SafeLoader):
             found = super().construct_object(node, deep)
         except ConfigurationError:
             raise
-        except (ValueError, LookupError, AttributeError) as error:  # `2020-13-45`, `!!bool x`, `!!timestamp x`
+        except (
+            ValueError,
+            LookupError,
+            AttributeError,
+        ) as error:  # `2020-13-45`, `!!bool x`, `!!timestamp x`
             kind = node.tag.rpartition(":")[2]
             raise _unreadable(node, f"{node.value!r} is no {kind} ({error})") from None
         if isinstance(found, int) and found.bit_length() > _BITS:

@@ -26,14 +26,14 @@ def shared_step(
     `exact` says whether rollouts start from the env's present state, on a copy of its model. `wanted` is None to take
     the envs that were measured alone, True for any that does not override the step, or a ConfigurationError.
     """
-    raw = env.unwrapped
+    raw: Any = env.unwrapped
     inherits = getattr(type(raw), "_step_mujoco_simulation", None) is MujocoEnv._step_mujoco_simulation
     # MuJoCo's state, from which rollouts start, does not say which bodies sleep.
     same = exact and inherits and not raw.model.opt.enableflags & _SLEEP
     if wanted and not same:
         raise ConfigurationError(
-            "share_step=True needs the env's own model, no delay, no flag sleep, and an env that steps as Gymnasium's "
-            f"MujocoEnv does; {raw} and its plant do not have all of these: leave it out"
+            "share_step=True needs the env's own model, no delay, no flag sleep, and an env that steps as "
+            f"Gymnasium's MujocoEnv does; {raw} and its plant do not have all of these: leave it out"
         )
     known = wanted or (wanted is None and type(raw).__module__.startswith(_KNOWN))
     return SharedStep(raw, substeps) if same and known else None

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable
-from numbers import Real
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -76,7 +75,7 @@ class StuckEscape(LayerWrapper):
             raise ConfigurationError(
                 "StuckEscape needs a CBFActionFilter inside: StuckEscape(sw.protect(env))"
             )
-        if not (isinstance(progress, Real) and np.isfinite(progress)):
+        if not (isinstance(progress, int | float | np.number) and np.isfinite(progress)):
             raise ConfigurationError(f"progress is a finite sum of rewards, got {progress!r}")
         if value is not None and not callable(value):
             raise ConfigurationError(
