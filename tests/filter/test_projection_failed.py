@@ -38,3 +38,16 @@ def test_when_every_solver_gives_up_the_status_says_failed(monkeypatch, rows, of
     assert answer.status == "failed"
     assert (np.abs(answer.control) <= 1.0).all()
     assert answer.violation == pytest.approx((rows @ answer.control - offsets).max())
+
+
+def test_a_least_squares_answer_that_is_no_optimum_is_not_taken(monkeypatch):
+    a, b = np.array([[1.0, 0.2], [0.0, 1.0], [0.3, 0.1]]), np.array([0.4, -0.2, 0.1])
+    problem = a, b, np.full(2, -1.0), np.full(2, 1.0)
+    right, real = projection.box_least_squares(*problem), daqp.solve
+
+    def elsewhere(*arguments, **options):
+        x, value, _, info = real(*arguments, **options)
+        return x + 0.5, value, 1, info
+
+    monkeypatch.setattr(daqp, "solve", elsewhere)
+    np.testing.assert_allclose(projection.box_least_squares(*problem), right, atol=1e-9)  # inside the box
