@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from benchmarks.faults.outcomes import Found, judged
+from benchmarks.faults.outcomes import Found, Outcome, judged
 from benchmarks.faults.stacks import BEFORE, Answer, Row, Session
 
 Change = Callable[[Any], Any]
@@ -93,7 +93,14 @@ def inputs(row: Row) -> dict[tuple[str, str], Callable[[Session], Found]]:
                 plain = int(numbers) if discrete else numbers.astype(kind)
             answer = session.step(spoiled)
             expected = without_a_fault(plain) if same_numbers else usual()
-            return judged(row, session, answer, expected, lambda: row.bare().begin().step(spoiled))
+            found = judged(row, session, answer, expected, lambda: row.bare().begin().step(spoiled))
+            if (
+                same_numbers
+                and found.outcome is Outcome.SILENT
+                and np.array_equal(answer.reached, expected.reached)
+            ):
+                return Found(Outcome.PASSED, "the env's own arithmetic is that of what it was given")
+            return found
 
         return run
 

@@ -132,6 +132,8 @@ def _less_is_known(info: dict[str, Any], usual: dict[str, Any]) -> str:
     """What info says of a silence: nothing in sight, a lease that runs down, an old image, no new chunk."""
     if "occlusion/visible" in info and not np.any(info["occlusion/visible"]):
         return "occlusion/visible is False, occlusion/sigma grows"
+    if "occlusion/sigma" in info and np.any(info["occlusion/sigma"] > usual["occlusion/sigma"]):
+        return "occlusion/sigma"
     for key, sign in (("lease/remaining_s", -1), ("teleop/round_trip_s", 1), ("handover/latency", -1)):
         if key in info and sign * (info[key] - usual[key]) > 0.0:
             return key
@@ -171,6 +173,9 @@ def _clock(by_s: float) -> Callable[[Row], Cell]:
 
             usual = row.open().begin().step(action)
             found = judged(row, session, answer, usual, alone)
+            said = _less_is_known(answer.info, usual.info)
+            if found.outcome is Outcome.SILENT and said:
+                return Found(Outcome.FLAGGED, said)
             corrected = answer.info.get("cbf/correction", 0.0) > usual.info.get("cbf/correction", 0.0)
             if found.outcome is Outcome.SILENT and corrected and answer.info["cbf/intervened"]:
                 return Found(Outcome.FLAGGED, "cbf/intervened: it begins to measure anew, and corrects more")

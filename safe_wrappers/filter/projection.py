@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter import rows_and_box
 from safe_wrappers.filter.problem import Array, Projection, Status
-from safe_wrappers.filter.qp import control_unit, nearest, plain, solve_with_daqp
+from safe_wrappers.filter.qp import OPTIMALITY_TOLERANCE, control_unit, nearest, plain, solve_with_daqp
 from safe_wrappers.filter.rows_and_box import LARGEST, OVERFLOWING, keep_rows, row_slacks
 
 OWN = "active-set"
@@ -133,8 +133,13 @@ def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
     unit = control_unit(best, lower, upper, 0.0)
     no_rows = np.zeros((0, linear.size)), np.zeros(0)
     answer = solve_with_daqp(hessian, linear / unit, *no_rows, lower / unit, upper / unit)
+    if answer is not None:
+        found = np.clip(answer[0] * unit, lower, upper)
+        downhill = np.clip(found - (hessian @ found + linear) / np.diag(hessian), lower, upper)
+        if bool((np.abs(downhill - found) <= OPTIMALITY_TOLERANCE * unit).all()):
+            return np.asarray(found)
     # Without rows the problem cannot be infeasible; on a numerical failure the unbounded answer, clipped.
-    return np.asarray(np.clip(best if answer is None else answer[0] * unit, lower, upper))
+    return np.asarray(np.clip(best, lower, upper))
 
 
 def cast_inside(control: Array, dtype: Any, normals: Array, offsets: Array, low: Array, high: Array) -> Any:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from safe_wrappers.filter.problem import ORDINARY_BOX, UNBOUNDED, Array, half_width, residual_scale
 from safe_wrappers.filter.rows_and_box import row_slacks
 
-_OPTIMALITY_TOLERANCE = 1e-4  # between a backend's answer and the one of its multipliers, in `control_unit`s
+OPTIMALITY_TOLERANCE = 1e-4  # between a backend's answer and the one of its multipliers, in `control_unit`s
 _SOLVERS_TOLERANCE = 1e-11  # of daqp, in `control_unit`s: rows at a small angle multiply a residual
 Answer = tuple[Array, Array, int]
 """x, row multipliers, iterations."""
@@ -74,7 +74,7 @@ def _checked(
             return None
         x = polished
     # Feasible is not yet closest: the multipliers must lead from the nominal to the answer.
-    if not float(np.abs(np.clip(u - multipliers @ g, lo, hi) - x).max()) <= _OPTIMALITY_TOLERANCE:
+    if not float(np.abs(np.clip(u - multipliers @ g, lo, hi) - x).max()) <= OPTIMALITY_TOLERANCE:
         return None
     return x, multipliers, iterations
 

@@ -388,7 +388,7 @@ def test_a_non_finite_action_does_not_get_through(name, case, bad):
         return
     action = np.full(env.action_space.shape, bad)
     if name in ONLY_LOOKING:  # nothing inside would answer it
-        with pytest.raises(sw.SafeWrappersError, match="finite numbers.*the env was not stepped"):
+        with pytest.raises(sw.SafeWrappersError, match=r"finite numbers.*the env was not stepped"):
             env.step(action)
         assert not hasattr(witness, "action")
         return
