@@ -162,10 +162,10 @@ def test_the_table_says_what_no_violation_bounds():
     rows = [of(POINT, "random", at) for at in range(3)] + [of(POINT, "random", 0, False, violations=40)]
     rows += [of(MAZE, "CEM", 0, violations=1, unflagged=1, examples=[{"seed": 0}], simulated=360)]
     text = table(collected(rows))
-    assert f"| {POINT} | random | 3,000 | 0 | 40 | 10.0% | 0 | 0 | 0 | 4 | 100 | - |" in text
-    assert f"| {MAZE} | CEM | 1,000 | 1 | - | 10.0% | 0 | 0 | 0 | 4 | 100 | 360 |" in text
-    assert f"| {POINT} | 3,000 | 0 | 1.0e-03 a step | 4 |" in text
-    assert "| all | 4,000 | 1 | - | 4 |" in text
+    assert f"| {POINT} | random | 3,000 | 0 | 40 | 10.0% | 0 | 0 | 0 | 4.000 | 100 | - |" in text
+    assert f"| {MAZE} | CEM | 1,000 | 1 | - | 10.0% | 0 | 0 | 0 | 4.000 | 100 | 360 |" in text
+    assert f"| {POINT} | 3,000 | 0 | 1.0e-03 a step | 4.000 |" in text
+    assert "| all | 4,000 | 1 | - | 4.000 |" in text
     assert collected(rows)["drivers"][1]["examples"] == [{"seed": 0}]
 
 
