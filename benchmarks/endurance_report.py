@@ -115,7 +115,7 @@ def table(found: dict[str, Any]) -> str:
         lines.append(
             f"| {r['env']} | {r['driver']} | {r['steps']:,} | {r['violations']:,} | {off} "
             f"| {r['intervened'] / r['steps']:.1%} | {flags} | {1e3 * r['smallest']:.3f} "
-            f"| {'-' if r['us'] is None else format(r['us'], '.0f')} | {format(r['simulated'], ',') if r['simulated'] else '-'} |"
+            f"| {'-' if r['us'] is None else format(r['us'], '.0f')} | {r['simulated'] or '-'} |"
         )
     lines += ["", "| env | steps | violations | at most, at 95 % | lowest h (mm) |", "|---|---|---|---|---|"]
     for env in [*dict.fromkeys(r["env"] for r in rows), ""]:
