@@ -23,6 +23,7 @@ import os
 import platform
 import time
 import warnings
+import zlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import zip_longest
@@ -161,7 +162,8 @@ def attacked(chunk: Chunk) -> tuple[Any, list[Any]]:
     envs: Any = SyncVectorEnv([(lambda: case.protect(case.make())) if search else case.make] * n)
     if chunk.filtered and not search:
         envs = sw.protect(envs)
-    seeds = [int(seed) for seed in np.random.SeedSequence(chunk.seed).generate_state(2 * n)]
+    own = zlib.crc32(f"{chunk.env} {chunk.driver}".encode())  # no driver starts where another does
+    seeds = [int(seed) for seed in np.random.SeedSequence([chunk.seed, own]).generate_state(2 * n)]
     envs.reset(seed=seeds[:n])
     rngs = map(np.random.default_rng, seeds[n:])
     if search:
@@ -175,14 +177,16 @@ def _count_violation(tally: Tally, chunk: Chunk, infos: dict[str, Any], i: int, 
     tally.violations += 1
     tally.unflagged += not {*flags} - {"intervened"}
     if chunk.filtered and len(tally.examples) < EXAMPLES:
-        # The envs of a chunk make the same steps again.
-        found = {"seed": chunk.seed, "of": i, "time": tally.steps, "missed": missed, "flags": flags}
+        # The chunk makes it again, in its env of this number, when it has made so many steps.
+        found = {"seed": chunk.seed, "of": i, "after": tally.steps, "missed": missed, "flags": flags}
         tally.examples.append(found | {"executed": infos["executed_action"][i].tolist()})
 
 
 def learn(chunk: Chunk) -> dict[str, Any]:
     """Train PPO on violations, through the filter, and evaluate it; all filtered steps count."""
-    found = trained_adversary.run(trained_adversary.Job(chunk.env, chunk.planned, chunk.seed), episodes=2)
+    # PPO's envs have the seeds after its own.
+    job = trained_adversary.Job(chunk.env, chunk.planned, 1000 * chunk.seed)
+    found = trained_adversary.run(job, episodes=2)
     tally = Tally()
     for part in ("training", "deterministic", "stochastic"):
         tally = tally.plus(Tally(**found[part]))

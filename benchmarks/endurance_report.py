@@ -114,7 +114,7 @@ def table(found: dict[str, Any]) -> str:
         flags = " | ".join(f"{r[name]:,}" for name in FLAGS[1:])
         lines.append(
             f"| {r['env']} | {r['driver']} | {r['steps']:,} | {r['violations']:,} | {off} "
-            f"| {r['intervened'] / r['steps']:.1%} | {flags} | {1e3 * r['smallest']:.3g} "
+            f"| {r['intervened'] / r['steps']:.1%} | {flags} | {1e3 * r['smallest']:.3f} "
             f"| {'-' if r['us'] is None else format(r['us'], '.0f')} | {r['simulated'] or '-'} |"
         )
     lines += ["", "| env | steps | violations | at most, at 95 % | lowest h (mm) |", "|---|---|---|---|---|"]
@@ -124,7 +124,7 @@ def table(found: dict[str, Any]) -> str:
         if steps:
             bound = f"{3.0 / steps:.1e} a step" if not bad else "-"
             least = 1e3 * min(r["smallest"] for r in part)
-            lines.append(f"| {env or 'all'} | {steps:,} | {bad:,} | {bound} | {least:.3g} |")
+            lines.append(f"| {env or 'all'} | {steps:,} | {bad:,} | {bound} | {least:.3f} |")
     simulated, bad = (sum(r[name] for r in rows) for name in ("simulated", "simulated_violations"))
     lines += ["", f"Of {simulated:,} steps that searches simulated, {bad:,} were in violation.", ""]
     for m in found["memory"]:

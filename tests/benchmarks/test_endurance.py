@@ -12,7 +12,7 @@ pytest.importorskip("gymnasium_robotics")
 
 from benchmarks import endurance
 from benchmarks.cases import CASES
-from benchmarks.endurance import Chunk, plan, run
+from benchmarks.endurance import Chunk, attacked, plan, run
 from benchmarks.endurance_report import collected, memory, speed, table
 from benchmarks.searching_drivers import HORIZON, SearchingDriver, cross_entropy, differences
 from benchmarks.trained_adversary import Tally
@@ -40,6 +40,12 @@ def test_a_chunk_follows_from_its_seed():
     assert counts(first) == counts(again) != counts(other)
 
 
+def test_no_two_drivers_start_alike():
+    chunks = [Chunk(POINT, driver, 1, 0) for driver in ("random", "bang-bang")]
+    starts = [env.unwrapped.hazard_positions for c in chunks for env in attacked(c)[0].unwrapped.envs]
+    assert len(np.unique(starts, axis=0)) == len(starts) == 2 * endurance.TOGETHER
+
+
 def test_steps_that_reset_an_env_are_not_judged():
     # An episode of the maze has 300 steps; its judge would raise if a reset were between its two looks.
     row = run(Chunk(MAZE, "corner-seeking", 16 * 302, 0))
@@ -60,7 +66,7 @@ def test_a_violation_is_kept_with_what_makes_it_again(monkeypatch):
     monkeypatch.setitem(CASES, POINT, dataclasses.replace(CASES[POINT], judge=lambda env: Strict()))
     row = run(Chunk(POINT, "random", 32, 7))
     assert (row["violations"], row["unflagged"]) == (32, 32)
-    assert [(e["seed"], e["of"], e["time"]) for e in row["examples"][14:18]] == [
+    assert [(e["seed"], e["of"], e["after"]) for e in row["examples"][14:18]] == [
         (7, 14, 0), (7, 15, 0), (7, 0, 16), (7, 1, 16)
     ]  # fmt: skip
     assert np.shape(row["examples"][0]["executed"]) == (2,)
@@ -156,10 +162,10 @@ def test_the_table_says_what_no_violation_bounds():
     rows = [of(POINT, "random", at) for at in range(3)] + [of(POINT, "random", 0, False, violations=40)]
     rows += [of(MAZE, "CEM", 0, violations=1, unflagged=1, examples=[{"seed": 0}], simulated=360)]
     text = table(collected(rows))
-    assert f"| {POINT} | random | 3,000 | 0 | 40 | 10.0% | 0 | 0 | 0 | 4 | 100 | - |" in text
-    assert f"| {MAZE} | CEM | 1,000 | 1 | - | 10.0% | 0 | 0 | 0 | 4 | 100 | 360 |" in text
-    assert f"| {POINT} | 3,000 | 0 | 1.0e-03 a step | 4 |" in text
-    assert "| all | 4,000 | 1 | - | 4 |" in text
+    assert f"| {POINT} | random | 3,000 | 0 | 40 | 10.0% | 0 | 0 | 0 | 4.000 | 100 | - |" in text
+    assert f"| {MAZE} | CEM | 1,000 | 1 | - | 10.0% | 0 | 0 | 0 | 4.000 | 100 | 360 |" in text
+    assert f"| {POINT} | 3,000 | 0 | 1.0e-03 a step | 4.000 |" in text
+    assert "| all | 4,000 | 1 | - | 4.000 |" in text
     assert collected(rows)["drivers"][1]["examples"] == [{"seed": 0}]
 
 
