@@ -104,8 +104,9 @@ def _silent(row: Row) -> Cell:
             return Found(Outcome.NOT_APPLICABLE, "it reads the simulation's own state")
         for camera in cameras:
             camera._sight.sees = lambda points, bodies: np.zeros(len(points), dtype=bool)
-        if not (receivers or cameras):
-            session.bottoms[0].__dict__.update(dict.fromkeys(published))
+        plants = _plants(session) if not (receivers or cameras) else []
+        for plant in plants:
+            plant.attribute = _without(plant.attribute, published)
         found = Found(Outcome.HARMLESS, "and was not needed")
         for action in session.actions[BEFORE:]:
             for receiver in receivers[:1]:
@@ -119,8 +120,8 @@ def _silent(row: Row) -> Cell:
             # What is in force goes on for a while, as it is meant to; then it has to be said.
             if found.outcome not in (Outcome.HARMLESS, Outcome.SILENT) or session.ended(answer):
                 break
-        for name in published:
-            session.bottoms[0].__dict__.pop(name, None)
+        for plant in plants:
+            del plant.attribute
         for camera in cameras:
             del camera._sight.sees
         return found
@@ -144,11 +145,22 @@ def _published(row: Row) -> list[str]:
     """The attributes of the env that the constraints read."""
     session = row.open()
     asked: list[str] = []
-    for plant in {id(engine.plant): engine.plant for engine in session.engines()}.values():
-        real = plant.attribute
-        plant.attribute = lambda name, real=real: (asked.append(name), real(name))[1]
+    for plant in _plants(session):
+        plant.attribute = _noted(plant.attribute, asked)
     session.begin(1)
-    return sorted(name for name in set(asked) if hasattr(session.raw(), name))
+    return sorted(name for name in set(asked) if name.endswith("positions"))
+
+
+def _plants(session: Session) -> list[Any]:
+    return list({id(engine.plant): engine.plant for engine in session.engines()}.values())
+
+
+def _noted(real: Callable[[str], Any], asked: list[str]) -> Callable[[str], Any]:
+    return lambda name: (asked.append(name), real(name))[1]
+
+
+def _without(real: Callable[[str], Any], silent: list[str]) -> Callable[[str], Any]:
+    return lambda name: None if name in silent else real(name)
 
 
 def _clock(by_s: float) -> Callable[[Row], Cell]:

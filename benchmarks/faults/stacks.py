@@ -99,7 +99,7 @@ class Row:
     @property
     def kind(self) -> str:
         """Wrapper or constraint."""
-        return "wrapper" if hasattr(sw, self.name) else "constraint"
+        return "wrapper" if self.name in sw.__all__ else "constraint"
 
     def open(self, **more: Any) -> "Session":
         """A new one, before its first episode."""

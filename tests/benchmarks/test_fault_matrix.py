@@ -110,7 +110,7 @@ class Mumbles(Bad):
         (Bad, ("deep-copied in the middle", ""), Outcome.DIVERGED),
         (Bad, ("pickled in the middle", ""), Outcome.DIVERGED),
         (HidesNaN, ("NaN", "all"), Outcome.SILENT),
-        (Clips, ("huge", "1e30"), Outcome.SILENT),
+        (Clips, ("huge", "1e300"), Outcome.SILENT),
         (Remembers, ("NaN", "all"), Outcome.DIVERGED),
         (Mumbles, ("NaN", "all"), Outcome.CRASHED),
     ],
@@ -180,7 +180,7 @@ def test_a_budget_reads_nothing_of_a_state_that_is_broken_elsewhere():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda env: sw.ChunkHandover(env, 1, 1, fallback="zero"),
+        lambda env: sw.ChunkHandover(env, 1, 1, blend="replace", fallback="zero"),
         lambda env: sw.TeleopChannel(env, 0.0, 0.0),
     ],
 )
