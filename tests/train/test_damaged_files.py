@@ -136,6 +136,18 @@ def test_of_a_run_that_was_killed(tmp_path, monkeypatch):
     assert ("seed_0", "episodes.csv") in went_on[0]
 
 
+def test_without_a_checkpoint_a_finished_run_is_not_begun_again(tmp_path):
+    experiment = read(tmp_path)
+    restart(experiment)
+    table = run_of(experiment) / "episodes.csv"
+    shutil.rmtree(run_of(experiment) / "checkpoints")
+    train_run(experiment.arms[0], 0, run_of(experiment), QUIET)  # whole: somebody made room
+    table.write_text("")
+    with pytest.raises(RunStateError, match=r"episodes\.csv is not .*, and no checkpoint is left .*; delete"):
+        train_run(experiment.arms[0], 0, run_of(experiment), QUIET)
+    assert table.read_text() == ""
+
+
 def test_a_damaged_film_is_not_shown(tmp_path):
     import json
 

@@ -112,11 +112,7 @@ def test_training_has_what_the_kind_says_and_the_rows_have_the_tasks_return(
     folder = experiment.run_folder(arm, 0)
     watch, models = Watch(), []
     monkeypatch.setattr(run_module, "InterventionCallback", lambda: watch)
-    monkeypatch.setattr(
-        run_module,
-        "_facts",
-        lambda model, *rest, facts=run_module._facts: (models.append(model), facts(model, *rest))[1],
-    )
+    monkeypatch.setattr(run_module, "write_policy", lambda *given: models.append(given[-1]))
     train_run(arm, 0, folder, Reports().progress)
     (model,) = models
 

@@ -87,13 +87,17 @@ def train_run(
     with telling_of_storage(folder), only_writer(folder):
         check_folder(arm, seed, folder)
         wrong = _finished_damage(folder)
-        if wrong is not None:
-            progress.say(f"{wrong}; made again from the last checkpoint")
-        elif is_finished(arm, folder):
+        if wrong is None and is_finished(arm, folder):
             claim_folder(arm, seed, folder)  # the last rollout may have gone beyond totals that were raised
             progress.steps(arm.total_steps)
             return
         checkpoint = latest_checkpoint(folder / CHECKPOINTS, progress.say)
+        if wrong is not None:
+            if checkpoint is None:
+                raise RunStateError(
+                    f"{wrong}, and no checkpoint is left to make it from; delete {str(folder)!r} to train again."
+                )
+            progress.say(f"{wrong}; made again from the last checkpoint")
         envs = make_vec_env(arm)
         try:
             _train(arm, seed, folder, envs, checkpoint, progress, start)
