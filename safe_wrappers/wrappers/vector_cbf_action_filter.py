@@ -3,7 +3,7 @@
 import copy
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +25,13 @@ from safe_wrappers.wrappers.common.receiver import action_array
 Mask = NDArray[np.bool_]
 
 
-class VectorCBFActionFilter(EpisodeGuard, VectorWrapper[Any, Any, Any, Any, Any]):
+if TYPE_CHECKING:
+    _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    _Wrapper = VectorWrapper  # no generic class in Gymnasium 1.1
+
+
+class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
     """Filters the actions of all envs of a `SyncVectorEnv`.
 
     Every env has a `CBFActionFilter` of its own beside it, with the same guarantees; its executed actions are the

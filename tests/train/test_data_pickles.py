@@ -14,6 +14,7 @@ import torch
 from rich.console import Console
 from test_run import Reports
 
+from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.diagnosis.trained import of_file
 from safe_wrappers.train.enjoy import enjoy_command
@@ -129,6 +130,12 @@ def test_only_data_is_found(tmp_path, text):
         read_pickle(tmp_path / "x.pkl")
 
 
+@pytest.mark.parametrize("module", ["info", "wrappers.record_interventions"])
+def test_a_mark_is_found_wherever_it_was(tmp_path, module):
+    (tmp_path / "x.pkl").write_bytes(f"csafe_wrappers.{module}\nNOT_JUDGED\n.".encode())
+    assert read_pickle(tmp_path / "x.pkl") is keys.NOT_JUDGED
+
+
 def test_random_states_go_on_where_they_stood(run):
     arm, folder, checkpoint = run
     found = latest_checkpoint(folder / "checkpoints", pytest.fail)
@@ -142,3 +149,13 @@ def test_random_states_go_on_where_they_stood(run):
     random.seed(1), np.random.seed(1), torch.manual_seed(1)
     assert drawn() == first
     assert len(set(first)) == 3
+
+
+def test_a_checkpoint_without_them_goes_on_too(run):
+    arm, folder, checkpoint = run  # older ones have pickled states, which are left
+    state = json.loads((checkpoint / "state.json").read_text())
+    del state["files"]["random.json"]
+    (checkpoint / "state.json").write_text(json.dumps(state))
+    (checkpoint / "random.json").unlink()
+    found = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    assert found.load_model("SAC", make_vec_env(arm), "cpu").num_timesteps == 32
