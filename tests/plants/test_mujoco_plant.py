@@ -281,6 +281,18 @@ def test_a_disabled_actuator_is_refused(option):
         bound(Scene(disabled))
 
 
+def test_a_loop_of_fixed_bodies_leaves_no_row_for_the_response():
+    """MuJoCo leaves rows of zeros out, and their place in the Jacobian."""
+    xml = """<mujoco><worldbody><body name="fixed"><geom size=".1"/></body>
+    <body pos="0 0 3"><joint name="hinge" axis="0 0 1" range="0.1 1" limited="true"/><geom size=".1" pos=".3 0 0"/>
+    </body></worldbody><equality><connect body1="fixed" body2="world" anchor="0 0 0"/></equality>
+    <actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
+    plant = bound(Scene(xml))
+    plant.observe()
+    np.testing.assert_allclose(plant.acceleration[1], differences(plant, np.zeros(1)), rtol=1e-6)
+    assert plant.forward().nefc == 1 < plant.data.efc_J.size
+
+
 def test_a_model_without_joints_has_an_acting_range():
     xml = '<mujoco><worldbody><site name="tip"/><geom size=".1"/></worldbody>%s</mujoco>'
     pull = '<actuator><position site="tip" kp="2" kv="1" forcerange="-1 1" ctrlrange="-9 9"/></actuator>'

@@ -300,7 +300,7 @@ class Response(Remade):
                 jacobian = np.zeros((count, m.nv))
                 mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
             else:
-                jacobian = d.efc_J.reshape(count, m.nv)
+                jacobian = d.efc_J[: count * m.nv].reshape(count, m.nv)  # rows of zeros are left out at its end
             constraints = d.efc_state, jacobian, d.efc_D
         return _respond(*self._actuation, self._mobility, *constraints)
 
