@@ -252,6 +252,9 @@ def test_clamped_sums_of_forces_are_refused():
     </body></worldbody><actuator><motor joint="elbow" ctrlrange="-1 1"/></actuator></mujoco>"""
     with pytest.raises(UnsupportedEnvError, match=r"'elbow' clamps the sum .*actuatorfrcrange"):
         bound(Scene(xml))
+    nameless = xml.replace('name="elbow"', "").replace('<motor joint="elbow" ctrlrange="-1 1"/>', "")
+    with pytest.raises(UnsupportedEnvError, match="joint '#0' clamps"):
+        bound(Scene(nameless))
 
 
 def test_clamped_tendon_forces_are_refused():
