@@ -252,6 +252,9 @@ def test_clamped_sums_of_forces_are_refused():
     </body></worldbody><actuator><motor joint="elbow" ctrlrange="-1 1"/></actuator></mujoco>"""
     with pytest.raises(UnsupportedEnvError, match=r"'elbow' clamps the sum .*actuatorfrcrange"):
         bound(Scene(xml))
+    nameless = xml.replace('name="elbow"', "").replace('<motor joint="elbow" ctrlrange="-1 1"/>', "")
+    with pytest.raises(UnsupportedEnvError, match="joint '#0' clamps"):
+        bound(Scene(nameless))
 
 
 def test_clamped_tendon_forces_are_refused():
@@ -279,6 +282,18 @@ def test_a_disabled_actuator_is_refused(option):
     disabled = xml.replace('gravity="0 0 0"/>', f'gravity="0 0 0" {option}{closed}>')
     with pytest.raises(UnsupportedEnvError, match="'off' is disabled"):
         bound(Scene(disabled))
+
+
+def test_a_loop_of_fixed_bodies_leaves_no_row_for_the_response():
+    """MuJoCo leaves rows of zeros out, and their place in the Jacobian."""
+    xml = """<mujoco><worldbody><body name="fixed"><geom size=".1"/></body>
+    <body pos="0 0 3"><joint name="hinge" axis="0 0 1" range="0.1 1" limited="true"/><geom size=".1" pos=".3 0 0"/>
+    </body></worldbody><equality><connect body1="fixed" body2="world" anchor="0 0 0"/></equality>
+    <actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
+    plant = bound(Scene(xml))
+    plant.observe()
+    np.testing.assert_allclose(plant.acceleration[1], differences(plant, np.zeros(1)), rtol=1e-6)
+    assert plant.forward().nefc == 1 < plant.data.efc_J.size
 
 
 def test_a_model_without_joints_has_an_acting_range():

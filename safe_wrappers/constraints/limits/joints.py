@@ -100,7 +100,7 @@ def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, 
         ties = [group for group in _tied(model) if group.intersection(covered)]
         rest = [j for j in rest if any(j in group for group in ties)]
     if rest:
-        named = [", ".join(model.joint(j).name for j in ids) for ids in (covered, rest)]
+        named = [", ".join(model.joint(j).name or f"#{j}" for j in ids) for ids in (covered, rest)]
         raise ConfigurationError(
             "an action of this machine may move more joints than those that an actuator drives directly. Covered "
             f"would be: {named[0]}. Not covered: {named[1]}. {remedy}"

@@ -46,7 +46,8 @@ def _refuse_unsupported(model: mujoco.MjModel) -> None:
             _refuse(name, f"a delay of {model.actuator_delay[i]} s", "none (say delay_s instead)")
     for kind, limited in (("joint", model.jnt_actfrclimited), ("tendon", model.tendon_actfrclimited)):
         if limited.any():
-            name = getattr(model, kind)(int(np.flatnonzero(limited)[0])).name
+            first = int(np.flatnonzero(limited)[0])
+            name = getattr(model, kind)(first).name or f"#{first}"
             raise UnsupportedEnvError(
                 f"{kind} {name!r} clamps the sum of its actuators' forces (actuatorfrcrange), which MujocoPlant "
                 "does not model; give the actuators a forcerange instead, or use AnalyticPlant"
@@ -300,7 +301,9 @@ class Response(Remade):
                 jacobian = np.zeros((count, m.nv))
                 mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
             else:
-                jacobian = d.efc_J.reshape(count, m.nv)
+                jacobian = d.efc_J[: count * m.nv].reshape(
+                    count, m.nv
+                )  # rows of zeros are left out at its end
             constraints = d.efc_state, jacobian, d.efc_D
         return _respond(*self._actuation, self._mobility, *constraints)
 

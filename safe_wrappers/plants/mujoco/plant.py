@@ -47,7 +47,7 @@ class MujocoPlant(Snapshot):
         action_map: The map, once bound; None where an action is a control.
 
     Raises:
-        UnsupportedEnvError: No MuJoCo model, an actuator that is not affine, or actions that no map makes controls.
+        UnsupportedEnvError: No MuJoCo model, a disabled actuator, one not affine, or actions that no map fits.
     """
 
     bounds_are_action_space: ClassVar[bool] = True
