@@ -1,8 +1,8 @@
 """EpisodeGuard: a wrapper's steps and resets one at a time, in the episode that its env is in."""
 
 import functools
-import threading
 from collections.abc import Callable
+from threading import get_ident
 from typing import Any, Final
 
 import gymnasium as gym
@@ -39,24 +39,24 @@ class EpisodeGuard:
 def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(method)
     def guarded(self: Any, *arguments: Any, **options: Any) -> Any:
-        mine = (threading.get_ident(),)
-        holder = vars(self).setdefault(_HOLDER, mine)  # one operation, in which threads do not change
-        if holder == _LOST:
+        mine, own = (get_ident(),), self.__dict__
+        holder = own.setdefault(_HOLDER, mine)  # one operation, in which threads do not change
+        if holder is not mine:
+            if holder == mine:  # of its base class
+                return method(self, *arguments, **options)
+            if holder != _LOST:
+                raise SafeWrappersError(
+                    f"{type(self).__name__}.{method.__name__} was called while another thread is in a step or reset "
+                    "of the same env, which has one state: give every thread an env of its own, or a lock around both"
+                )
             if method.__name__ == "step":
                 raise gym.error.ResetNeeded(
                     f"this {type(self).__name__} is a copy: {_LOST}; call reset before step"
                 )
-            vars(self)[_HOLDER] = holder = mine
-        if holder is not mine:
-            if holder == mine:  # of its base class
-                return method(self, *arguments, **options)
-            raise SafeWrappersError(
-                f"{type(self).__name__}.{method.__name__} was called while another thread is in a step or reset of "
-                "the same env, which has one state: give every thread an env of its own, or a lock around both"
-            )
+            own[_HOLDER] = mine
         try:
             return method(self, *arguments, **options)
         finally:
-            del vars(self)[_HOLDER]
+            del own[_HOLDER]
 
     return guarded
