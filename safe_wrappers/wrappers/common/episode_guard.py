@@ -1,8 +1,8 @@
 """EpisodeGuard: a wrapper's steps and resets one at a time, in the episode that its env is in."""
 
 import functools
-import threading
 from collections.abc import Callable
+from threading import get_ident
 from typing import Any, Final
 
 import gymnasium as gym
@@ -20,9 +20,9 @@ class EpisodeGuard:
     """Base of all wrappers: guards `step` and `reset`, its own and those of subclasses.
 
     A step before the first reset, or after one that failed, is refused. So is a call while another thread is in one:
-    env and wrapper have one episode. A copy, pickled or deep, of an
-    env that is made anew by its constructor (EzPickle, as most MuJoCo envs) is at no state of the episode that the
-    wrapper remembers: its step is refused until it is reset.
+    env and wrapper have one episode. A copy, pickled or deep, of an env that is made anew by its constructor
+    (EzPickle, as most MuJoCo envs) is at no state of the episode that the wrapper remembers: its step is refused
+    until it is reset.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -48,19 +48,19 @@ class EpisodeGuard:
 def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(method)
     def guarded(self: Any, *arguments: Any, **options: Any) -> Any:
-        mine = (threading.get_ident(),)
-        holder = vars(self).setdefault(_HOLDER, mine)  # one operation, in which threads do not change
-        if isinstance(holder, str):
-            if method.__name__ == "step":
-                raise gym.error.ResetNeeded(f"this {type(self).__name__} is {holder}; call reset before step")
-            vars(self)[_HOLDER] = holder = mine
+        mine, own = (get_ident(),), self.__dict__
+        holder = own.setdefault(_HOLDER, mine)  # one operation, in which threads do not change
         if holder is not mine:
             if holder == mine:  # of its base class
                 return method(self, *arguments, **options)
-            raise SafeWrappersError(
-                f"{type(self).__name__}.{method.__name__} was called while another thread is in a step or reset of "
-                "the same env, which has one state: give every thread an env of its own, or a lock around both"
-            )
+            if not isinstance(holder, str):
+                raise SafeWrappersError(
+                    f"{type(self).__name__}.{method.__name__} was called while another thread is in a step or reset "
+                    "of the same env, which has one state: give every thread an env of its own, or a lock around both"
+                )
+            if method.__name__ == "step":
+                raise gym.error.ResetNeeded(f"this {type(self).__name__} is {holder}; call reset before step")
+            own[_HOLDER] = mine
         after: str | None = _FAILED if method.__name__ == "reset" else None
         try:
             found = method(self, *arguments, **options)
@@ -68,8 +68,8 @@ def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
             return found
         finally:
             if after is None:
-                del vars(self)[_HOLDER]
+                del own[_HOLDER]
             else:
-                vars(self)[_HOLDER] = after
+                own[_HOLDER] = after
 
     return guarded
