@@ -40,7 +40,7 @@ from safe_wrappers.errors import SafeWrappersError
 
 RESULTS = Path(__file__).parent / "results"
 STEPS = 3
-BATCH = 250
+BATCH = 500
 LONGEST_S = 120.0
 """Of one model, the first one's imports and compilation included."""
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
