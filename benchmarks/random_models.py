@@ -40,7 +40,7 @@ from safe_wrappers.errors import SafeWrappersError
 
 RESULTS = Path(__file__).parent / "results"
 STEPS = 3
-BATCH = 250
+BATCH = 500
 LONGEST_S = 120.0
 """Of one model, the first one's imports and compilation included."""
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -323,7 +323,8 @@ def _lines_in_time(process: "subprocess.Popen[str]") -> Iterator[str]:
 def kind_of(refusal: str) -> str:
     """A refusal without the names and numbers of one model."""
     first = refusal.partition("Use AnalyticPlant")[0].partition("Covered would be")[0]
-    first = first.partition("; the model has")[0].partition(" ('")[0]
+    for more in ("; the model has", " ('", ", which", " (actuatorgroupdisable"):
+        first = first.partition(more)[0]
     plain = re.sub(r"<[^>]* object at \w+>", "the env", first)
     return re.sub(r"'[^']*'", "'...'", re.sub(r"-?\d[\d.e+-]*", "N", plain))[:140].strip()
 

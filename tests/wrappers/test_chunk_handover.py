@@ -1121,8 +1121,10 @@ def test_an_ordinary_policys_action_is_a_chunk_of_one():
         assert np.array_equal(one.step(action)[0], env.step(action)[0])
     with pytest.raises(ActionError, match=r"\(1, 2\)"):
         env.step(np.zeros(3))
+    pair = sw.ChunkHandover(gym.make("Reacher-v5"), 2, 1, rate_limit=1.0)
+    pair.reset(seed=0)
     with pytest.raises(ActionError, match=r"\(2, 2\)"):
-        sw.ChunkHandover(gym.make("Reacher-v5"), 2, 1, rate_limit=1.0).step(np.zeros(2))
+        pair.step(np.zeros(2))
 
 
 @pytest.mark.parametrize(("allowed_s", "refused"), [(0.0, True), (0.025, True), (0.03, False), (1.0, False)])
