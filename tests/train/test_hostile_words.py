@@ -13,6 +13,7 @@ from safe_wrappers.diagnosis.finding import Series
 from safe_wrappers.train.config import FilterConfig
 from safe_wrappers.train.diagnosis.page import diagnosis_page
 from safe_wrappers.train.evaluation.summary import summarize
+from safe_wrappers.train.figures.plot_files import PlotFiles
 from safe_wrappers.train.policies.card import write_card
 from safe_wrappers.train.report import write_overview, write_report
 
@@ -66,7 +67,7 @@ def diagnosis(fake_experiment, word, folder):
         word, word, figure=2.0, threshold=1.0, evidence=[(word, 1.0, word)], series=series, **texts
     )
     absent = Finding(word, word, word, missing=word)
-    return diagnosis_page(Diagnosis(word, 10, [word], [found, absent]), word)
+    return diagnosis_page(Diagnosis(word, 10, [word], [found, absent]), word, PlotFiles(folder / "page.html"))
 
 
 @pytest.mark.parametrize("page", [report, overview, diagnosis])

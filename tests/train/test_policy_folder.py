@@ -151,7 +151,7 @@ def test_a_filter_of_ones_own_is_told_from_none(fake_experiment, tmp_path):
     train_run(arm, 0, tmp_path / "seed_0", Reports().progress)
     bare = gym.make("fake_task:FakeGoal-v0")
     with pytest.raises(ConfigurationError, match=r"(?s)trained: FakeFilter\n  here: no filter"):
-        load_policy(tmp_path / "seed_0" / "policy", bare)
+        load_policy(tmp_path / "seed_0" / "policy", bare, imports=["fake_task"])
 
 
 def test_training_for_longer_takes_the_old_policy_away_and_writes_the_new_one(fake_experiment, tmp_path):

@@ -72,7 +72,7 @@ def _joint(plant: MujocoPlant, j: int) -> tuple[Array, Array, float, Array | Non
     model, data = plant.model, plant.forward()
     at, axis = data.xanchor[j].copy(), data.xaxis[j].copy()
     q, size = float(plant.qpos[model.jnt_qposadr[j]]), _SHORTEST * float(model.stat.extent)
-    if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE:
+    if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_SLIDE):
         return at, axis, q, None, size
     body = int(model.jnt_bodyid[j])
     out = data.xipos[body] - at
