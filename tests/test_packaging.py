@@ -122,7 +122,7 @@ def test_metadata(wheel):
     }
     mujoco = [Requirement(r) for r in metadata.get_all("Requires-Dist") if r.startswith("mujoco")]
     for version, extra, taken in (
-        ("3.3.6", "", False), ("3.3.7", "", True), ("4.0.0", "", True), ("5.0.0", "", False),
+        ("3.4.0", "", False), ("3.5.0", "", True), ("4.0.0", "", True), ("5.0.0", "", False),
         ("3.11.0", "robotics", True), ("3.12.0", "robotics", False),
     ):  # fmt: skip
         asked = [r for r in mujoco if r.marker is None or r.marker.evaluate({"extra": extra})]
