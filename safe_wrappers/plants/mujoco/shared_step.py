@@ -12,7 +12,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Recorder
 
 _STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_SLEEP: Final = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # before 3.4 nothing sleeps
+_SLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 _MJ_STEP: Final = mujoco.mj_step
 _KNOWN: Final = ("gymnasium.envs.mujoco.", "safe_wrappers.envs.velocity")
 """Envs whose shared step was measured equal bit for bit (`tests/plants/test_shared_step.py`)."""

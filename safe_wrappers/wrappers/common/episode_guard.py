@@ -10,10 +10,12 @@ import gymnasium as gym
 from safe_wrappers.errors import SafeWrappersError
 
 _HOLDER: Final = "_stepping"
+"""Which thread is in a step or reset; absent while none is."""
+_AWAITS: Final = "_awaits_reset"
+"""Why steps are refused until a reset; None while there is an episode."""
 _NEW: Final = "new, and has no episode yet"
 _LOST: Final = "a copy: its env was made anew, and is not in the episode that it remembers"
 _FAILED: Final = "in no episode: its last reset failed"
-"""These hold a wrapper until its next reset."""
 
 
 class EpisodeGuard:
@@ -33,19 +35,19 @@ class EpisodeGuard:
 
     def await_reset(self) -> None:
         """Refuse steps until the first reset; called at construction."""
-        vars(self)[_HOLDER] = _NEW
+        vars(self)[_AWAITS] = _NEW
 
     def __getstate__(self) -> dict[str, Any]:
-        state = dict(vars(self))
-        if not isinstance(state.get(_HOLDER), str):
-            state.pop(_HOLDER, None)
+        state = {name: value for name, value in vars(self).items() if name != _HOLDER}
         raw: Any = self.unwrapped  # type: ignore[attr-defined]
         if any(isinstance(env.unwrapped, gym.utils.EzPickle) for env in getattr(raw, "envs", [raw])):
-            state[_HOLDER] = _LOST
+            state[_AWAITS] = _LOST
         return state
 
 
 def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
+    begins = method.__name__ == "reset"
+
     @functools.wraps(method)
     def guarded(self: Any, *arguments: Any, **options: Any) -> Any:
         mine, own = (get_ident(),), self.__dict__
@@ -53,23 +55,22 @@ def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
         if holder is not mine:
             if holder == mine:  # of its base class
                 return method(self, *arguments, **options)
-            if not isinstance(holder, str):
-                raise SafeWrappersError(
-                    f"{type(self).__name__}.{method.__name__} was called while another thread is in a step or reset "
-                    "of the same env, which has one state: give every thread an env of its own, or a lock around both"
-                )
-            if method.__name__ == "step":
-                raise gym.error.ResetNeeded(f"this {type(self).__name__} is {holder}; call reset before step")
-            own[_HOLDER] = mine
-        after: str | None = _FAILED if method.__name__ == "reset" else None
+            raise SafeWrappersError(
+                f"{type(self).__name__}.{method.__name__} was called while another thread is in a step or reset "
+                "of the same env, which has one state: give every thread an env of its own, or a lock around both"
+            )
         try:
+            if begins:
+                own[_AWAITS] = _FAILED
+            elif own[_AWAITS] is not None:
+                raise gym.error.ResetNeeded(
+                    f"this {type(self).__name__} is {own[_AWAITS]}; call reset before step"
+                )
             found = method(self, *arguments, **options)
-            after = None
+            if begins:
+                own[_AWAITS] = None
             return found
         finally:
-            if after is None:
-                del own[_HOLDER]
-            else:
-                own[_HOLDER] = after
+            del own[_HOLDER]
 
     return guarded
