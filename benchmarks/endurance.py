@@ -57,6 +57,8 @@ ENVS = (
 LEARNER = "learner"
 STEPS = {"hand": 50_000, "off": 5_000, "search": 1_000, LEARNER: 50_000}
 """Control steps of a chunk, by the kind of driver; `off` is a hand-written one without the filter."""
+CARS_EVERY, SEARCHES_EVERY = 3, 10
+"""Rounds: a car's step takes four times as long as a point's, and one of a search a hundred times."""
 TOGETHER = 16
 """Envs that a hand-written driver attacks at once."""
 BLOCKS = 40
@@ -84,7 +86,7 @@ def hand_written(env: str) -> dict[str, Maker]:
 
 
 def plan(steps: int) -> list[Chunk]:
-    """Whole chunks of at least so many filtered steps: rounds through all drivers, the envs by turns."""
+    """Whole chunks of at least so many filtered steps: rounds through the drivers, the envs by turns."""
     kinds = [
         [
             *((name, "hand") for name in hand_written(env)),
@@ -99,6 +101,8 @@ def plan(steps: int) -> list[Chunk]:
         for turn in zip_longest(*kinds):
             for env, pair in zip(ENVS, turn, strict=True):
                 if pair is None:
+                    continue
+                if seed % (SEARCHES_EVERY if pair[1] == "search" else CARS_EVERY if "Car" in env else 1):
                     continue
                 if planned >= steps:
                     return found
