@@ -193,6 +193,29 @@ def wall_seeking(env: Any, rng: np.random.Generator) -> Driver:
     return act
 
 
+def corner_seeking(env: Any, rng: np.random.Generator) -> Driver:
+    """Past (or at) the corners of walls, from one side to the other, at full force: where the path bends."""
+    geoms = wall_geoms(env.model)
+    middle, half = env.model.geom_pos[geoms, :2], env.model.geom_size[geoms, :2]
+    sides = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])
+    corners = (middle[:, None] + sides * half[:, None]).reshape(-1, 2)
+    state: dict[str, Any] = {"left": 0, "spot": np.zeros(2)}
+
+    def act() -> Action:
+        place = env.data.qpos[:2]
+        if state["left"] == 0:
+            near = np.argsort(np.linalg.norm(corners - place, axis=1))[:6]
+            way = corners[rng.choice(near)] - place
+            across = np.array([-way[1], way[0]]) / max(float(np.linalg.norm(way)), 1e-9)
+            aside = rng.normal(0.0, 0.12) * across
+            state.update(left=int(rng.integers(5, 60)), spot=place + rng.uniform(1.0, 3.0) * way + aside)
+        state["left"] -= 1
+        offset = state["spot"] - place
+        return np.asarray(offset / max(float(np.abs(offset).max()), 1e-9))
+
+    return act
+
+
 def planning(gain: Callable[[Any], Callable[[np.ndarray], float]]) -> Maker:
     """Rolls random changes of its plan out on the env's model, and goes on with the best (predictive sampling).
 
