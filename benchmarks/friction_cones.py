@@ -29,6 +29,7 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
+from benchmarks.tables import markdown
 from benchmarks.whole_body import learned
 from safe_wrappers.control.legged.whole_body import (
     WholeBodySolution,
@@ -175,24 +176,22 @@ def quantiles(values: list[float]) -> list[float] | None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "| robot | policy | contacts: mean, most | solver | admitted | infeasible | failed | lost "
-        "| farther: median, 99 % | apart: median, 99 % | us: median, 99 % |",
-        "|---" * 11 + "|",
-    ]
+    lines = []
     for row in rows:
         n = row["problems"]
         farther, apart = (
             "-" if row[key] is None else f"{row[key][0]:.4f}, {row[key][1]:.3f}"
             for key in ("farther", "apart")
         )
-        lines.append(
-            f"| {row['robot']} | {row['policy']} | {row['contacts']:.1f}, {row['most_contacts']} | {row['solver']} "
-            f"| {row['admitted'] / n:.1%} | {row['infeasible'] / n:.1%} | {row['failed']} | {row['lost'] / n:.1%} "
-            + ("| - | - " if row["solver"] == EXACT else f"| {farther} | {apart} ")
-            + f"| {row['us'][0]:.0f}, {row['us'][1]:.0f} |"
-        )
-    return "\n".join(lines)
+        cells = [row["robot"], row["policy"], f"{row['contacts']:.1f}, {row['most_contacts']}", row["solver"]]
+        cells += [f"{row['admitted'] / n:.1%}", f"{row['infeasible'] / n:.1%}", row["failed"]]
+        cells += [f"{row['lost'] / n:.1%}", *(("-", "-") if row["solver"] == EXACT else (farther, apart))]
+        lines.append([*cells, f"{row['us'][0]:.0f}, {row['us'][1]:.0f}"])
+    return markdown(
+        "robot | policy | contacts: mean, most | solver | admitted | infeasible | failed | lost"
+        " | farther: median, 99 % | apart: median, 99 % | us: median, 99 %",
+        lines,
+    )
 
 
 def main() -> None:
