@@ -29,6 +29,7 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
+from benchmarks.drivers import held
 from benchmarks.tables import markdown
 from benchmarks.whole_body import learned
 from safe_wrappers.control.legged.whole_body import (
@@ -61,22 +62,21 @@ Policy = Callable[[Any], Any]
 
 def policy_of(name: str, robot: str, space: gym.spaces.Box, rng: np.random.Generator) -> Policy | None:
     """A policy by name; None where the learned one has not been trained."""
-    held = {"action": np.zeros(space.shape), "left": 0}
 
     def standing(_: Any) -> Any:
         return (0.05 * rng.uniform(space.low, space.high)).astype(space.dtype)
 
-    def random(_: Any) -> Any:
-        if held["left"] == 0:
-            held["action"], held["left"] = rng.uniform(space.low, space.high), int(rng.integers(1, 6))
-        held["left"] -= 1
-        return np.asarray(held["action"], dtype=space.dtype)
+    def draw() -> tuple[int, Any]:
+        action = rng.uniform(space.low, space.high).astype(space.dtype)
+        return int(rng.integers(1, 6)), action
+
+    random = held(draw)
 
     if name == "learned":
         with contextlib.suppress(SafeWrappersError, OSError, ImportError):
             return learned(robot)
         return None
-    return {"standing": standing, "random": random}[name]
+    return {"standing": standing, "random": lambda _: random()}[name]
 
 
 def record(robot: str, policy: str, count: int, seed: int = 0) -> Iterator[WholeBodyProblem]:
