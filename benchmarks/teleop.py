@@ -23,7 +23,6 @@ what was in flight at the first of them. The excess over that is computed for ev
 """
 
 import argparse
-import json
 import math
 import multiprocessing
 from dataclasses import asdict, dataclass
@@ -35,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
+from benchmarks import chunks
 from benchmarks.tables import markdown, total
 from safe_wrappers.envs.teleop_contact import TELEOP_ACCELERATION, TELEOP_BRAKING, TELEOP_TOP_SPEED
 from safe_wrappers.envs.teleop_operator import TeleopOperator
@@ -313,17 +313,12 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     arguments = parser.parse_args()
     RESULTS.mkdir(exist_ok=True)
-    kept = RESULTS / "teleop.jsonl"
-    rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
-    done = {tuple(r[f] for f in Job.__dataclass_fields__) for r in rows}
-    missing = [j for j in jobs(arguments.seeds) if tuple(asdict(j).values()) not in done]
-    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool, kept.open("a") as file:
-        for row in pool.imap_unordered(run, missing):
-            rows.append(row)
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-    (RESULTS / "teleop.md").write_text(tables(rows) + "\n")
-    print(tables(rows))
+    path = RESULTS / "teleop.jsonl"
+    known = chunks.known(path, Job)
+    rows = chunks.measured(path, jobs(arguments.seeds), run, arguments.workers, known)
+    text = tables(list(rows.values()))
+    (RESULTS / "teleop.md").write_text(text + "\n")
+    print(text)
 
 
 if __name__ == "__main__":
