@@ -22,7 +22,6 @@ on the most at once (and so does its oracle).
 """
 
 import argparse
-import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -35,6 +34,7 @@ import ruckig
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
+from benchmarks.tables import keep, markdown, total
 from safe_wrappers.control.watchdog.reachability import admits
 
 RESULTS = Path(__file__).parent / "results"
@@ -325,22 +325,20 @@ def judged(seed: int, count: int) -> list[dict[str, Any]]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per judge, group and kind of motion, and the sums."""
-    lines = [
-        "| judge | chunks | made from | count | refused | passed | closest |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for r in rows:
+        counts = (f"{count:,}" for count in (r["chunks"], r["refused"], r["chunks"] - r["refused"]))
         closest = "-" if r["closest"] is None else f"{r['closest']:.2%}"
-        counts = f"{r['chunks']:,} | {r['refused']:,} | {r['chunks'] - r['refused']:,}"
-        lines.append(f"| {r['judge']} | {r['group']} | {r['kind']} | {counts} | {closest} |")
+        lines.append([r["judge"], r["group"], r["kind"], *counts, closest])
     said = []
     for judge in JUDGES:
         for group in ("clean", "unreachable", "beyond the real reach"):
             part = [r for r in rows if (r["judge"], r["group"]) == (judge, group)]
             if part:
-                refused, count = (sum(r[k] for r in part) for k in ("refused", "chunks"))
+                refused, count = total(part, "refused"), total(part, "chunks")
                 said.append(f"- {judge}, {group}: {refused:,} of {count:,} refused.")
-    return "\n".join([*lines, "", *said])
+    head = "judge | chunks | made from | count | refused | passed | closest"
+    return "\n".join([markdown(head, lines), "", *said])
 
 
 def main() -> None:
@@ -350,10 +348,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     rows = judged(arguments.seed, arguments.chunks)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "admission.json").write_text(json.dumps(rows, indent=1) + "\n")
-    (RESULTS / "admission.md").write_text(table(rows) + "\n")
-    print(table(rows))
+    keep(RESULTS, "admission", rows, table(rows))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ A violation is a control step in which the env's own truth was broken at any phy
 
 import argparse
 import itertools
-import json
 import multiprocessing
 import warnings
 from dataclasses import asdict, dataclass
@@ -24,6 +23,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import car_drivers, drivers
+from benchmarks.tables import keep, markdown, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 RESULTS = Path(__file__).parent / "results"
@@ -119,31 +119,25 @@ def jobs(arguments: argparse.Namespace) -> list[Job]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per level, driver and variant, episodes and plants pooled."""
-    lines = [
-        "| level | driver | filter | steps | violations | changed | infeasible | fallback | unsafe "
-        "| lowest h (mm) | return |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
 
     def label(row: dict[str, Any]) -> tuple[Any, ...]:
         return row["level"], row["driver"], row["variant"] if row["filtered"] else "off"
 
     for key, group in itertools.groupby(sorted(rows, key=label), label):
         part = list(group)
-        sums = {k: sum(r[k] for r in part) for k in ("steps", "violations", "intervened")}
-        sums |= {k: sum(r[k] for r in part) for k in ("infeasible", "fallback", "unsafe")}
+        steps = total(part, "steps")
         margins = [r["margin_min_m"] for r in part if r["margin_min_m"] is not None]
         returns = [r["return_mean"] for r in part if r["return_mean"] is not None]
-        lines.append(
-            f"| {key[0]} | {key[1]} | {key[2]} | {sums['steps']:,} | {sums['violations']:,} "
-            f"| {sums['intervened'] / sums['steps']:.1%} | {sums['infeasible']} | {sums['fallback']} "
-            f"| {sums['unsafe']} | {1e3 * min(margins):.2f} | {np.mean(returns):.1f} |"
-            if margins
-            else f"| {key[0]} | {key[1]} | {key[2]} | {sums['steps']:,} | {sums['violations']:,} "
-            f"| - | - | - | - | - | {np.mean(returns):.1f} |"
-        )
-    steps, bad = sum(r["steps"] for r in rows), sum(r["violations"] for r in rows)
-    return "\n".join([*lines, "", f"In all: {bad:,} violations in {steps:,} steps."])
+        filtered: list[object] = ["-"] * 5
+        if margins:
+            flags = (total(part, flag) for flag in ("infeasible", "fallback", "unsafe"))
+            filtered = [f"{total(part, 'intervened') / steps:.1%}", *flags, f"{1e3 * min(margins):.2f}"]
+        counts = f"{steps:,}", f"{total(part, 'violations'):,}"
+        lines.append([*key, *counts, *filtered, f"{np.mean(returns):.1f}"])
+    head = "level | driver | filter | steps | violations | changed | infeasible | fallback | unsafe"
+    sums = f"In all: {total(rows, 'violations'):,} violations in {total(rows, 'steps'):,} steps."
+    return "\n".join([markdown(f"{head} | lowest h (mm) | return", lines), "", sums])
 
 
 def main() -> None:
@@ -165,11 +159,7 @@ def main() -> None:
         rows = pool.map(run, jobs(arguments), chunksize=1)
     name = next((m for m in ("mismatch", "off", "price") if getattr(arguments, m)), "filtered")
     name = name if arguments.robot == "point" else f"{arguments.robot}_{name}"
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / f"adversarial_{name}.json").write_text(json.dumps(rows, indent=1) + "\n")
-    text = table(rows)
-    (RESULTS / f"adversarial_{name}.md").write_text(text + "\n")
-    print(text)
+    keep(RESULTS, f"adversarial_{name}", rows, table(rows))
 
 
 if __name__ == "__main__":

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Action = NDArray[np.float64]
-Driver = Callable[[], Action]
+from benchmarks.drivers import Action, Driver, held
 
 _FULL = 0.02
 
@@ -60,7 +59,7 @@ def _seeking(env: Any, rng: np.random.Generator, where: Callable[[], NDArray[np.
 
 def bang_bang(env: Any, rng: np.random.Generator) -> Driver:
     """Full torque one way or the other, both wheels, held for random times."""
-    return _in_the_field(env, _held(rng, lambda: rng.choice([-1.0, 1.0], size=2), 0.08))
+    return _in_the_field(env, held(lambda: (int(rng.geometric(0.08)), rng.choice([-1.0, 1.0], size=2))))
 
 
 def full_throttle(env: Any, rng: np.random.Generator) -> Driver:
@@ -97,18 +96,6 @@ def pulse(env: Any, rng: np.random.Generator) -> Driver:
 def uniform(env: Any, rng: np.random.Generator) -> Driver:
     """Uniform random actions."""
     return _in_the_field(env, lambda: rng.uniform(-1.0, 1.0, size=2))
-
-
-def _held(rng: np.random.Generator, draw: Callable[[], Action], rate: float) -> Driver:
-    state: dict[str, Any] = {"left": 0, "action": np.zeros(2)}
-
-    def act() -> Action:
-        if state["left"] == 0:
-            state.update(left=int(rng.geometric(rate)), action=draw())
-        state["left"] -= 1
-        return np.array(state["action"])
-
-    return act
 
 
 def _in_the_field(env: Any, driver: Driver) -> Driver:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drivers import Action, Driver
+from benchmarks.drivers import Action, Driver, held
 from benchmarks.mujoco_drivers import Maker
 
 
@@ -22,15 +22,7 @@ def goal_seeking(env: Any, rng: np.random.Generator) -> Driver:
 
 def bang_bang(env: Any, rng: np.random.Generator) -> Driver:
     """Full force one way or the other along each axis, and full turns, held for random times (1 s on average)."""
-    state: dict[str, Any] = {"left": 0, "action": np.ones(3)}
-
-    def act() -> Action:
-        if state["left"] == 0:
-            state.update(left=int(rng.geometric(0.04)), action=rng.choice([-1.0, 1.0], 3))
-        state["left"] -= 1
-        return np.asarray(state["action"])
-
-    return act
+    return held(lambda: (int(rng.geometric(0.04)), rng.choice([-1.0, 1.0], 3)))
 
 
 def pulse(env: Any, rng: np.random.Generator) -> Driver:

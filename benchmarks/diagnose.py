@@ -17,9 +17,9 @@ import gymnasium as gym
 import gymnasium_robotics
 import mujoco
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 import safe_wrappers as sw
+from benchmarks.mujoco_drivers import balancing_gain
 from safe_wrappers.diagnosis import Diagnosis, diagnose
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 
@@ -107,20 +107,7 @@ def still(env: gym.Env[Any, Any]) -> Policy:
 
 def balancing(env: gym.Env[Any, Any]) -> Policy:
     """A linear quadratic regulator of InvertedPendulum, from differences of one control step."""
-    raw: Any = env.unwrapped
-    model, data, n = raw.model, mujoco.MjData(raw.model), raw.model.nv
-
-    def after(x: np.ndarray) -> np.ndarray:
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = x[:n], x[n : 2 * n], x[2 * n :]
-        mujoco.mj_step(model, data, raw.frame_skip)
-        return np.concatenate([data.qpos, data.qvel])
-
-    nudges = 1e-5 * np.eye(2 * n + model.nu)
-    slopes = np.array([(after(nudge) - after(-nudge)) / 2e-5 for nudge in nudges]).T
-    a, b = slopes[:, : 2 * n], slopes[:, 2 * n :]
-    value = solve_discrete_are(a, b, np.eye(2 * n), 0.1 * np.eye(1))
-    gain = np.linalg.solve(0.1 * np.eye(1) + b.T @ value @ b, b.T @ value @ a)
+    gain = balancing_gain(env.unwrapped, effort=0.1)
     return lambda x: np.clip(-gain @ x, -3.0, 3.0).astype(np.float32)
 
 

@@ -11,6 +11,20 @@ Action = NDArray[np.float64]
 Driver = Callable[[], Action]
 
 
+def held(draw: Callable[[], tuple[int, Any]]) -> Callable[[], Any]:
+    """What was drawn, for as many steps as were drawn with it; then drawn anew."""
+    left, value = 0, None
+
+    def current() -> Any:
+        nonlocal left, value
+        if left == 0:
+            left, value = draw()
+        left -= 1
+        return value
+
+    return current
+
+
 def towards(env: Any, target: NDArray[np.float64]) -> Action:
     """Turn towards a point and push on, knowing nothing of hazards."""
     offset = target - env.agent_position
@@ -59,16 +73,7 @@ def lateral_drift(env: Any, rng: np.random.Generator) -> Driver:
 
 def bang_bang(env: Any, rng: np.random.Generator) -> Driver:
     """Full throttle one way or the other, both actuators, held for random times."""
-    state = {"left": 0, "action": np.ones(2)}
-
-    def act() -> Action:
-        if state["left"] == 0:
-            state["left"] = int(rng.geometric(0.04))
-            state["action"] = rng.choice([-1.0, 1.0], size=2)
-        state["left"] -= 1
-        return state["action"]
-
-    return act
+    return held(lambda: (int(rng.geometric(0.04)), rng.choice([-1.0, 1.0], size=2)))
 
 
 def uniform(env: Any, rng: np.random.Generator) -> Driver:

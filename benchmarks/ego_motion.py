@@ -9,7 +9,6 @@ Noise is that of a small MEMS unit: 0.02 m/s^2 and 0.002 rad/s in each control s
 """
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.crossing_drivers import DRIVERS
+from benchmarks.tables import keep, markdown
 from benchmarks.tracked import CROSSING, crossing
 
 RESULTS = Path(__file__).parent / "results"
@@ -61,18 +61,18 @@ def drive(lever_arm: bool, noise: bool, fix_every_s: float | None, episodes: int
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "| lever arm | noise | fix | steps | own position: median | 95 % below | largest | seen cars: median error "
-        "| outside 3 sigma |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for row in rows:
         fix = "at the reset" if row["fix_every_s"] is None else f"every {row['fix_every_s']:g} s"
         cells = ["compensated" if row["lever_arm"] else "left out", "MEMS" if row["noise"] else "none", fix]
         cells.append(f"{row['steps']:,}")
         cells += [f"{row[key]:.3f} m" for key in ("median_m", "p95_m", "largest_m", "cars_median_m")]
-        lines.append("| " + " | ".join([*cells, f"{row['cars_outside']:.1%}"]) + " |")
-    return "\n".join(lines)
+        lines.append([*cells, f"{row['cars_outside']:.1%}"])
+    return markdown(
+        "lever arm | noise | fix | steps | own position: median | 95 % below | largest | seen cars: median error"
+        " | outside 3 sigma",
+        lines,
+    )
 
 
 def main() -> None:
@@ -87,10 +87,7 @@ def main() -> None:
         for fix_every_s in (None, 2.0)
         for lever_arm in (True, False)
     ]
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    (arguments.results / "ego_motion.json").write_text(json.dumps(rows, indent=1) + "\n")
-    (arguments.results / "ego_motion.md").write_text(table(rows) + "\n")
-    print(table(rows))
+    keep(arguments.results, "ego_motion", rows, table(rows))
 
 
 if __name__ == "__main__":

@@ -36,10 +36,10 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 import safe_wrappers as sw
-from benchmarks import chunks, point_maze, trained_adversary
+from benchmarks import chunks, trained_adversary
 from benchmarks.cases import CASES
 from benchmarks.endurance_report import collected, table
-from benchmarks.mujoco_drivers import Maker
+from benchmarks.mujoco_drivers import Maker, corner_seeking
 from benchmarks.scaling import resident_kb
 from benchmarks.searching_drivers import SEARCHES, SearchingDriver
 from benchmarks.trained_adversary import EXAMPLES, FLAGS, Tally
@@ -81,7 +81,7 @@ def hand_written(env: str) -> dict[str, Maker]:
     """The drivers of an env that know what they look for."""
     found = dict(CASES[env].drivers)
     if "Maze" in env:
-        found["corner-seeking"] = lambda raw, rng: point_maze.corner_seeking(point_maze.Maze(raw), rng)
+        found["corner-seeking"] = corner_seeking
     return found
 
 

@@ -12,12 +12,9 @@ clock: what `step` takes beyond the env's own.
 """
 
 import argparse
-import json
 import multiprocessing
 import time
 import warnings
-from collections.abc import Iterable
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +24,10 @@ import gymnasium_robotics
 import numpy as np
 
 import safe_wrappers as sw
+from benchmarks import chunks
 from benchmarks.fetch_drivers import drivers, obstacles
 from benchmarks.fetch_judge import FetchJudge
+from benchmarks.tables import markdown, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 RESULTS = Path(__file__).parent / "results"
@@ -120,28 +119,24 @@ def jobs(arguments: argparse.Namespace) -> list[Job]:
     ]
 
 
-def _sum(rows: list[dict[str, Any]], key: str) -> int:
-    return int(sum(row[key] for row in rows))
-
-
-def _line(name: str, driver: str, part: list[dict[str, Any]]) -> str:
+def _line(name: str, driver: str, part: list[dict[str, Any]]) -> list[str]:
     on, off = [r for r in part if r["filtered"]], [r for r in part if not r["filtered"]]
-    steps = _sum(on, "steps")
+    steps = total(on, "steps")
     cells = [
         name,
         driver,
         f"{steps:,}",
-        f"{_sum(off, 'violations') / max(_sum(off, 'steps'), 1):.1%}",
-        f"{_sum(on, 'violations'):,}",
-        f"{_sum(on, 'unflagged'):,}",
-        f"{_sum(on, 'intervened') / max(steps, 1):.1%}",
-        f"{_sum(on, 'infeasible'):,}",
-        f"{_sum(on, 'fallback'):,}",
-        f"{_sum(on, 'coming_free'):,}",
+        f"{total(off, 'violations') / max(total(off, 'steps'), 1):.1%}",
+        f"{total(on, 'violations'):,}",
+        f"{total(on, 'unflagged'):,}",
+        f"{total(on, 'intervened') / max(steps, 1):.1%}",
+        f"{total(on, 'infeasible'):,}",
+        f"{total(on, 'fallback'):,}",
+        f"{total(on, 'coming_free'):,}",
         f"{-1e3 * max((r['worst_m'] for r in on), default=np.nan):.2f}",
         *(_microseconds(on, which) for which in ("unchanged_us", "changed_us", "filter_us")),
     ]
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
 def _microseconds(rows: list[dict[str, Any]], which: str) -> str:
@@ -151,17 +146,15 @@ def _microseconds(rows: list[dict[str, Any]], which: str) -> str:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per env and driver, one per env, one for all."""
-    lines = [
-        "| env | driver | steps | violations off | on | unflagged | changed | infeasible | fallback "
-        "| coming free | least room (mm) | filter, unchanged (us) | changed (us) | mean (us) |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for env_id in sorted({row["env_id"] for row in rows}, key=ENVS.index):
         of_env = [row for row in rows if row["env_id"] == env_id]
         for driver in dict.fromkeys(row["driver"] for row in of_env):
             lines.append(_line(env_id, driver, [row for row in of_env if row["driver"] == driver]))
         lines.append(_line(env_id, "all", of_env))
-    return "\n".join([*lines, _line("all", "all", rows)])
+    head = "env | driver | steps | violations off | on | unflagged | changed | infeasible | fallback | coming free"
+    times = "filter, unchanged (us) | changed (us) | mean (us)"
+    return markdown(f"{head} | least room (mm) | {times}", [*lines, _line("all", "all", rows)])
 
 
 def main() -> None:
@@ -181,29 +174,12 @@ def main() -> None:
     wanted = jobs(arguments)
     arguments.results.mkdir(parents=True, exist_ok=True)
     path = arguments.results / "fetch.jsonl"
-    known = _known(path) if arguments.resume else {}
-    rows = {job: known[job] for job in wanted if job in known}
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
-    left = [job for job in wanted if job not in rows]
-    with ExitStack() as stack:
-        file = stack.enter_context(path.open("a"))
-        done: Iterable[dict[str, Any]] = map(run, left)
-        if arguments.workers > 1:
-            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(arguments.workers))
-            done = pool.imap(run, left)
-        for job, row in zip(left, done, strict=True):
-            rows[job] = row
-            file.write(json.dumps(row) + "\n")
-            file.flush()
+    found = chunks.known(path, Job) if arguments.resume else {}
+    kept = {job: found[job] for job in wanted if job in found}
+    rows = chunks.measured(path, wanted, run, arguments.workers, kept)
     text = table([rows[job] for job in wanted])
     (arguments.results / "fetch.md").write_text(text + "\n")
     print(text)
-
-
-def _known(path: Path) -> dict[Job, dict[str, Any]]:
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    found = [json.loads(line) for line in lines if line.endswith("\n")]  # a killed run's last one may be cut
-    return {Job(**{key: row[key] for key in Job.__dataclass_fields__}): row for row in found}
 
 
 if __name__ == "__main__":

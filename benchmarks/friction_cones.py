@@ -29,6 +29,8 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
+from benchmarks.drivers import held
+from benchmarks.tables import markdown
 from benchmarks.whole_body import learned
 from safe_wrappers.control.legged.whole_body import (
     WholeBodySolution,
@@ -60,22 +62,21 @@ Policy = Callable[[Any], Any]
 
 def policy_of(name: str, robot: str, space: gym.spaces.Box, rng: np.random.Generator) -> Policy | None:
     """A policy by name; None where the learned one has not been trained."""
-    held = {"action": np.zeros(space.shape), "left": 0}
 
     def standing(_: Any) -> Any:
         return (0.05 * rng.uniform(space.low, space.high)).astype(space.dtype)
 
-    def random(_: Any) -> Any:
-        if held["left"] == 0:
-            held["action"], held["left"] = rng.uniform(space.low, space.high), int(rng.integers(1, 6))
-        held["left"] -= 1
-        return np.asarray(held["action"], dtype=space.dtype)
+    def draw() -> tuple[int, Any]:
+        action = rng.uniform(space.low, space.high).astype(space.dtype)
+        return int(rng.integers(1, 6)), action
+
+    random = held(draw)
 
     if name == "learned":
         with contextlib.suppress(SafeWrappersError, OSError, ImportError):
             return learned(robot)
         return None
-    return {"standing": standing, "random": random}[name]
+    return {"standing": standing, "random": lambda _: random()}[name]
 
 
 def record(robot: str, policy: str, count: int, seed: int = 0) -> Iterator[WholeBodyProblem]:
@@ -175,24 +176,22 @@ def quantiles(values: list[float]) -> list[float] | None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "| robot | policy | contacts: mean, most | solver | admitted | infeasible | failed | lost "
-        "| farther: median, 99 % | apart: median, 99 % | us: median, 99 % |",
-        "|---" * 11 + "|",
-    ]
+    lines = []
     for row in rows:
         n = row["problems"]
         farther, apart = (
             "-" if row[key] is None else f"{row[key][0]:.4f}, {row[key][1]:.3f}"
             for key in ("farther", "apart")
         )
-        lines.append(
-            f"| {row['robot']} | {row['policy']} | {row['contacts']:.1f}, {row['most_contacts']} | {row['solver']} "
-            f"| {row['admitted'] / n:.1%} | {row['infeasible'] / n:.1%} | {row['failed']} | {row['lost'] / n:.1%} "
-            + ("| - | - " if row["solver"] == EXACT else f"| {farther} | {apart} ")
-            + f"| {row['us'][0]:.0f}, {row['us'][1]:.0f} |"
-        )
-    return "\n".join(lines)
+        cells = [row["robot"], row["policy"], f"{row['contacts']:.1f}, {row['most_contacts']}", row["solver"]]
+        cells += [f"{row['admitted'] / n:.1%}", f"{row['infeasible'] / n:.1%}", row["failed"]]
+        cells += [f"{row['lost'] / n:.1%}", *(("-", "-") if row["solver"] == EXACT else (farther, apart))]
+        lines.append([*cells, f"{row['us'][0]:.0f}, {row['us'][1]:.0f}"])
+    return markdown(
+        "robot | policy | contacts: mean, most | solver | admitted | infeasible | failed | lost"
+        " | farther: median, 99 % | apart: median, 99 % | us: median, 99 %",
+        lines,
+    )
 
 
 def main() -> None:

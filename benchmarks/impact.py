@@ -28,6 +28,7 @@ from scipy.integrate import solve_ivp
 
 import safe_wrappers as sw
 from benchmarks.arm_and_wall import REACH_M, SUBSTEPS, TIP_M, ArmAndWall, arm_model, normal_force, springy
+from benchmarks.tables import markdown
 from safe_wrappers.control.contact.impact import effective_mass, peak_force
 
 RESULTS = Path(__file__).parent / "results"
@@ -337,35 +338,24 @@ def run(job: Job) -> dict[str, Any]:
 
 def formula_table(found: dict[str, Any]) -> str:
     """Markdown: errors by physics step, then the arm."""
-    lines = [
-        "| physics step (ms) | cases | mean error | worst error |",
-        "|---|---|---|---|",
-        *(
-            f"| {1e3 * r['timestep']:g} | {r['cases']} | {r['mean']:.2%} | {r['worst']:.2%} |"
-            for r in found["grid"]
-        ),
-        "",
-        f"Formula against scipy's integration: {found['oracle']:.1e} at most.",
-        "",
-        "| Reacher's arm, unpowered | hits | mean error | smallest, largest peak against the formula |",
-        "|---|---|---|---|",
-        *(
-            f"| {title} | {part['hits']} | {part['mean']:.1%} | {part['lowest']:+.1%}, {part['highest']:+.2%} |"
-            for title, part in (
-                ("any direction", found["arm"]["all"]),
-                ("within 30 degrees of the normal", found["arm"]["square"]),
-            )
-        ),
+    steps = [
+        (f"{1e3 * r['timestep']:g}", r["cases"], f"{r['mean']:.2%}", f"{r['worst']:.2%}")
+        for r in found["grid"]
     ]
-    return "\n".join(lines)
+    titles = {"all": "any direction", "square": "within 30 degrees of the normal"}
+    hits = [
+        (titles[key], part["hits"], f"{part['mean']:.1%}", f"{part['lowest']:+.1%}, {part['highest']:+.2%}")
+        for key, part in found["arm"].items()
+    ]
+    oracle = f"Formula against scipy's integration: {found['oracle']:.1e} at most."
+    head = "Reacher's arm, unpowered | hits | mean error | smallest, largest peak against the formula"
+    first = markdown("physics step (ms) | cases | mean error | worst error", steps)
+    return "\n\n".join([first, oracle, markdown(head, hits)])
 
 
 def approach_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: without the constraint and with it."""
-    lines = [
-        "| | approaches | touched | over the limit | largest force / limit | mean | steps changed | infeasible |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for limited, title in ((False, "off"), (True, "on")):
         part = [r for r in rows if r["limited"] is limited]
         if not part:
@@ -375,17 +365,15 @@ def approach_table(rows: list[dict[str, Any]]) -> str:
             return float(sum(r[key] for r in part))
 
         count, steps = total("approaches"), total("steps")
-        lines.append(
-            f"| {title} | {count:,.0f} | {total('touched') / count:.1%} | {total('exceeded'):,.0f} "
-            f"({total('exceeded') / count:.2%}) | {max(r['worst'].get('share', 0.0) for r in part):.3f} | "
-            f"{total('share_sum') / count:.3f} | "
-            + (
-                f"{total('changed') / steps:.1%} | {total('infeasible'):,.0f} of {steps:,.0f} |"
-                if limited
-                else "- | - |"
-            )
-        )
-    return "\n".join(lines)
+        exceeded = f"{total('exceeded'):,.0f} ({total('exceeded') / count:.2%})"
+        largest = f"{max(r['worst'].get('share', 0.0) for r in part):.3f}"
+        acted = [f"{total('changed') / steps:.1%}", f"{total('infeasible'):,.0f} of {steps:,.0f}"]
+        cells = [title, f"{count:,.0f}", f"{total('touched') / count:.1%}", exceeded, largest]
+        lines.append([*cells, f"{total('share_sum') / count:.3f}", *(acted if limited else ["-", "-"])])
+    return markdown(
+        "| approaches | touched | over the limit | largest force / limit | mean | steps changed | infeasible",
+        lines,
+    )
 
 
 def main() -> None:

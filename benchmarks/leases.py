@@ -26,6 +26,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.cart_and_wall import HOLD_S, PHYSICS_S, CartAndWall, Drive
+from benchmarks.tables import markdown
 from safe_wrappers.control.watchdog.leases import longest_lease
 from safe_wrappers.wrappers.faults import Outages
 
@@ -217,10 +218,7 @@ def run(job: Job) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per mode."""
-    lines = [
-        "| episodes | count | contacts | least clearance over the margin (mm) | arrived | mean time (s) | braked |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     summed = ("episodes", "contacts", "arrived", "arrived_s", "steps", "braked_steps")
     for mode, title in MODES.items():
         part = [r for r in rows if r["mode"] == mode]
@@ -237,10 +235,11 @@ def table(rows: list[dict[str, Any]]) -> str:
         arrived = f"{total['arrived'] / total['episodes']:.1%}" if arrives else "-"
         time = f"{total['arrived_s'] / total['arrived']:.2f}" if arrives and total["arrived"] else "-"
         braked = f"{total['braked_steps'] / total['steps']:.1%}" if mode in ("lease", "head on") else "-"
-        lines.append(
-            f"| {title} | {total['episodes']:,} | {contacts} | {lowest} | {arrived} | {time} | {braked} |"
-        )
-    return "\n".join(lines)
+        lines.append([title, f"{total['episodes']:,}", contacts, lowest, arrived, time, braked])
+    return markdown(
+        "episodes | count | contacts | least clearance over the margin (mm) | arrived | mean time (s) | braked",
+        lines,
+    )
 
 
 def main() -> None:

@@ -4,13 +4,14 @@
 """
 
 from collections.abc import Callable
+from itertools import cycle
 from typing import Any
 
 import mujoco
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from benchmarks.drivers import Action, Driver
+from benchmarks.drivers import Action, Driver, held
 from benchmarks.judges import stepped, wall_geoms
 
 Maker = Callable[[Any, np.random.Generator], Driver]
@@ -33,15 +34,7 @@ def corners(hold: int) -> Maker:
 
     def make(env: Any, rng: np.random.Generator) -> Driver:
         low, high = _box(env)
-        state: dict[str, Any] = {"step": 0, "action": high}
-
-        def act() -> Action:
-            if state["step"] % hold == 0:
-                state["action"] = np.where(rng.random(low.size) < 0.5, low, high)
-            state["step"] += 1
-            return np.asarray(state["action"])
-
-        return act
+        return held(lambda: (hold, np.where(rng.random(low.size) < 0.5, low, high)))
 
     return make
 
@@ -53,52 +46,43 @@ pulse = corners(hold=15)
 def clamp_seeking(env: Any, rng: np.random.Generator) -> Driver:
     """At full speed along the last axis, now and then a little back, and anything along the others."""
     low, high = _box(env)
-    state: dict[str, Any] = {"left": 0, "action": high}
 
-    def act() -> Action:
-        if state["left"] == 0:
-            action = rng.uniform(low, high)
-            action[-1] = high[-1] if rng.random() < 0.8 else 0.2 * low[-1]
-            state.update(left=int(rng.integers(50, 500)), action=action)
-        state["left"] -= 1
-        return np.asarray(state["action"])
+    def draw() -> tuple[int, Action]:
+        action = rng.uniform(low, high)
+        action[-1] = high[-1] if rng.random() < 0.8 else 0.2 * low[-1]
+        return int(rng.integers(50, 500)), action
 
-    return act
+    return held(draw)
 
 
 def end_seeking(env: Any, rng: np.random.Generator) -> Driver:
     """Everything towards one end, long enough to get there, then towards the other."""
     low, high = _box(env)
-    state: dict[str, Any] = {"left": 0, "forward": False}
-
-    def act() -> Action:
-        if state["left"] == 0:
-            state.update(left=int(rng.integers(20, 80)), forward=not state["forward"])
-        state["left"] -= 1
-        return high if state["forward"] else low
-
-    return act
+    ends = cycle((high, low))
+    return held(lambda: (int(rng.integers(20, 80)), next(ends)))
 
 
 def carrying(env: Any, rng: np.random.Generator) -> Driver:
     """Balances the pole (LQR about upright, on the env's own model) and carries it to one end, then to the other."""
     low, high = _box(env)
-    gain = _balancing_gain(env)
-    state: dict[str, Any] = {"left": 0, "way": 1.0}
+    gain, ways = balancing_gain(env), cycle((-1.0, 1.0))
+    way = held(lambda: (int(rng.integers(100, 300)), next(ways)))
 
     def act() -> Action:
-        if state["left"] == 0:
-            state.update(left=int(rng.integers(100, 300)), way=-state["way"])
-        state["left"] -= 1
         away = np.concatenate([env.data.qpos, env.data.qvel])
-        away[0] = -0.3 * state["way"]  # the carrot: always a little farther on
+        away[0] = -0.3 * way()  # the carrot: always a little farther on
         return np.asarray(np.clip(-gain @ away, low, high))
 
     return act
 
 
-def _balancing_gain(env: Any) -> np.ndarray:
-    """Of u = -gain @ (qpos, qvel), shape (nu, 2 nv), from differences of one held control step at rest."""
+def balancing_gain(env: Any, effort: float = 1.0) -> np.ndarray:
+    """Of u = -gain @ (qpos, qvel), shape (nu, 2 nv), from differences of one held control step at rest.
+
+    Args:
+        env: With as many positions as speeds.
+        effort: Its price in the quadratic cost, where a state's is 1.
+    """
     model: mujoco.MjModel = env.model
     data, n, nudge = mujoco.MjData(model), model.nv, 1e-5
 
@@ -111,7 +95,7 @@ def _balancing_gain(env: Any) -> np.ndarray:
     steps = nudge * np.eye(2 * n + model.nu)
     slopes = np.array([(after(step) - after(-step)) / (2.0 * nudge) for step in steps]).T
     a, b = slopes[:, : 2 * n], slopes[:, 2 * n :]
-    cost = np.eye(model.nu)
+    cost = effort * np.eye(model.nu)
     value = solve_discrete_are(a, b, np.eye(2 * n), cost)
     return np.asarray(np.linalg.solve(cost + b.T @ value @ b, b.T @ value @ a))
 
@@ -176,18 +160,38 @@ def wall_seeking(env: Any, rng: np.random.Generator) -> Driver:
     """A point on two axes: at full force to a random spot on one of the nearest walls, then to another."""
     geoms = wall_geoms(env.model)
     middle, half = env.model.geom_pos[geoms, :2], env.model.geom_size[geoms, :2]
-    state: dict[str, Any] = {"left": 0, "spot": np.zeros(2)}
+
+    def draw() -> tuple[int, Action]:
+        away = np.linalg.norm(np.maximum(np.abs(env.data.qpos[:2] - middle) - half, 0.0), axis=1)
+        pick = np.argsort(away)[rng.integers(6)]
+        return int(rng.integers(5, 60)), middle[pick] + rng.uniform(-half[pick], half[pick])
+
+    return _running_to(env, held(draw))
+
+
+def corner_seeking(env: Any, rng: np.random.Generator) -> Driver:
+    """Past (or at) the corners of walls, from one side to the other, at full force: where the path bends."""
+    geoms = wall_geoms(env.model)
+    middle, half = env.model.geom_pos[geoms, :2], env.model.geom_size[geoms, :2]
+    sides = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])
+    corners = (middle[:, None] + sides * half[:, None]).reshape(-1, 2)
+
+    def draw() -> tuple[int, Action]:
+        place = env.data.qpos[:2]
+        near = np.argsort(np.linalg.norm(corners - place, axis=1))[:6]
+        way = corners[rng.choice(near)] - place
+        across = np.array([-way[1], way[0]]) / max(float(np.linalg.norm(way)), 1e-9)
+        aside = rng.normal(0.0, 0.12) * across
+        return int(rng.integers(5, 60)), place + rng.uniform(1.0, 3.0) * way + aside
+
+    return _running_to(env, held(draw))
+
+
+def _running_to(env: Any, spot: Callable[[], Action]) -> Driver:
+    """At full force to a place in the plane, m."""
 
     def act() -> Action:
-        place = env.data.qpos[:2]
-        if state["left"] == 0:
-            away = np.linalg.norm(np.maximum(np.abs(place - middle) - half, 0.0), axis=1)
-            pick = np.argsort(away)[rng.integers(6)]
-            state.update(
-                left=int(rng.integers(5, 60)), spot=middle[pick] + rng.uniform(-half[pick], half[pick])
-            )
-        state["left"] -= 1
-        offset = state["spot"] - place
+        offset = spot() - env.data.qpos[:2]
         return np.asarray(offset / max(float(np.abs(offset).max()), 1e-9))
 
     return act

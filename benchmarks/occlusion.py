@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks.crossing_drivers import DRIVERS
+from benchmarks.tables import markdown, total
 from benchmarks.tracked import CROSSING, crossing
 from safe_wrappers.appendix.estimation.consistency import chi_square_band, normalised_error_squared
 from safe_wrappers.appendix.estimation.covariance import double_integrator_covariance
@@ -286,19 +287,14 @@ def growth_job(seed: int) -> list[dict[str, Any]]:
 
 def growth_table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "Sigma of a position while it is not seen, the wrapper's step by step against the closed form:",
-        "",
-        "| motion of a track | unseen track-steps | longest (s) | largest relative error |",
-        "|---|---|---|---|",
-    ]
+    lines = []
     for motion in dict.fromkeys(row["motion"] for row in rows):
         part = [row for row in rows if row["motion"] == motion]
-        lines.append(
-            f"| {motion} | {sum(r['steps'] for r in part):,} | {max(r['longest_s'] for r in part):.2f} "
-            f"| {max(r['worst'] for r in part):.1e} |"
-        )
-    return "\n".join(lines)
+        longest, worst = (max(r[key] for r in part) for key in ("longest_s", "worst"))
+        lines.append([motion, f"{total(part, 'steps'):,}", f"{longest:.2f}", f"{worst:.1e}"])
+    says = "Sigma of a position while it is not seen, the wrapper's step by step against the closed form:"
+    head = "motion of a track | unseen track-steps | longest (s) | largest relative error"
+    return f"{says}\n\n{markdown(head, lines)}"
 
 
 # 3. Collisions -----------------------------------------------------------------------------------------------------
@@ -350,29 +346,26 @@ def collisions_job(job: Job) -> list[dict[str, Any]]:
 
 def collisions_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: a row per filter and driver, and one per filter over all drivers."""
-    lines = [
-        "Collisions under drivers that know nothing of cars, judged by the env on the truth:",
-        "",
-        "| filter | driver | steps | collisions | per million steps | in a step not flagged "
-        "| with no flag in the second before | steps in contact | changed | flagged | goals / 1,000 steps |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     present = list(dict.fromkeys(row["driver"] for row in rows))
     for driver, arm in itertools.product([*present, "all"], ARMS):
         part = [r for r in rows if r["arm"] == arm and driver in (r["driver"], "all")]
         if not part:
             continue
-        total = {k: sum(r[k] for r in part) for k in part[0] if isinstance(part[0][k], int)}
-        steps = total["steps"]
+        count = {k: total(part, k) for k in part[0] if isinstance(part[0][k], int)}
+        steps = count["steps"]
         filtered = ARMS[arm] is not None
-        cells = [arm, driver, f"{steps:,}", f"{total['collisions']:,}"]
-        cells.append(f"{1e6 * total['collisions'] / steps:,.0f}")
-        cells += [str(total[k]) if filtered else "-" for k in ("unflagged", "unannounced")]
-        cells.append(f"{total['cost_steps']:,}")
-        cells += [f"{total[k] / steps:.2%}" if filtered else "-" for k in ("intervened", "flagged")]
-        cells.append(f"{1e3 * total['goals'] / steps:.2f}")
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        cells = [arm, driver, f"{steps:,}", f"{count['collisions']:,}"]
+        cells.append(f"{1e6 * count['collisions'] / steps:,.0f}")
+        cells += [str(count[k]) if filtered else "-" for k in ("unflagged", "unannounced")]
+        cells.append(f"{count['cost_steps']:,}")
+        cells += [f"{count[k] / steps:.2%}" if filtered else "-" for k in ("intervened", "flagged")]
+        cells.append(f"{1e3 * count['goals'] / steps:.2f}")
+        lines.append(cells)
+    says = "Collisions under drivers that know nothing of cars, judged by the env on the truth:"
+    head = "filter | driver | steps | collisions | per million steps | in a step not flagged"
+    more = "with no flag in the second before | steps in contact | changed | flagged | goals / 1,000 steps"
+    return f"{says}\n\n{markdown(f'{head} | {more}', lines)}"
 
 
 # All of it ---------------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from benchmarks.arm_and_wall import ArmAndWall
 from benchmarks.arms import ARMS
 from benchmarks.cases import PROTECTED
 from benchmarks.crossing_drivers import DRIVERS as CROSSING
-from benchmarks.drivers import Driver
+from benchmarks.drivers import Driver, held
 from benchmarks.env_step import Figures, Filter, compare, gentle
 from benchmarks.mujoco_drivers import Maker
 
@@ -57,17 +57,7 @@ def _pressing(env: Any, rng: np.random.Generator) -> Driver:
 def _pushing_out(env: Any, rng: np.random.Generator) -> Driver:
     """Into random corners of the action space, for random times: an arm ends stretched or out of reach."""
     low, high = (bound.astype(np.float64) for bound in (env.action_space.low, env.action_space.high))
-    state: dict[str, Any] = {"left": 0, "action": high}
-
-    def act() -> Any:
-        if state["left"] == 0:
-            state.update(
-                left=int(rng.integers(5, 25)), action=np.where(rng.random(low.size) < 0.5, low, high)
-            )
-        state["left"] -= 1
-        return np.asarray(state["action"])
-
-    return act
+    return held(lambda: (int(rng.integers(5, 25)), np.where(rng.random(low.size) < 0.5, low, high)))
 
 
 def _on_legs(robot: str, **arguments: Any) -> Steps:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drivers import Action, Driver
+from benchmarks.drivers import Action, Driver, held
 
 
 def patrol_seeking(env: Any, rng: np.random.Generator) -> Driver:
@@ -19,14 +19,11 @@ def patrol_seeking(env: Any, rng: np.random.Generator) -> Driver:
 
 def corridor(env: Any, rng: np.random.Generator) -> Driver:
     """Up and down the middle of the nearest corridor, turning about at random."""
-    state: dict[str, Any] = {"left": 0, "way": 1.0}
+    way = held(lambda: (int(rng.integers(20, 150)), float(rng.choice([-1.0, 1.0]))))
 
     def act() -> Action:
-        if state["left"] == 0:
-            state.update(left=int(rng.integers(20, 150)), way=float(rng.choice([-1.0, 1.0])))
-        state["left"] -= 1
         (_, y), (vx, vy) = env.agent_position, env.agent_velocity
         middle = env.patrol_positions[:, 1][np.abs(env.patrol_positions[:, 1] - y).argmin()]
-        return np.clip([0.5 * state["way"] - 0.2 * vx * abs(vx), 3.0 * (middle - y) - 0.3 * vy], -1.0, 1.0)
+        return np.clip([0.5 * way() - 0.2 * vx * abs(vx), 3.0 * (middle - y) - 0.3 * vy], -1.0, 1.0)
 
     return act

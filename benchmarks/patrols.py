@@ -20,6 +20,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.patrol_drivers import patrol_seeking
+from benchmarks.tables import markdown
 from benchmarks.tracked import PATROLLED, PATROLS_AT_ONCE, PATROLS_TURNING, PATROLS_TURNING_AT_ONCE, patrolled
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -91,19 +92,19 @@ def _outside(truth: Any, position: Any, covariance: Any) -> int:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown, a row per arm."""
-    lines = [
-        f"| the track is told | steps | collisions | not flagged | outside {SIGMAS:g} sigma, now | the same, "
-        f"{AHEAD_S:g} s ahead | changed | flagged |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for row in rows:
         filtered, steps = ARMS[row["arm"]][1], row["steps"]
         cells = [row["arm"], f"{steps:,}", str(row["collisions"]), str(row["unflagged"]) if filtered else "-"]
         cells.append(f"{row['outside'] / row['judged']:.2%}")
         cells.append(f"{row['outside_ahead'] / row['judged_ahead']:.2%}")
         cells += [f"{row[name] / steps:.1%}" if filtered else "-" for name in ("changed", "flagged")]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown(
+        f"the track is told | steps | collisions | not flagged | outside {SIGMAS:g} sigma, now | the same, "
+        f"{AHEAD_S:g} s ahead | changed | flagged",
+        lines,
+    )
 
 
 def main() -> None:

@@ -16,7 +16,6 @@ import argparse
 import multiprocessing
 import time
 import warnings
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ import numpy as np
 from benchmarks import chunks
 from benchmarks.cases import CASES, HARD, PROTECTED, Case
 from benchmarks.descriptions import constrained, promised, reserve
+from benchmarks.tables import markdown, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 RESULTS = Path(__file__).parent / "results"
@@ -90,15 +90,8 @@ def run(job: Job) -> dict[str, Any]:
                 twin.step(np.asarray(executed, dtype=kind))
                 ratios[bool(info["cbf/intervened"])].append(spent / (time.perf_counter() - begin))
         over = bool(truncated or (terminated and not case.past_termination))
-    return (
-        asdict(job)
-        | count
-        | _timings(ratios)
-        | {
-            "worst": float(worst),
-            "seconds": time.perf_counter() - started,
-        }
-    )
+    spent = {"worst": float(worst), "seconds": time.perf_counter() - started}
+    return asdict(job) | count | _timings(ratios) | spent
 
 
 def _timings(ratios: dict[bool, list[float]]) -> dict[str, Any]:
@@ -125,15 +118,11 @@ def jobs(cases: dict[str, Case], arguments: argparse.Namespace) -> list[Job]:
     return found
 
 
-def _sum(rows: Iterable[dict[str, Any]], key: str) -> int:
-    return sum(row[key] for row in rows)
-
-
 def _overhead(rows: list[dict[str, Any]], which: str) -> str:
     """Medians of the parts, weighted by their steps; a few steps say nothing."""
     timed = [(row[f"{which}_ratio"], row[f"{which}_timed"]) for row in rows if row[f"{which}_timed"]]
-    total = sum(n for _, n in timed)
-    return f"{sum(r * n for r, n in timed) / total:.1f}" if total >= 20 else "-"
+    steps = sum(n for _, n in timed)
+    return f"{sum(r * n for r, n in timed) / steps:.1f}" if steps >= 20 else "-"
 
 
 def _per_driver(rows: list[dict[str, Any]]) -> list[tuple[tuple[str, str, bool], list[dict[str, Any]]]]:
@@ -145,11 +134,7 @@ def _per_driver(rows: list[dict[str, Any]]) -> list[tuple[tuple[str, str, bool],
 
 def table_of_envs(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per env, drivers pooled."""
-    lines = [
-        "| env | what is constrained | class | reserve | step time, inactive / active "
-        "| violations on | off | steps each | changed | infeasible | fallback |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for name, case in cases.items():
         on = [r for r in rows if r["case"] == name and r["filtered"]]
         off = [r for r in rows if r["case"] == name and not r["filtered"]]
@@ -162,46 +147,39 @@ def table_of_envs(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
             cells += [f"{_overhead(on, 'inactive')} / {_overhead(on, 'active')}", _violations(on)]
         else:
             cells += ["-", "-"]
-        cells.append(f"{_sum(off, 'violations'):,}" if off else "-")
-        cells.append(f"{_sum(on or off, 'steps'):,}")
-        share = _sum(on, "intervened") / max(_sum(on, "steps"), 1)
+        cells.append(f"{total(off, 'violations'):,}" if off else "-")
+        cells.append(f"{total(on or off, 'steps'):,}")
+        share = total(on, "intervened") / max(total(on, "steps"), 1)
         cells += (
-            [f"{share:.1%}", f"{_sum(on, 'infeasible'):,}", f"{_sum(on, 'fallback'):,}"] if on else ["-"] * 3
+            [f"{share:.1%}", f"{total(on, 'infeasible'):,}", f"{total(on, 'fallback'):,}"]
+            if on
+            else ["-"] * 3
         )
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    head = "env | what is constrained | class | reserve | step time, inactive / active | violations on | off"
+    return markdown(f"{head} | steps each | changed | infeasible | fallback", lines)
 
 
 def table_of_drivers(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per env, driver and filter."""
-    lines = [
-        "| env | driver | filter | steps | violations | changed | infeasible | fallback | unsafe | worst |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for (name, driver, filtered), part in _per_driver(rows):
-        steps = _sum(part, "steps")
+        steps = total(part, "steps")
         flags = (
-            [f"{_sum(part, 'intervened') / steps:.1%}"] + [f"{_sum(part, flag):,}" for flag in _FLAGS[1:]]
+            [f"{total(part, 'intervened') / steps:.1%}"] + [f"{total(part, flag):,}" for flag in _FLAGS[1:]]
             if filtered
             else ["-"] * 4
         )
         worst = max(row["worst"] for row in part)
-        cells = [
-            name,
-            driver,
-            "on" if filtered else "off",
-            f"{steps:,}",
-            _violations(part),
-            *flags,
-            f"{worst:.3g}",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    skipped = _sum(rows, "unsafe_starts")
-    return "\n".join([*lines, "", f"Starts left out because they were unsafe: {skipped:,}."])
+        cells = [name, driver, "on" if filtered else "off", f"{steps:,}", _violations(part)]
+        lines.append([*cells, *flags, f"{worst:.3g}"])
+    head = "env | driver | filter | steps | violations | changed | infeasible | fallback | unsafe | worst"
+    skipped = f"Starts left out because they were unsafe: {total(rows, 'unsafe_starts'):,}."
+    return "\n".join([markdown(head, lines), "", skipped])
 
 
 def _violations(rows: list[dict[str, Any]]) -> str:
-    violations, unflagged = _sum(rows, "violations"), _sum(rows, "unflagged")
+    violations, unflagged = total(rows, "violations"), total(rows, "unflagged")
     return f"{violations:,} ({unflagged:,} unflagged)" if unflagged else f"{violations:,}"
 
 

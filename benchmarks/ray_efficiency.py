@@ -9,7 +9,6 @@ Efficiency is the first time over the CPUs times the other.
 """
 
 import argparse
-import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from benchmarks.tables import keep, markdown
 from safe_wrappers.train.config import parse_experiment, read_config
 from safe_wrappers.train.experiment import training_jobs
 from safe_wrappers.train.processes.job import Job, Progress
@@ -57,16 +57,11 @@ def rows_of(seconds: dict[str, tuple[int, float, float]]) -> list[Row]:
 
 def table(rows: list[Row]) -> str:
     """Markdown: one line per way."""
-    lines = [
-        f"| {RUNS} runs | CPUs | wall time | efficiency | start of the cluster |",
-        "|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {row.way} | {row.cpus} | {row.seconds:.0f} s | {row.efficiency:.0%} "
-        f"| {f'{row.start_s:.0f} s' if row.start_s else '-'} |"
-        for row in rows
-    ]
-    return "\n".join(lines)
+    lines = []
+    for row in rows:
+        start = f"{row.start_s:.0f} s" if row.start_s else "-"
+        lines.append((row.way, row.cpus, f"{row.seconds:.0f} s", f"{row.efficiency:.0%}", start))
+    return markdown(f"{RUNS} runs | CPUs | wall time | efficiency | start of the cluster", lines)
 
 
 def jobs(steps: int, folder: Path) -> list[Job]:
@@ -135,13 +130,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the rows and the table")
     arguments = parser.parse_args()
     rows = measure(arguments.steps)
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    (arguments.results / "ray_efficiency.json").write_text(
-        json.dumps({"steps": arguments.steps, "rows": [asdict(row) for row in rows]}, indent=1) + "\n"
-    )
-    text = table(rows)
-    (arguments.results / "ray_efficiency.md").write_text(text + "\n")
-    print(text)
+    found = {"steps": arguments.steps, "rows": [asdict(row) for row in rows]}
+    keep(arguments.results, "ray_efficiency", found, table(rows))
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 import safe_wrappers as sw
 from benchmarks.chunk_policy import RUNS, TASKS, Policy, Task, policy
 from benchmarks.seam_bounds import Bounds, bounds_of
+from benchmarks.tables import markdown
 from safe_wrappers.appendix.handover.flexible_joint import manifold
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.control.handover.smoothstep import smoothstep
@@ -301,14 +302,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def _part(name: str, rows: list[dict[str, Any]]) -> str:
-    lines = [
-        f"**{name}**. Bounds: {rows[0]['bounds_chosen']}.",
-        "",
-        "| delay | blend | bounds | seams | first difference, peak / mean | second | third | rate, peak | kept "
-        "| held back | blend (ms), cut short | vibration, peak / mean (mJ) | times lower "
-        "| tracking error (mm) | return |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    cells_of = []
     for r in rows:
         base = next(x for x in rows if x["blend"] == "replace" and x["delay"] == r["delay"])
         jumps = [
@@ -334,7 +328,13 @@ def _part(name: str, rows: list[dict[str, Any]]) -> str:
             "-" if r["tracking_error_mean_m"] is None else f"{1e3 * r['tracking_error_mean_m']:.1f}",
             f"{r['return_mean']:.2f} ± {r['return_standard_error']:.2f}",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
+        cells_of.append(cells)
+    head = (
+        "delay | blend | bounds | seams | first difference, peak / mean | second | third | rate, peak | kept"
+        " | held back | blend (ms), cut short | vibration, peak / mean (mJ) | times lower"
+        " | tracking error (mm) | return"
+    )
+    lines = [f"**{name}**. Bounds: {rows[0]['bounds_chosen']}.", "", markdown(head, cells_of)]
     floors = [
         f"{1e3 * r['alone_peak_J']:.3g} / {1e3 * r['alone_mean_J']:.3g} mJ at a delay of {r['delay']}"
         for r in rows

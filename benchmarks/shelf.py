@@ -26,6 +26,7 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
+from benchmarks.tables import markdown
 from safe_wrappers.plants import View
 from safe_wrappers.shelf import PLANTS
 from safe_wrappers.train.tables import write_rows
@@ -165,22 +166,17 @@ def row(case: Case, driver: str, steps: int) -> dict[str, Any]:
     }
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
+def table_of(rows: list[dict[str, Any]]) -> str:
     """The table that the docs show."""
-    lines = [
-        "| env | driver | steps | violations off | on | of these unflagged | changed | infeasible "
-        "| reward per step off; on | step, ms off; on |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for one in rows:
-        lines.append(
-            f"| {one['env']} | {one['driver']} | {int(one['steps']):,} | {int(one['violations_off']):,} "
-            f"| {int(one['violations_on']):,} | {int(one['unflagged']):,} | {100 * float(one['changed']):.2g} % "
-            f"| {100 * float(one['infeasible']):.2g} % | {float(one['return_off']):.3g}; "
-            f"{float(one['return_on']):.3g} "
-            f"| {float(one['step_us_off']) / 1e3:.2g}; {float(one['step_us_on']) / 1e3:.2g} |"
-        )
-    return "\n".join([*lines, ""])
+        counts = (f"{int(one[key]):,}" for key in ("steps", "violations_off", "violations_on", "unflagged"))
+        shares = (f"{100 * float(one[key]):.2g} %" for key in ("changed", "infeasible"))
+        returns = "; ".join(f"{float(one[key]):.3g}" for key in ("return_off", "return_on"))
+        times = "; ".join(f"{float(one[key]) / 1e3:.2g}" for key in ("step_us_off", "step_us_on"))
+        lines.append([one["env"], one["driver"], *counts, *shares, returns, times])
+    head = "env | driver | steps | violations off | on | of these unflagged | changed | infeasible"
+    return markdown(f"{head} | reward per step off; on | step, ms off; on", lines) + "\n"
 
 
 def main() -> None:
@@ -210,7 +206,7 @@ def main() -> None:
             write_rows(
                 RESULTS, COLUMNS, [known[name, d] for name in names for d in DRIVERS if (name, d) in known]
             )
-    table = markdown([known[name, d] for name in names for d in DRIVERS if (name, d) in known])
+    table = table_of([known[name, d] for name in names for d in DRIVERS if (name, d) in known])
     RESULTS.with_suffix(".md").write_text(table)
     print(table)
 

@@ -24,6 +24,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 import safe_wrappers as sw
+from benchmarks.tables import markdown, total
 from safe_wrappers.constraints import PredictiveShield
 from safe_wrappers.train.tables import write_rows
 
@@ -135,26 +136,22 @@ def row(env_id: str, way: str, seed: int, steps: int) -> dict[str, Any]:
     }
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
+def table_of(rows: list[dict[str, Any]]) -> str:
     """The table that the docs show: means over seeds, sums of violations."""
-    lines = [
-        "| env | way | steps x seeds | violations in training | changed | return | violations in evaluation "
-        "| changed | infeasible | minutes per seed |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for env_id, way in dict.fromkeys((one["env"], one["way"]) for one in rows):
         same = [one for one in rows if (one["env"], one["way"]) == (env_id, way)]
 
         def mean(key: str, same: list[dict[str, Any]] = same) -> float:
             return float(np.mean([float(one[key]) for one in same]))
 
-        lines.append(
-            f"| {env_id} | {way} | {int(same[0]['steps']):,} x {len(same)} "
-            f"| {sum(int(one['training_violations']) for one in same):,} | {100 * mean('training_changed'):.2g} % "
-            f"| {mean('return'):.3g} | {sum(int(one['violations']) for one in same):,} "
-            f"| {100 * mean('changed'):.2g} % | {100 * mean('infeasible'):.2g} % | {mean('minutes'):.2g} |"
-        )
-    return "\n".join([*lines, ""])
+        cells = [env_id, way, f"{int(same[0]['steps']):,} x {len(same)}"]
+        cells += [f"{total(same, 'training_violations'):,}", f"{100 * mean('training_changed'):.2g} %"]
+        cells += [f"{mean('return'):.3g}", f"{total(same, 'violations'):,}"]
+        cells += [f"{100 * mean(key):.2g} %" for key in ("changed", "infeasible")]
+        lines.append([*cells, f"{mean('minutes'):.2g}"])
+    head = "env | way | steps x seeds | violations in training | changed | return | violations in evaluation"
+    return markdown(f"{head} | changed | infeasible | minutes per seed", lines) + "\n"
 
 
 def main() -> None:
@@ -185,8 +182,8 @@ def main() -> None:
                 rows.sort(key=lambda one: (one["env"], WAYS.index(one["way"]), int(one["seed"])))
                 print(new, flush=True)
                 write_rows(RESULTS, COLUMNS, rows)
-                RESULTS.with_suffix(".md").write_text(markdown(rows))
-    print(markdown(rows))
+                RESULTS.with_suffix(".md").write_text(table_of(rows))
+    print(table_of(rows))
 
 
 if __name__ == "__main__":

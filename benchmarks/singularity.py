@@ -36,6 +36,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.arms import ARMS, Arm, Truth, watch
+from benchmarks.tables import keep, markdown
 from safe_wrappers.control.filtering.manipulability import manipulability
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -360,19 +361,19 @@ def attack(job: AttackJob) -> dict[str, Any]:
 
 def measure_table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "| | configurations | J | smallest w | QR: error | time (us) | SVD: error | time (us) | det: error "
-        "| not a number | time (us) |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for r in rows:
         svd = "-" if r["svd_error"] == 0.0 else f"{r['svd_error']:.1e}"
-        lines.append(
-            f"| {r['what']} | {r['count']:,} | {r['shape'][0]} x {r['shape'][1]} | {r['least']:.1e} | "
-            f"{r['qr_error']:.1e} | {r['qr_us']:.2f} | {svd} | {r['svd_us']:.2f} | {r['determinant_error']:.1e} | "
-            f"{r['determinant_failed']:,} | {r['determinant_us']:.2f} |"
-        )
-    return "\n".join(lines)
+        cells = [r["what"], f"{r['count']:,}", "{} x {}".format(*r["shape"]), f"{r['least']:.1e}"]
+        cells += [f"{r['qr_error']:.1e}", f"{r['qr_us']:.2f}", svd, f"{r['svd_us']:.2f}"]
+        cells += [
+            f"{r['determinant_error']:.1e}",
+            f"{r['determinant_failed']:,}",
+            f"{r['determinant_us']:.2f}",
+        ]
+        lines.append(cells)
+    head = "| configurations | J | smallest w | QR: error | time (us) | SVD: error | time (us) | det: error"
+    return markdown(f"{head} | not a number | time (us)", lines)
 
 
 TITLES = {
@@ -386,49 +387,45 @@ TITLES = {
 
 def path_table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "| path | constraint | peak rate (rad/s) | 99.9 % | over the limit | time below threshold | steps below, "
-        "unflagged | error, rms (mm) | largest | steps changed | infeasible | filter (us) |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for r in rows:
         filtered = r["mode"] not in ("off", "damped")
         where = (
             f"{r['arm']}, {r['kind']}: w > {r['threshold']:.3g}, limit {ARMS[r['arm']].rate_limit:g} rad/s"
         )
-        lines.append(
-            f"| {where} | {TITLES[r['mode']]} | {r['peak']:.2f} | {r['p999']:.2f} | "
-            f"{r['over']:.2%} | {r['time_below']:.1%} | "
-            + (f"{r['unflagged']:,}" if r["mode"] in ("margin", "both") else "-")
-            + f" | {1e3 * r['error_rms']:.1f} | {1e3 * r['error_max']:.0f} | "
-            + (
-                f"{r['changed'] / r['steps']:.1%} | {r['infeasible']:,} of {r['steps']:,} | {r['filter_us']:,.0f} |"
-                if filtered
-                else "- | - | - |"
-            )
-        )
-    return "\n".join(lines)
+        cells = [where, TITLES[r["mode"]], f"{r['peak']:.2f}", f"{r['p999']:.2f}", f"{r['over']:.2%}"]
+        cells += [f"{r['time_below']:.1%}", f"{r['unflagged']:,}" if r["mode"] in ("margin", "both") else "-"]
+        cells += [f"{1e3 * r['error_rms']:.1f}", f"{1e3 * r['error_max']:.0f}"]
+        infeasible = f"{r['infeasible']:,} of {r['steps']:,}"
+        acted = [f"{r['changed'] / r['steps']:.1%}", infeasible, f"{r['filter_us']:,.0f}"]
+        lines.append(cells + (acted if filtered else ["-"] * 3))
+    head = "path | constraint | peak rate (rad/s) | 99.9 % | over the limit | time below threshold"
+    more = "error, rms (mm) | largest | steps changed | infeasible | filter (us)"
+    return markdown(f"{head} | steps below, unflagged | {more}", lines)
 
 
 def attack_table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "| arm | driver | steps | below, off | below, on | starting below | unflagged | smallest w / threshold, once "
-        "inside | changed | infeasible | filter (us) |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     on = {(r["arm"], r["driver"]): r for r in rows if r["filtered"]}
     for r in (r for r in rows if not r["filtered"]):
         with_ = on.get((r["arm"], r["driver"]))
         if with_ is None:
             continue
         n = with_["steps"]
-        lines.append(
-            f"| {r['arm']} | {r['driver']} | {n:,} | {r['below'] / r['steps']:.1%} | {with_['below'] / n:.1%} | "
-            f"{with_['unsafe'] / n:.1%} | {with_['unflagged']:,} | {with_['least']:.4f} | "
-            f"{with_['changed'] / n:.1%} | {with_['infeasible']:,} | {with_['filter_us']:,.0f} |"
-        )
-    return "\n".join(lines)
+        cells = [
+            r["arm"],
+            r["driver"],
+            f"{n:,}",
+            f"{r['below'] / r['steps']:.1%}",
+            f"{with_['below'] / n:.1%}",
+        ]
+        cells += [f"{with_['unsafe'] / n:.1%}", f"{with_['unflagged']:,}", f"{with_['least']:.4f}"]
+        cells += [f"{with_['changed'] / n:.1%}", f"{with_['infeasible']:,}", f"{with_['filter_us']:,.0f}"]
+        lines.append(cells)
+    head = "arm | driver | steps | below, off | below, on | starting below | unflagged"
+    more = "smallest w / threshold, once inside | changed | infeasible | filter (us)"
+    return markdown(f"{head} | {more}", lines)
 
 
 PARTS = ("measure", "paths", "attacks")
@@ -442,7 +439,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2500, help="of each driver on each arm")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     arguments = parser.parse_args()
-    RESULTS.mkdir(exist_ok=True)
     kept = RESULTS / "singularity.json"
     results: dict[str, Any] = json.loads(kept.read_text()) if kept.exists() else {}
     wanted = PARTS if arguments.part is None else (arguments.part,)
@@ -456,9 +452,7 @@ def main() -> None:
             results["attacks"] = pool.map(partial(on_cpu_time, attack), attacks, chunksize=1)
     tables = {"measure": measure_table, "paths": path_table, "attacks": attack_table}
     text = "\n\n".join(tables[part](results[part]) for part in PARTS if part in results)
-    kept.write_text(json.dumps(results, indent=1) + "\n")
-    (RESULTS / "singularity.md").write_text(text + "\n")
-    print(text)
+    keep(RESULTS, "singularity", results, text)
 
 
 if __name__ == "__main__":

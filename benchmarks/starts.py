@@ -8,7 +8,6 @@ h is 0 where there is nothing to measure from: no hazards, wheels at rest.
 """
 
 import argparse
-import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases import PROTECTED, Case
+from benchmarks.tables import keep, markdown
 from safe_wrappers.errors import UnsafeStateWarning
 
 RESULTS = Path(__file__).parent / "results"
@@ -40,16 +40,14 @@ def measure(case: Case, resets: int, seed: int = 0) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per env."""
-    lines = [
-        "| env | resets | unsafe by the filter | by the env's truth | smallest h |",
-        "|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {', '.join((r['env'], *r['also']))} | {r['resets']:,} | {r['unsafe']:,} | {r['violated']:,} "
-        f"| {r['smallest']:.3g} |"
-        for r in rows
-    ]
-    return "\n".join(lines)
+    counts = ("resets", "unsafe", "violated")
+    return markdown(
+        "env | resets | unsafe by the filter | by the env's truth | smallest h",
+        (
+            [", ".join((r["env"], *r["also"])), *(f"{r[key]:,}" for key in counts), f"{r['smallest']:.3g}"]
+            for r in rows
+        ),
+    )
 
 
 def main() -> None:
@@ -63,11 +61,7 @@ def main() -> None:
     if not chosen:
         parser.error(f"nothing to measure; the envs are: {', '.join(PROTECTED)}")
     rows = [measure(case, arguments.resets) for case in chosen]
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    (arguments.results / "starts.json").write_text(json.dumps(rows, indent=1) + "\n")
-    text = table(rows)
-    (arguments.results / "starts.md").write_text(text + "\n")
-    print(text)
+    keep(arguments.results, "starts", rows, table(rows))
 
 
 if __name__ == "__main__":

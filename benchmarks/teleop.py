@@ -23,7 +23,6 @@ what was in flight at the first of them. The excess over that is computed for ev
 """
 
 import argparse
-import json
 import math
 import multiprocessing
 from dataclasses import asdict, dataclass
@@ -35,6 +34,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
+from benchmarks import chunks
+from benchmarks.tables import markdown, total
 from safe_wrappers.envs.teleop_contact import TELEOP_ACCELERATION, TELEOP_BRAKING, TELEOP_TOP_SPEED
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 
@@ -213,11 +214,7 @@ def _mean(rows: list[dict[str, Any]], key: str, form: str) -> str:
 def energy_table(rows: list[dict[str, Any]], codings: tuple[str, ...], networks: tuple[str, ...]) -> str:
     """Markdown: careful operators without revocation; one line per network and delay, codings side by side."""
     names = " / ".join(codings)
-    lines = [
-        f"| network | delay each way (ms) | energy made (J): {names} | touches per s | force ripple (N) "
-        "| peak force (N) | swept (cm) |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for network in networks:
         for delay in DELAYS_S:
             parts = [
@@ -226,15 +223,16 @@ def energy_table(rows: list[dict[str, Any]], codings: tuple[str, ...], networks:
             ]
             if not all(parts):
                 continue
-            cells = [
-                " / ".join(energy(float(np.mean([r["made_j"] for r in p]))) for p in parts),
-                " / ".join(_mean(p, "contacts_per_s", ".1f") for p in parts),
-                " / ".join(_mean(p, "ripple_n", ".2f") for p in parts),
-                " / ".join(f"{max(r['peak_n'] for r in p):.0f}" for p in parts),
-                " / ".join(f"{100.0 * float(np.mean([r['swept_m'] for r in p])):.0f}" for p in parts),
-            ]
-            lines.append(f"| {network} | {1e3 * delay:g} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            figures = (
+                [energy(float(np.mean([r["made_j"] for r in p]))) for p in parts],
+                [_mean(p, "contacts_per_s", ".1f") for p in parts],
+                [_mean(p, "ripple_n", ".2f") for p in parts],
+                [f"{max(r['peak_n'] for r in p):.0f}" for p in parts],
+                [f"{100.0 * float(np.mean([r['swept_m'] for r in p])):.0f}" for p in parts],
+            )
+            lines.append([network, f"{1e3 * delay:g}", *map(" / ".join, figures)])
+    head = f"network | delay each way (ms) | energy made (J): {names} | touches per s | force ripple (N)"
+    return markdown(f"{head} | peak force (N) | swept (cm)", lines)
 
 
 def energy(joule: float) -> str:
@@ -244,11 +242,7 @@ def energy(joule: float) -> str:
 
 def clearance_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: episodes that touched the clamp, with revocation and without, all delays together."""
-    lines = [
-        "| operator | network | coding | episodes each | breached, no revocation | with revocation "
-        "| least clearance (mm) | time revoked |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for operator in OPERATORS:
         for network in NETWORKS:
             for coding in CODINGS:
@@ -261,32 +255,28 @@ def clearance_table(rows: list[dict[str, Any]]) -> str:
                 breached = [
                     str(sum(r["breached_steps"] > 0 for r in part)) if part else "-" for part in (off, on)
                 ]
-                share = sum(r["revoked_steps"] for r in on) / sum(r["steps"] for r in on)
-                lines.append(
-                    f"| {operator} | {network} | {coding} | {len(on)} | {breached[0]} | {breached[1]} | "
-                    f"{1e3 * min(r['least_m'] for r in on):.2f} | {share:.1%} |"
-                )
-    return "\n".join(lines)
+                share = total(on, "revoked_steps") / total(on, "steps")
+                least = f"{1e3 * min(r['least_m'] for r in on):.2f}"
+                lines.append([operator, network, coding, len(on), *breached, least, f"{share:.1%}"])
+    head = "operator | network | coding | episodes each | breached, no revocation | with revocation"
+    return markdown(f"{head} | least clearance (mm) | time revoked", lines)
 
 
 def both_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: both invariants in the same runs, of waves with revocation."""
-    lines = [
-        "| operators | episodes | ticks | extracted beyond what was in flight, at most (J) "
-        "| most in flight (J) | made, with the hand a tick late (J) | breaches |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for operators in (OPERATORS[:2], OPERATORS[2:]):
         waves = _some(rows, coding="wave", revocation=True)
         part = [r for r in waves if r["operator"] in operators]
         if part:
-            lines.append(
-                f"| {', '.join(operators)} | {len(part)} | {sum(r['steps'] for r in part):,} | "
-                f"{max(r['excess_j'] for r in part):.1e} | {energy(max(r['flying_j'] for r in part))} | "
-                f"{max(r['made_at_hand_j'] for r in part):.1e} | "
-                f"{sum(r['breached_steps'] > 0 for r in part)} |"
+            excess_j, flying_j, at_hand_j = (
+                max(r[key] for r in part) for key in ("excess_j", "flying_j", "made_at_hand_j")
             )
-    return "\n".join(lines)
+            cells = [", ".join(operators), len(part), f"{total(part, 'steps'):,}", f"{excess_j:.1e}"]
+            breaches = sum(r["breached_steps"] > 0 for r in part)
+            lines.append([*cells, energy(flying_j), f"{at_hand_j:.1e}", breaches])
+    head = "operators | episodes | ticks | extracted beyond what was in flight, at most (J)"
+    return markdown(f"{head} | most in flight (J) | made, with the hand a tick late (J) | breaches", lines)
 
 
 def tables(rows: list[dict[str, Any]]) -> str:
@@ -323,17 +313,12 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     arguments = parser.parse_args()
     RESULTS.mkdir(exist_ok=True)
-    kept = RESULTS / "teleop.jsonl"
-    rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
-    done = {tuple(r[f] for f in Job.__dataclass_fields__) for r in rows}
-    missing = [j for j in jobs(arguments.seeds) if tuple(asdict(j).values()) not in done]
-    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool, kept.open("a") as file:
-        for row in pool.imap_unordered(run, missing):
-            rows.append(row)
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-    (RESULTS / "teleop.md").write_text(tables(rows) + "\n")
-    print(tables(rows))
+    path = RESULTS / "teleop.jsonl"
+    known = chunks.known(path, Job)
+    rows = chunks.measured(path, jobs(arguments.seeds), run, arguments.workers, known)
+    text = tables(list(rows.values()))
+    (RESULTS / "teleop.md").write_text(text + "\n")
+    print(text)
 
 
 if __name__ == "__main__":

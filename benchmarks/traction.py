@@ -15,7 +15,6 @@ MuJoCo's own friction; its wheels are judged at the ends of the control steps.
 import argparse
 import importlib.util
 import itertools
-import json
 import math
 import multiprocessing
 from collections.abc import Callable
@@ -29,6 +28,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 import safe_wrappers as sw
+from benchmarks.tables import keep, markdown, total
 
 RESULTS = Path(__file__).parent / "results"
 CONFIG = Path(__file__).parents[1] / "configs" / "saferover_ppo.yaml"
@@ -258,51 +258,47 @@ def _car_slip(raw: Any, wheel: str) -> float:
 
 def tables(rows: list[dict[str, Any]], stops: list[dict[str, Any]], cars: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "| driver | limiter | steps | slip > 0.2 | spin-out | spin-outs / min | yaw excursion | worst slip "
-        "| mean speed (m/s) | changed | infeasible |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    driven: list[list[object]] = []
 
     def key(row: dict[str, Any]) -> tuple[str, bool]:
         return row["driver"], row["limited"]
 
     for (driver, limited), group in itertools.groupby(sorted(rows, key=key), key):
         part = list(group)
-        total = {k: sum(r[k] for r in part) for k in part[0] if isinstance(part[0][k], int)}
-        steps = total["steps"]
+        steps = total(part, "steps")
         minutes = steps * 0.01 / 60.0
         speed = sum(r["mean_speed"] * r["steps"] for r in part) / steps
-        lines.append(
-            f"| {driver} | {'on' if limited else 'off'} | {steps:,} | {total['slipping'] / steps:.2%} "
-            f"| {total['spin_out'] / steps:.3%} | {total['spin_outs_begun'] / minutes:.1f} "
-            f"| {total['yaw'] / steps:.2%} | {max(r['worst_slip'] for r in part):.2f} | {speed:.2f} "
-            + (f"| {total['intervened'] / steps:.1%} | {total['infeasible']} |" if limited else "| - | - |")
-        )
-    lines += [
-        "",
-        "| ground | limiter off (m) | limiter on (m) | best constant slip (m) | at slip | on / best |",
-        "|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {s['ground']} | {s['unlimited_m']:.3f} | {s['limited_m']:.3f} | {s['best_constant_slip_m']:.3f} "
-        f"| {s['best_slip']:.3f} | {s['limited_m'] / s['best_constant_slip_m']:.3f} |"
+        cells = [driver, "on" if limited else "off", f"{steps:,}", f"{total(part, 'slipping') / steps:.2%}"]
+        cells += [f"{total(part, 'spin_out') / steps:.3%}", f"{total(part, 'spin_outs_begun') / minutes:.1f}"]
+        cells += [f"{total(part, 'yaw') / steps:.2%}", f"{max(r['worst_slip'] for r in part):.2f}"]
+        acted = [f"{total(part, 'intervened') / steps:.1%}", total(part, "infeasible")]
+        driven.append([*cells, f"{speed:.2f}", *(acted if limited else ["-", "-"])])
+    head = "driver | limiter | steps | slip > 0.2 | spin-out | spin-outs / min | yaw excursion | worst slip"
+    keys = ("unlimited_m", "limited_m", "best_constant_slip_m", "best_slip")
+    stopped = [
+        [
+            s["ground"],
+            *(f"{s[key]:.3f}" for key in keys),
+            f"{s['limited_m'] / s['best_constant_slip_m']:.3f}",
+        ]
         for s in stops
     ]
-    lines += [
-        "",
-        "| SafeCarGoal0, pulses | steps | slip > 0.2 | slip > 0.5 | mean speed (m/s) |",
-        "|---|---|---|---|---|",
-    ]
+    pulsed = []
     for limited in (False, True):
         part = [c for c in cars if c["limited"] == limited]
-        steps = sum(c["steps"] for c in part)
-        slipping, spin_out = (sum(c[k] for c in part) / steps for k in ("slipping", "spin_out"))
-        speed = float(np.mean([c["mean_speed"] for c in part]))
-        lines.append(
-            f"| limiter {'on' if limited else 'off'} | {steps:,} | {slipping:.2%} | {spin_out:.2%} | {speed:.2f} |"
-        )
-    return "\n".join(lines)
+        steps, speed = total(part, "steps"), float(np.mean([c["mean_speed"] for c in part]))
+        shares = (f"{total(part, key) / steps:.2%}" for key in ("slipping", "spin_out"))
+        pulsed.append([f"limiter {'on' if limited else 'off'}", f"{steps:,}", *shares, f"{speed:.2f}"])
+    return "\n\n".join(
+        [
+            markdown(f"{head} | mean speed (m/s) | changed | infeasible", driven),
+            markdown(
+                "ground | limiter off (m) | limiter on (m) | best constant slip (m) | at slip | on / best",
+                stopped,
+            ),
+            markdown("SafeCarGoal0, pulses | steps | slip > 0.2 | slip > 0.5 | mean speed (m/s)", pulsed),
+        ]
+    )
 
 
 def main() -> None:
@@ -327,12 +323,8 @@ def main() -> None:
             [CarJob(on, part, p) for on in (False, True) for p in range(arguments.parts)],
             chunksize=1,
         )
-    print(tables(rows, stops, cars))
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "traction.json").write_text(
-        json.dumps({"drivers": rows, "stopping": stops, "car": cars}, indent=1) + "\n"
-    )
-    (RESULTS / "traction.md").write_text(tables(rows, stops, cars) + "\n")
+    found = {"drivers": rows, "stopping": stops, "car": cars}
+    keep(RESULTS, "traction", found, tables(rows, stops, cars))
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.cases import CASES
+from benchmarks.tables import markdown, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 RESULTS: Final = Path(__file__).parent / "results"
@@ -190,10 +191,7 @@ def evaluate(model: PPO, scaling: VecNormalize, env: Adversary, deterministic: b
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: for each env its training and its evaluations."""
-    lines = [
-        "| env | part | steps | violations | unflagged | smallest h | changed | infeasible | fallback | unsafe |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     parts = {"training": "training", "deterministic": "evaluation, deterministic"}
     parts |= {"stochastic": "evaluation, stochastic", "unfiltered": "the same without the filter"}
     for row in rows:
@@ -206,11 +204,14 @@ def table(rows: list[dict[str, Any]]) -> str:
                 f"{t['intervened'] / max(t['steps'], 1):.1%}",
                 *(f"{t[name]:,}" for name in FLAGS[1:]),
             ]
-            lines.append("| " + " | ".join(counts + (["-"] * 6 if part == "unfiltered" else filtered)) + " |")
+            lines.append(counts + (["-"] * 6 if part == "unfiltered" else filtered))
     filtered_parts = [row[part] for row in rows for part in list(parts)[:-1]]
-    sums = {key: sum(part[key] for part in filtered_parts) for key in ("steps", "violations", "unflagged")}
+    sums = {key: total(filtered_parts, key) for key in ("steps", "violations", "unflagged")}
     text = f"In all, through the filter: {sums['violations']:,} violations in {sums['steps']:,} steps"
-    return "\n".join([*lines, "", f"{text}, {sums['unflagged']:,} of them unflagged."])
+    head = (
+        "env | part | steps | violations | unflagged | smallest h | changed | infeasible | fallback | unsafe"
+    )
+    return "\n".join([markdown(head, lines), "", f"{text}, {sums['unflagged']:,} of them unflagged."])
 
 
 def main() -> None:

@@ -13,10 +13,13 @@ from safe_wrappers.train.figures.canvas import draw
 from safe_wrappers.train.figures.constraints import constraints_picture
 from safe_wrappers.train.figures.corrections import corrections_picture
 from safe_wrappers.train.figures.curve import curve_picture
-from safe_wrappers.train.figures.episode_timeline import changes_picture, failures_picture
 from safe_wrappers.train.figures.finals import finals_picture
 from safe_wrappers.train.figures.plane import plane_limits, plane_picture
-from safe_wrappers.train.figures.training_timeline import training_timeline_picture
+from safe_wrappers.train.figures.timelines import (
+    changes_picture,
+    failures_picture,
+    training_timeline_picture,
+)
 from safe_wrappers.train.figures.where import choose_view, where_picture
 
 ARMS = ["bare", "safe"]

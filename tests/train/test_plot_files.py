@@ -15,11 +15,10 @@ from safe_wrappers.train.figures import (
     constraints,
     corrections,
     curve,
-    episode_timeline,
     finals,
     plane,
     scenes,
-    training_timeline,
+    timelines,
     where,
 )
 from safe_wrappers.train.figures.picture import Plotted
@@ -39,7 +38,7 @@ def drawn(monkeypatch):
         return "<svg></svg>"
 
     for module in (
-        constraints, corrections, curve, episode_timeline, finals, plane, scenes, training_timeline, where,
+        constraints, corrections, curve, finals, plane, scenes, timelines, where,
     ):  # fmt: skip
         monkeypatch.setattr(module, "draw", keep)
     return kept
@@ -109,8 +108,8 @@ def test_constraints(drawn):
 @pytest.mark.parametrize(
     ("picture", "name", "value"),
     [
-        (episode_timeline.changes_picture, "episode-changes", "percent_of_steps"),
-        (episode_timeline.failures_picture, "episode-failures", "per_1000_steps"),
+        (timelines.changes_picture, "episode-changes", "percent_of_steps"),
+        (timelines.failures_picture, "episode-failures", "per_1000_steps"),
     ],
 )
 def test_when_in_an_episode(drawn, picture, name, value):
@@ -126,7 +125,7 @@ def test_when_in_an_episode(drawn, picture, name, value):
 def test_when_in_training(drawn):
     rate = (np.linspace(0, 100, 5), np.array([1.0, np.nan, 3.0, 0.0]), 4)
     rates = {"infeasible": {"safe": rate}, "fallback": {"safe": (rate[0], 2 * rate[1], 8)}}
-    rows = training_timeline.training_timeline_picture(rates, 400, ARMS).data.rows
+    rows = timelines.training_timeline_picture(rates, 400, ARMS).data.rows
     stairs = [patch.get_data() for patch in drawn["training-timeline"].patches]
     assert len(stairs) == 2
     for event, each in zip(("infeasible", "fallback"), stairs, strict=True):

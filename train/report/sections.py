@@ -16,13 +16,12 @@ from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Summary, over_seeds
 from ..figures.constraints import constraints_picture
 from ..figures.corrections import corrections_picture
 from ..figures.curve import curve_picture
-from ..figures.episode_timeline import changes_picture, failures_picture
 from ..figures.finals import finals_picture
 from ..figures.picture import Picture
 from ..figures.plane import plane_picture
 from ..figures.plot_files import PlotFiles
 from ..figures.scenes import scene_frame, scene_picture
-from ..figures.training_timeline import training_timeline_picture
+from ..figures.timelines import changes_picture, failures_picture, training_timeline_picture
 from ..figures.where import choose_view, where_picture
 from ..run.folder import FINISHED_FILE
 from .markup import pictures, text
