@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import check_fields, name_list, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Nearest, Plain, obstacles_from, refuse_more_dimensions
 from safe_wrappers.control.backup.approach_rows import (
@@ -18,7 +18,7 @@ from safe_wrappers.control.backup.approach_rows import (
 from safe_wrappers.control.numerics.nearest_discs import squashed
 from safe_wrappers.drawing.marks import Mark, segment
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.points import Points
 

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from safe_wrappers.filter.constraint import Array
+from safe_wrappers.checks import Array
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.search import Decision, Rows, SafeActionSearch, Stage
 

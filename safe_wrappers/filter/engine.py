@@ -6,8 +6,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.filter.search import Decision, SafeActionSearch
 from safe_wrappers.plants.plant import Plant

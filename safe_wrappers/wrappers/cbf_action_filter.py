@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative
+from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.engine import SafetyFilter
@@ -21,7 +21,7 @@ from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array
 
 SAFE_TOLERANCE = 1e-6

@@ -17,13 +17,11 @@ ones have an order. It is an idealisation of rigid contact, not a prediction for
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.appendix.contact.lemke import LcpStatus, solve_lcp
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 class ContactStep(NamedTuple):

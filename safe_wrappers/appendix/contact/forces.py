@@ -6,11 +6,9 @@ Source: appendix "Rigid Body Contact Mechanics" and "Physical contact feasibilit
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array, finite_arrays
+from safe_wrappers.checks import Array, finite_array, finite_arrays
 from safe_wrappers.control.contact.friction_cone import checked_friction, cone_excess, normal_and_tangential
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def sphere_gap(center: ArrayLike, other: ArrayLike, radii: ArrayLike) -> Array:

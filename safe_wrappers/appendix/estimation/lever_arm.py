@@ -8,16 +8,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import Array, finite_arrays
 from safe_wrappers.control.estimation.lever_arm import GRAVITY, centre_acceleration, lever_arm_acceleration
 from safe_wrappers.control.numerics.spatial import check_vectors, cross, finite_result
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation
-
-Array = NDArray[np.float64]
 
 
 def centre_velocity(velocity: Array, angular_velocity: Array, arm: Array) -> Array:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.lie_derivatives import (
     Observability,
     checked_tolerance,
@@ -25,8 +26,6 @@ from safe_wrappers.control.estimation.observability import (
     state_names,
     unobservable_subspace,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

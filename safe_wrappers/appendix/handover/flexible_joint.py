@@ -26,12 +26,11 @@ broadcast with those of M. Anything else raises `ConfigurationError`.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.vibration import smoothstep_share
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def accelerations(

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup import point_scene
 from safe_wrappers.control.backup.damped_axis import braking
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
-from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point, walls

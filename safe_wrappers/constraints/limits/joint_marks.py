@@ -6,8 +6,8 @@ from typing import Final
 import mujoco
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.drawing.marks import Mark, arrow, ball, line, pad, segment
-from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _SHORTEST: Final = 0.08

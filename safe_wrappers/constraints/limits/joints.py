@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, positive
+from safe_wrappers.checks import Array, name_list, positive
 from safe_wrappers.constraints.limits.joint_marks import range_marks, speed_marks
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, HalfSpaces
+from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant

@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits import joints as of_joints
 from safe_wrappers.control.filtering.manipulability import signed_manipulability
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.native import mj_kinematics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 

@@ -8,13 +8,11 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.stopping import held_limit, held_stop
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.control.numerics.surfaces import nearest_points
-
-Array = NDArray[np.float64]
 
 _ROUNDING: Final = 1.0 + 1e-9
 _UNBOUNDED: Final = 1e12

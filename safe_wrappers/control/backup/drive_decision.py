@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.drive_among_discs import (
-    Array,
     Look,
     admits,
     backup_drive,

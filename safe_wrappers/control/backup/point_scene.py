@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.backup.point_among_walls import (
-    Array,
     Pair,
     PointAmongWalls,
     PointMotion,

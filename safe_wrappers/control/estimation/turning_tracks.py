@@ -6,9 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.lie_derivatives import nonlinear_observability
 from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
-from safe_wrappers.control.estimation.turning import SIZE, Array, Turns, flow, gathered_noise, rates
+from safe_wrappers.control.estimation.turning import SIZE, Turns, flow, gathered_noise, rates
 from safe_wrappers.errors import ConfigurationError
 
 _SHORTEST_S: Final = 1e-3

@@ -18,11 +18,10 @@ mean. Adding b / j to the delays instead would be wrong on either side of that.
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
 """Relative bound on the accumulated rounding of the formulas below."""
