@@ -8,7 +8,6 @@ import sys
 import numpy as np
 
 from safe_wrappers.control.backup import approach_rows as of
-from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.control.numerics import surfaces
 from safe_wrappers.control.numerics.compiled import IS_COMPILED
 from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
@@ -44,7 +43,6 @@ def random_looks(count):
         moving = rng.normal(size=near[1].shape)
         found += of.approach_rows(near[0], near[1], moving, near[2], v, drift, effect, *always)
         found += of.out_of_reach(some_surfaces(rng, 3), np.abs(rng.normal(size=18 + m)), *always)
-        found += sampled_inset(point, v, 2.0, 0.05), sampled_acceleration_limit(point, v, 2.0, 0.05)
         outline = convex_outline(rng.normal(size=(6, 2))) if i % 2 else np.zeros((0, 2))
         ahead = rng.normal(size=(3, 2))
         ahead /= np.sqrt((ahead**2).sum(axis=1))[:, None]
