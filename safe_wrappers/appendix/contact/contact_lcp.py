@@ -41,19 +41,6 @@ class ContactStep(NamedTuple):
     status: LcpStatus
 
 
-def delassus_matrix(inertia: ArrayLike, jacobian: ArrayLike) -> Array:
-    """`J M^-1 J'`, shape (k, k), 1/kg: normal velocities that unit impulses at the contacts cause.
-
-    Its diagonal is one over `impact.effective_mass`; the rest is how contacts act on each other.
-
-    Args:
-        inertia: Joint-space inertia M, symmetric and positive definite, shape (n, n).
-        jacobian: Rows J of the contacts' normals, `normal velocity = J @ qvel`, shape (k, n).
-    """
-    m, j = _matrices(inertia, jacobian)
-    return _delassus(_cholesky(m), j)[1]
-
-
 def contact_step(
     inertia: ArrayLike,
     jacobian: ArrayLike,
