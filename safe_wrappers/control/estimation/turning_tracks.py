@@ -51,11 +51,6 @@ class TurningTracks(Tracks):
             np.stack([motion.mean_velocity for motion in self.motions]),
         )
 
-    @property
-    def turn_rates(self) -> Array:
-        """Estimated turn rates, shape (n,), rad/s, positive to the left."""
-        return self.mean[:, 4]
-
     def advance(self, time_s: float) -> None:
         """Predict over a time without measurements."""
         longest, left = self._longest_s(), float(time_s)

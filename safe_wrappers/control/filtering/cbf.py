@@ -28,11 +28,6 @@ def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Ar
     return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
 
 
-def linear_decay(h: ArrayLike, alpha: float) -> Array:
-    """The linear class-K function `alpha * h` (alpha in 1/s)."""
-    return alpha * np.asarray(h, dtype=np.float64)
-
-
 def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array, Array]:
     """The barrier condition as half-spaces `normals @ u <= offsets`: `-Lg h`, shape (..., m), and `Lf h + alpha(h)`.
 

@@ -60,19 +60,6 @@ def distance_to_outline(outline: Array, x: float, y: float) -> float:
 
 
 @compiled
-def _distances(outline: Array, points: Array) -> Array:
-    found = np.empty(len(points))
-    for i in range(len(points)):
-        found[i] = distance_to_outline(outline, points[i, 0], points[i, 1])
-    return found
-
-
-def distances_to_outline(outline: Array, points: Array) -> Array:
-    """Signed distances (...), m, of points (..., 2) to a convex outline with corners (c, 2) counter-clockwise."""
-    return _distances(outline, points.reshape(-1, 2)).reshape(points.shape[:-1])
-
-
-@compiled
 def clearances_on_a_course(outline: Array, places: Array, ahead: Array, discs: Array) -> Array:
     """What an outline leaves to discs at k instants, m, shape (k, n).
 

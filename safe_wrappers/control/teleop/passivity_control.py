@@ -74,11 +74,6 @@ class EnergyReference:
         return self._taken_in.value
 
     @property
-    def heard_j(self) -> float:
-        """Largest energy that the other end has reported to have taken in, J."""
-        return self._heard
-
-    @property
     def budget_j(self) -> float:
         """Energy that this end may still give out, J; below 0 it is in debt."""
         return self._initial + self._heard + self._dissipated.value - self._given_out.value
