@@ -89,7 +89,6 @@ CALLS = {
         lambda a, c: appendix_observability.linear_observability(a, c).rank,
         [CHAIN, [[1, 0]]],
     ),
-    "pbh_test": (lambda a, c: appendix_observability.pbh_test(a, c)[1], [CHAIN, [[1, 0]]]),
     "port_power": (waves.port_power, [2, 3]),
     "to_waves": (passivity.to_waves, [2, 3, 4]),
     "from_waves": (waves.from_waves, [2, 3, 4]),
