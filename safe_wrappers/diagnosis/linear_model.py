@@ -13,6 +13,7 @@ from safe_wrappers.checks import Array
 from safe_wrappers.diagnosis.recording import Env, Recording
 from safe_wrappers.diagnosis.symptom import NotMeasuredError, require_physics
 from safe_wrappers.plants.env_checks import wrappers_of
+from safe_wrappers.plants.mujoco.model import BALL, FREE
 from safe_wrappers.plants.snapshot import STATE
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
@@ -223,6 +224,6 @@ def _dof_name(model: mujoco.MjModel, dof: int) -> str:
     joint = int(model.dof_jntid[dof])
     name = model.joint(joint).name or f"joint {joint}"
     kind, which = int(model.jnt_type[joint]), dof - int(model.jnt_dofadr[joint])
-    if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+    if kind == FREE:
         return f"{name} {('x', 'y', 'z', 'turn x', 'turn y', 'turn z')[which]}"
-    return f"{name} turn {'xyz'[which]}" if kind == int(mujoco.mjtJoint.mjJNT_BALL) else name
+    return f"{name} turn {'xyz'[which]}" if kind == BALL else name

@@ -10,17 +10,17 @@ from safe_wrappers.control.filtering.manipulability import manipulability
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, require_physics
+from safe_wrappers.plants.mujoco.model import HINGE
 
 NEAR = 0.2
 """Share of the largest manipulability below which a pose is near a singular one."""
 LEAST_STEPS = 10
-_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SAMPLES = 500
 
 
 def _arm(model: mujoco.MjModel) -> tuple[int, NDArray[np.int64]]:
     """The body at the tip of the longest chain of driven hinges on a fixed base, and their degrees of freedom."""
-    driven = {j for j in driven_joints(model) if model.jnt_type[j] == _HINGE}
+    driven = {j for j in driven_joints(model) if model.jnt_type[j] == HINGE}
     best: tuple[int, list[int]] = (0, [])
     for body in range(1, model.nbody):
         joints: list[int] = []

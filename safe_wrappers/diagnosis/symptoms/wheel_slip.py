@@ -9,6 +9,7 @@ from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, replayed, require_physics
+from safe_wrappers.plants.mujoco.model import HINGE
 
 SLIPS = 0.2
 """Slip ratio from which on a wheel is beyond the peak of its traction on all usual grounds."""
@@ -16,7 +17,6 @@ REGULARIZATION = 0.5
 """m/s, as of `SlipLimiter`."""
 _LEVEL = 0.5
 """Of the vertical part of an axle's direction: a wheel does not turn about a steep one."""
-_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SPHERE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 
 
@@ -26,7 +26,7 @@ def wheels(model: mujoco.MjModel) -> dict[int, float]:
     mujoco.mj_kinematics(model, data)
     for j in driven_joints(model):
         level = abs(data.xaxis[j, 2]) < _LEVEL
-        if model.jnt_type[j] != _HINGE or model.jnt_limited[j] or not level or not model.joint(j).name:
+        if model.jnt_type[j] != HINGE or model.jnt_limited[j] or not level or not model.joint(j).name:
             continue
         for g in np.flatnonzero(model.geom_bodyid == model.jnt_bodyid[j]):
             axis = np.zeros(3)
