@@ -20,7 +20,6 @@ from safe_wrappers.control.numerics.active_set import (
     SOLVED,
     TARGET,
     WEIGHT,
-    Space,
     X,
     closest_point,
     search_space,
@@ -169,7 +168,7 @@ def _violate_least(point: Array, columns: Array, rows: Array) -> bool:
     for j in range(m):
         for row in range(X):
             near[row, j] = point[row, j]
-    ended, _ = closest_point((near, columns, softened, along, factors, active))
+    ended, _ = closest_point(near, columns, softened, along, factors, active)
     for j in range(m):
         point[X, j] = min(max(near[X, j], point[LOW, j]), point[HIGH, j])
     for i in range(k):
@@ -206,10 +205,14 @@ def _keep_rows(
     control: Array,
     multipliers: Array,
     slacks: Array,
-    space: Space,
+    point: Array,
+    columns: Array,
+    rows: Array,
+    along: Array,
+    factors: Array,
+    active: NDArray[np.int64],
 ) -> tuple[int, float, int]:
     """`keep_rows` in a given space: how it ended, the violation, the number of changes of the active set."""
-    point, columns, rows, _, _, _ = space
     m, k = columns.shape
     ended, inside = _read(u, normals, offsets, lower, upper, point, columns, rows, control)
     for i in range(k):
@@ -223,7 +226,7 @@ def _keep_rows(
         return INACTIVE, 0.0, 0
     if named and asking > 1:
         return SEVERAL_ROWS, math.inf, 0
-    ended, steps = closest_point(space)
+    ended, steps = closest_point(point, columns, rows, along, factors, active)
     solved = ended == SOLVED and _judge(point, columns, rows)
     if ended == CONTRADICTORY:
         solved = asking == 1 and _to_corner(point, columns, rows)
@@ -270,7 +273,7 @@ def keep_rows(
         INACTIVE and so on, the violation, the number of changes of the active set.
     """
     problem = u, normals, offsets, lower, upper, named, control, multipliers
-    return _keep_rows(*problem, np.zeros(offsets.size), search_space(u.size, offsets.size, False))
+    return _keep_rows(*problem, np.zeros(offsets.size), *search_space(u.size, offsets.size, False))
 
 
 @compiled
@@ -287,10 +290,26 @@ def keep_rows_of_each(
     ended: NDArray[np.int64],
 ) -> None:
     """`keep_rows` for B problems: B is the first dimension of every array."""
-    slacks, space = np.zeros(offsets.shape[1]), search_space(u.shape[1], offsets.shape[1], False)
+    slacks = np.zeros(offsets.shape[1])
+    point, columns, rows, along, factors, active = search_space(u.shape[1], offsets.shape[1], False)
     for i in range(u.shape[0]):
-        problem = u[i], normals[i], offsets[i], lower[i], upper[i], named, controls[i], multipliers[i]
-        ended[i], violations[i], _ = _keep_rows(*problem, slacks, space)
+        ended[i], violations[i], _ = _keep_rows(
+            u[i],
+            normals[i],
+            offsets[i],
+            lower[i],
+            upper[i],
+            named,
+            controls[i],
+            multipliers[i],
+            slacks,
+            point,
+            columns,
+            rows,
+            along,
+            factors,
+            active,
+        )
 
 
 @compiled

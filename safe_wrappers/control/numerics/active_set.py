@@ -95,9 +95,17 @@ def _append(point: Array, along: Array, factors: Array, place: int, square: floa
 
 
 @compiled
-def _factor(space: Space, start: int, count: int) -> bool:
+def _factor(
+    normals: Array,
+    rows: Array,
+    point: Array,
+    along: Array,
+    factors: Array,
+    active: NDArray[np.int64],
+    start: int,
+    count: int,
+) -> bool:
     """Factor the active normals from one place on; False if they depend on each other."""
-    point, normals, rows, along, factors, active = space
     m, wide = normals.shape[0], point.shape[1]
     for a in range(start, count):
         i, whole = active[a], 0.0
@@ -125,9 +133,16 @@ def _in_normals(along: Array, factors: Array, wide: int, count: int) -> None:
 
 
 @compiled
-def _polish(space: Space, count: int) -> None:
+def _polish(
+    normals: Array,
+    rows: Array,
+    point: Array,
+    along: Array,
+    factors: Array,
+    active: NDArray[np.int64],
+    count: int,
+) -> None:
     """The iterate of the active set anew from the target, and again from what rounding left of it."""
-    point, normals, rows, along, factors, active = space
     m, wide = normals.shape[0], point.shape[1]
     for j in range(m):
         if point[SIDE, j] == 0.0:
@@ -191,9 +206,16 @@ def _most_violated(
 
 
 @inlined
-def _first_used_up(space: Space, count: int, length: float) -> tuple[float, int]:
+def _first_used_up(
+    normals: Array,
+    rows: Array,
+    point: Array,
+    along: Array,
+    active: NDArray[np.int64],
+    count: int,
+    length: float,
+) -> tuple[float, int]:
     """How far the entering multiplier grows until an active one is zero, and its place: row a, or bound count + j."""
-    point, normals, rows, along, _, active = space
     used, place = math.inf, -1
     for a in range(count):
         i, change = active[a], along[CHANGE, a]
@@ -213,13 +235,22 @@ def _first_used_up(space: Space, count: int, length: float) -> tuple[float, int]
 
 
 @compiled
-def _enter(space: Space, count: int, chosen: int, over: float) -> tuple[int, int, int]:
+def _enter(
+    normals: Array,
+    rows: Array,
+    point: Array,
+    along: Array,
+    factors: Array,
+    active: NDArray[np.int64],
+    count: int,
+    chosen: int,
+    over: float,
+) -> tuple[int, int, int]:
     """Add one condition, violated by `over`, and drop those whose multipliers it uses up on the way.
 
     Returns:
         How many half-spaces are active; SOLVED, CONTRADICTORY or GAVE_UP; steps.
     """
-    point, normals, rows, along, factors, active = space
     m, k = normals.shape
     wide, most = point.shape[1], 10 * (m + k)
     bound, side, slack, length, weight = -1, 0.0, 0.0, 1.0, 0.0
@@ -239,7 +270,7 @@ def _enter(space: Space, count: int, chosen: int, over: float) -> tuple[int, int
             point[REST, j] = -slack if j == m + count else 0.0
         square = _split(point, along, factors, count, whole)
         _in_normals(along, factors, wide, count)
-        used, place = _first_used_up(space, count, length)
+        used, place = _first_used_up(normals, rows, point, along, active, count, length)
         holds = math.inf
         if square > _DEPENDENT * _DEPENDENT * whole:
             holds = max(over, 0.0) / square
@@ -270,7 +301,7 @@ def _enter(space: Space, count: int, chosen: int, over: float) -> tuple[int, int
             rows[WEIGHT, active[place]] = 0.0
             for a in range(place, count):
                 active[a] = active[a + 1]
-        if not _factor(space, start, count):
+        if not _factor(normals, rows, point, along, factors, active, start, count):
             return count, GAVE_UP, steps
         if holds <= used:
             return count, SOLVED, steps
@@ -278,19 +309,20 @@ def _enter(space: Space, count: int, chosen: int, over: float) -> tuple[int, int
 
 
 @compiled
-def closest_point(space: Space) -> tuple[int, int]:
+def closest_point(
+    point: Array, normals: Array, rows: Array, along: Array, factors: Array, active: NDArray[np.int64]
+) -> tuple[int, int]:
     """The x that minimises `|x - target|^2` with `x @ normals <= offsets` and `low <= x <= high`.
 
     With slacks it minimises `|x - target|^2 + sum of (violation / slack)^2` over the box: there is always an answer,
     and the multipliers are the violations over the squared slacks. The caller judges the answer.
 
-    In the space the rows TARGET to NEAR, the normals, and OFFSET to SLACK are written, all finite but for the box.
-    The answer is in X and WEIGHT.
+    The arguments are a `Space` with the rows TARGET to NEAR, the normals, and OFFSET to SLACK written, all finite but
+    for the box. The answer is in X and WEIGHT.
 
     Returns:
         SOLVED, CONTRADICTORY or GAVE_UP, and the number of changes of the active set.
     """
-    point, normals, rows, _, _, active = space
     m, k = normals.shape
     for i in range(k):
         rows[WEIGHT, i] = 0.0
@@ -303,9 +335,9 @@ def closest_point(space: Space) -> tuple[int, int]:
     while steps < 10 * (m + k):
         chosen, over = _most_violated(normals, rows, point, active, count)
         if chosen < 0:
-            _polish(space, count)
+            _polish(normals, rows, point, along, factors, active, count)
             return SOLVED, steps
-        count, ended, more = _enter(space, count, chosen, over)
+        count, ended, more = _enter(normals, rows, point, along, factors, active, count, chosen, over)
         steps += more
         if ended != SOLVED:
             return ended, steps
