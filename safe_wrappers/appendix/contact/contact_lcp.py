@@ -84,22 +84,16 @@ def contact_step(
     if not 0.0 < step_s < np.inf:
         raise ConfigurationError(f"step_s must be positive and finite, got {step_s!r}")
     lower = _cholesky(m)
-    half, matrix = _delassus(lower, j)
+    half: Array = np.asarray(np.linalg.solve(lower, j.T), dtype=np.float64)
+    matrix = half.T @ half
     free = v + step_s * np.linalg.solve(lower.T, np.linalg.solve(lower, f))
     impacts = (phi <= 0.0) | ((e > 0.0) & (phi + step_s * (j @ free) <= 0.0))
     least = np.where(impacts, -e * (j @ v), -phi / step_s)
     if k == 0:
         return ContactStep(free, np.zeros(0), np.zeros(0), LcpStatus.SOLVED)
-    found = solve_lcp(matrix, j @ free - least)
+    found = solve_lcp(0.5 * (matrix + matrix.T), j @ free - least)  # exactly symmetric
     after = free + np.linalg.solve(lower.T, half @ found.z)
     return ContactStep(after, found.z, phi + step_s * (j @ after), found.status)
-
-
-def _delassus(lower: Array, j: Array) -> tuple[Array, Array]:
-    """L^-1 J' and its square, which is exactly symmetric."""
-    half: Array = np.asarray(np.linalg.solve(lower, j.T), dtype=np.float64)
-    matrix = half.T @ half
-    return half, np.asarray(0.5 * (matrix + matrix.T))
 
 
 def _cholesky(m: Array) -> Array:
