@@ -11,6 +11,7 @@ from safe_wrappers.constraints.limits.joints import JointSpeedLimit
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.env_checks import check_actions
+from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS
 from safe_wrappers.plants.simulator.plant import SimulatorPlant
 from safe_wrappers.recipes import RECIPES
 from safe_wrappers.shelf import PLANTS, SHELF
@@ -148,8 +149,7 @@ def _limiting_joints(env: gym.Env[Any, Any], model: mujoco.MjModel) -> str:
     try:
         CBFActionFilter(env, [JointSpeedLimit(limit=4.0)])
     except ConfigurationError:
-        scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-        names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] in scalar]
+        names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] in SCALAR_JOINTS]
         if not names or "" in names:
             raise
         CBFActionFilter(env, [JointSpeedLimit(limit=4.0, joints=names)])

@@ -31,6 +31,7 @@ from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADI
 from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.plants.mujoco.model import HINGE
 
 Env = gym.Env[Any, Any]
 Recommended = list[Constraint]
@@ -180,8 +181,7 @@ def _joint_speeds(
 
     def recipe(env: Env) -> Recommended:
         model: mujoco.MjModel = env.unwrapped.model  # type: ignore[attr-defined]
-        hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
-        driven = {model.joint(j).name: int(model.jnt_type[j]) == hinge for j in driven_joints(model)}
+        driven = {model.joint(j).name: int(model.jnt_type[j]) == HINGE for j in driven_joints(model)}
         turning = [*(name for name, turns in driven.items() if turns), *tied]
         sliding = [name for name, turns in driven.items() if not turns]
         limits = [JointSpeedLimit(hinges, turning, margin=margin, horizon=horizon)]

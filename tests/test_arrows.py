@@ -140,7 +140,7 @@ def test_the_parser_sees_what_it_should(tmp_path):
     path.write_text(source)
     found = imports(path, "safe_wrappers.control")
     assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
-    assert layers_used("control", LAYERS["control"] / "watchdog" / "leases.py") == {"errors"}
+    assert layers_used("control", LAYERS["control"] / "watchdog" / "leases.py") == {"checks", "errors"}
     assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {
         "checks",
         "deprecation",

@@ -185,7 +185,7 @@ def test_a_car_keeps_clear_of_vases_with_its_outline_where_they_cost():
 
 
 def test_the_cars_outline_encloses_every_geom():
-    from safe_wrappers.control.numerics.outlines import distances_to_outline
+    from safe_wrappers.control.numerics.outlines import distance_to_outline
 
     env = gym.make("SafeCarGoal1-v0").unwrapped
     env.reset(
@@ -197,7 +197,7 @@ def test_the_cars_outline_encloses_every_geom():
     for g in np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body("agent").id):
         corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T * model.geom_aabb[g, 3:]
         turned = (corners + model.geom_aabb[g, :3]) @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
-        beyond = distances_to_outline(outline, turned[:, :2])
+        beyond = np.array([distance_to_outline(outline, x, y) for x, y, _ in turned])
         assert beyond.max() < 1e-9
         closest = min(closest, np.abs(beyond).min())
     assert closest < 1e-9

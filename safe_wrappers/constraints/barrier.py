@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.filtering import cbf
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize
 from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant

@@ -6,10 +6,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import check_fields, name_list, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Nearest, Plain, obstacles_from, refuse_more_dimensions
 from safe_wrappers.control.backup.approach_rows import (
+    Machine,
     approach_rows,
     approach_rows_of,
     approaches,
@@ -18,7 +19,7 @@ from safe_wrappers.control.backup.approach_rows import (
 from safe_wrappers.control.numerics.nearest_discs import squashed
 from safe_wrappers.drawing.marks import Mark, segment
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.points import Points
 
@@ -105,34 +106,27 @@ class BoundClearance(BoundConstraint):
         """The rooms and the rows, once per observation."""
         if self._observed is None:
             plant, spec = self.plant, self.spec
-            timing = plant.delay_s, plant.control_dt
-            always = (
-                plant.lower,
-                plant.upper,
-                *timing,
-                spec.radius,
-                spec.braking,
-                spec.state_error + spec.margin,
-            )
-            self._observed = (self._far(always) if self._was_far else None) or self._near(always)
+            limits = plant.lower, plant.upper, plant.delay_s, plant.control_dt
+            machine = *limits, spec.radius, spec.braking, spec.state_error + spec.margin
+            self._observed = (self._far(machine) if self._was_far else None) or self._near(machine)
             self._was_far = not self._observed[1].offsets.size
         return self._observed
 
-    def _far(self, always: tuple[Any, ...]) -> tuple[Array, HalfSpaces] | None:
+    def _far(self, machine: Machine) -> tuple[Array, HalfSpaces] | None:
         """The rooms where no control can matter; None: it may."""
         if self._still is None or not self._points.of_machine:
             return None
-        found = [out_of_reach(self._still, reach, *always) for reach in self._points.reaches()]
+        found = [out_of_reach(self._still, reach, machine) for reach in self._points.reaches()]
         if not all(certain for _, certain in found):
             return None
         rooms = found[0][0] if len(found) == 1 else np.concatenate([rooms for rooms, _ in found])
         return rooms, self._none
 
-    def _near(self, always: tuple[Any, ...]) -> tuple[Array, HalfSpaces]:
+    def _near(self, machine: Machine) -> tuple[Array, HalfSpaces]:
         found = [
-            approach_rows(*self._surfaces(p), v, drift, effect, *always)
+            approach_rows(*self._surfaces(p), v, drift, effect, machine)
             if self._still is None
-            else approach_rows_of(self._still, p, v, drift, effect, *always)
+            else approach_rows_of(self._still, p, v, drift, effect, machine)
             for p, v, drift, effect in self._points.accelerations()
         ]
         parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))

@@ -5,9 +5,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
 from safe_wrappers.drawing.marks import Mark, ball, block, ellipsoid, pad, ring, spatial
-from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.plant import Plant
 
 _PAD_M: Final = 0.4

@@ -7,12 +7,11 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from safe_wrappers.checks import non_negative, positive, settings_from
+from safe_wrappers.checks import Array, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
 from safe_wrappers.control.numerics.surfaces import BLOCK, NUMBERS, PLANE, ROUND, nearest_points
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.plant import Plant
 
 _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)  # of the horizon, at which growth is looked at; the first: its rate now

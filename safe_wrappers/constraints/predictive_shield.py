@@ -10,9 +10,9 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import non_negative, positive, whole_number
+from safe_wrappers.checks import Array, non_negative, positive, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.rollouts import NotFiniteError, RolloutPlant, View
 

@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative, positive, whole_number
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, whole_number
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import Tangents, differences, linearize, tangent_rows
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco

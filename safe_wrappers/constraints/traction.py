@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import Array, name_list, non_negative, positive
 from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
 from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.driven_wheels import DrivenWheels

@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
-from safe_wrappers.diagnosis.symptom import NotMeasuredError
+from safe_wrappers.diagnosis.recording import Env, Recording
+from safe_wrappers.diagnosis.symptom import NotMeasuredError, require_physics
 from safe_wrappers.plants.env_checks import wrappers_of
+from safe_wrappers.plants.mujoco.model import BALL, FREE
 from safe_wrappers.plants.snapshot import STATE
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
@@ -114,11 +115,8 @@ class Linearised:
     """
 
     def __init__(self, env: Env, recording: Recording, places: Callable[[mujoco.MjData], Array]) -> None:
-        found = physics(env)
-        if found is None:
-            raise NotMeasuredError("the env has no MuJoCo model that could be linearised")
         self._raw: Any = env.unwrapped
-        self._model, self._data = found
+        self._model, self._data = require_physics(env, "that could be linearised")
         self._own = mujoco.MjData(self._model)
         self._recording, self._places = recording, places
         self._kept = np.zeros(mujoco.mj_stateSize(self._model, STATE))
@@ -226,6 +224,6 @@ def _dof_name(model: mujoco.MjModel, dof: int) -> str:
     joint = int(model.dof_jntid[dof])
     name = model.joint(joint).name or f"joint {joint}"
     kind, which = int(model.jnt_type[joint]), dof - int(model.jnt_dofadr[joint])
-    if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+    if kind == FREE:
         return f"{name} {('x', 'y', 'z', 'turn x', 'turn y', 'turn z')[which]}"
-    return f"{name} turn {'xyz'[which]}" if kind == int(mujoco.mjtJoint.mjJNT_BALL) else name
+    return f"{name} turn {'xyz'[which]}" if kind == BALL else name

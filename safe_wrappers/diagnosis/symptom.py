@@ -1,12 +1,14 @@
 """A symptom: how it is measured, and which lines treat it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import mujoco
+
 from safe_wrappers.checks import Array
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording
+from safe_wrappers.diagnosis.recording import Env, Recording, physics
 
 Recordings = Mapping[str, Recording]
 """By the driver's name."""
@@ -14,6 +16,25 @@ Recordings = Mapping[str, Recording]
 
 class NotMeasuredError(Exception):
     """Why a symptom cannot be measured in an env; never leaves this package."""
+
+
+def require_physics(env: Env, that: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """MuJoCo's model and data of an env; `NotMeasuredError` where it has no model `that` could be used."""
+    found = physics(env)
+    if found is None:
+        raise NotMeasuredError(f"the env has no MuJoCo model {that}")
+    return found
+
+
+def replayed(model: mujoco.MjModel, recording: Recording) -> Iterator[tuple[int, mujoco.MjData]]:
+    """Every step, and data with where all bodies were after it and how fast."""
+    data = mujoco.MjData(model)
+    for k, (qpos, qvel) in enumerate(zip(recording.qpos, recording.qvel, strict=True)):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        yield k, data
 
 
 @dataclass

@@ -6,7 +6,8 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from safe_wrappers.drawing.marks import Array, Mark, Role, arrow
+from safe_wrappers.checks import Array
+from safe_wrappers.drawing.marks import Mark, Role, arrow
 from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
+
 Role = Literal["keep out", "limit", "way", "estimate", "proposed", "executed"]
 Shape = Literal["sphere", "ellipsoid", "capsule", "box", "arrow"]
 

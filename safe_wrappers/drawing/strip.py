@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.marks import COLOURS, Array
+from safe_wrappers.checks import Array
+from safe_wrappers.drawing.marks import COLOURS
 
 if TYPE_CHECKING:
     from PIL import ImageDraw

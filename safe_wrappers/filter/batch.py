@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.problem import Array
 from safe_wrappers.filter.projection import OWN, STATUSES, check_solver, project_unchecked
 from safe_wrappers.filter.rows_and_box import BAD_NOMINAL, UNSOLVED, keep_rows_of_each
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.nearest_discs import squashed
 from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
@@ -15,8 +15,6 @@ from safe_wrappers.plants.plant import Plant
 
 if TYPE_CHECKING:
     from safe_wrappers.filter.constraint_batch import ConstraintBatch
-
-Array = NDArray[np.float64]
 Promise = Literal["proved", "best effort"]
 Memory = Any
 """What a bound constraint keeps from one control step to the next; None if nothing."""

@@ -5,7 +5,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.filter.constraint import Array, Memory
+from safe_wrappers.checks import Array
+from safe_wrappers.filter.constraint import Memory
 
 
 class ConstraintBatch(ABC):

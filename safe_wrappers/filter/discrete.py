@@ -1,9 +1,6 @@
-"""The search and the engine for discrete actions: every one of them is tried."""
+"""The search for discrete actions, which are whole numbers as floats: every one of them is tried."""
 
-from typing import ClassVar
-
-from safe_wrappers.filter.constraint import Array
-from safe_wrappers.filter.engine import SafetyFilter
+from safe_wrappers.checks import Array
 from safe_wrappers.filter.search import Decision, Rows, SafeActionSearch, Stage
 
 
@@ -19,9 +16,3 @@ class DiscreteSearch(SafeActionSearch):
         if self._fallback.custom:
             return super().unreadable(last)
         return Decision(last, Stage.FALLBACK, fallback=True)
-
-
-class DiscreteFilter(SafetyFilter):
-    """A `SafetyFilter` whose controls are whole numbers, as floats."""
-
-    search: ClassVar[type[SafeActionSearch]] = DiscreteSearch

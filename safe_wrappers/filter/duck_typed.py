@@ -7,8 +7,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.plant import Plant
 
 

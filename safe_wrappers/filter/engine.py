@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.filter.search import Decision, SafeActionSearch
 from safe_wrappers.plants.plant import Plant
@@ -26,6 +27,7 @@ class SafetyFilter:
         low: Action box, shape (m,).
         high: Likewise.
         dtype: Of the actions; decisions are rounded to it before they are judged.
+        search: How an admissible action is looked for.
 
     Attributes:
         bound: The constraints on the plant, in their order.
@@ -40,7 +42,6 @@ class SafetyFilter:
     """
 
     margin: float
-    search: ClassVar[type[SafeActionSearch]] = SafeActionSearch
 
     def __init__(
         self,
@@ -51,6 +52,7 @@ class SafetyFilter:
         low: Array,
         high: Array,
         dtype: Any = np.float64,
+        search: type[SafeActionSearch] = SafeActionSearch,
     ) -> None:
         self.plant = plant
         self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in constraints]
@@ -61,7 +63,7 @@ class SafetyFilter:
                 twice = f"{kind} is in the list {kinds.count(kind)} times"
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
         falling_back = Fallback(fallback, self.bound)
-        self._search = self.search(plant, self.bound, falling_back, solver, low, high, dtype)
+        self._search = search(plant, self.bound, falling_back, solver, low, high, dtype)
         self._low, self._high = low, high
         self._narrower = not plant.bounds_are_action_space
         self._all_predict = all(c.predicts for c in self.bound)

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import Array, BoundConstraint
+from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.filter.projection import box_least_squares
 from safe_wrappers.plants.plant import Plant
 

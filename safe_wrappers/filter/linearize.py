@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from safe_wrappers.filter.constraint import Array, HalfSpaces
+from safe_wrappers.checks import Array
+from safe_wrappers.filter.constraint import HalfSpaces
 
 Slacks = Callable[[Array], Array]
 """Control (m,) to what is left of the requirement along the held step, (k,); wanted >= 0."""

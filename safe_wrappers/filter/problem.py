@@ -3,12 +3,8 @@
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
-
-Array = NDArray[np.float64]
 
 FEASIBILITY_TOLERANCE: Final = 1e-9
 """Largest residual that the nominal may have, as a share of `residual_scale`; answers may have ten times as much."""

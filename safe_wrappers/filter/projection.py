@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter import rows_and_box
-from safe_wrappers.filter.problem import Array, Projection, Status
+from safe_wrappers.filter.problem import Projection, Status
 from safe_wrappers.filter.qp import OPTIMALITY_TOLERANCE, control_unit, nearest, plain, solve_with_daqp
 from safe_wrappers.filter.rows_and_box import LARGEST, OVERFLOWING, keep_rows, row_slacks
 

@@ -13,7 +13,8 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.filter.problem import ORDINARY_BOX, UNBOUNDED, Array, half_width, residual_scale
+from safe_wrappers.checks import Array
+from safe_wrappers.filter.problem import ORDINARY_BOX, UNBOUNDED, half_width, residual_scale
 from safe_wrappers.filter.rows_and_box import row_slacks
 
 OPTIMALITY_TOLERANCE = 1e-4  # between a backend's answer and the one of its multipliers, in `control_unit`s

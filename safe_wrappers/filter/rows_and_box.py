@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.active_set import (
     ALLOWED,
     CONTRADICTORY,
@@ -24,7 +25,7 @@ from safe_wrappers.control.numerics.active_set import (
     search_space,
 )
 from safe_wrappers.control.numerics.compiled import compiled, inlined
-from safe_wrappers.filter.problem import EXACT_SHARE, FEASIBILITY_TOLERANCE, Array, half_width, residual_scale
+from safe_wrappers.filter.problem import EXACT_SHARE, FEASIBILITY_TOLERANCE, half_width, residual_scale
 
 INACTIVE, PROJECTED, INFEASIBLE, UNSOLVED, SEVERAL_ROWS, UNUSUAL, BAD_NOMINAL, BAD_BOX, _READ = range(9)
 """How it ended: the first three as a `Status`; no answer; a problem for a named solver; a number too large to be

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.filter.constraint import Array, BoundConstraint, HalfSpaces
+from safe_wrappers.checks import Array
+from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
 from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.filter.problem import Projection, Status
 from safe_wrappers.filter.projection import cast_inside, keeps_rows, project_unchecked

@@ -1,7 +1,7 @@
 """ActionShield: CBFActionFilter for discrete actions."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.filter.discrete import DiscreteFilter
-from safe_wrappers.filter.engine import SafetyFilter
+from safe_wrappers.filter.discrete import DiscreteSearch
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
@@ -53,6 +52,8 @@ class ActionShield(CBFActionFilter):
         array([ True,  True])
     """
 
+    _search: ClassVar = DiscreteSearch
+
     def __init__(
         self,
         env: Env,
@@ -87,10 +88,6 @@ class ActionShield(CBFActionFilter):
         self._low = np.atleast_1d(space.start).astype(np.float64)
         self._high = self._low + counts - 1.0
         self._shape, self._dtype = self._low.shape, np.float64
-
-    def _filter(self) -> SafetyFilter:
-        box = self._low, self._high
-        return DiscreteFilter(self.plant, self.constraints, self._fallback, self._solver, *box, self._dtype)
 
     def step(self, action: Any) -> Step:
         """Shield the action and step the env with what may be executed."""

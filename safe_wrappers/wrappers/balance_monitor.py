@@ -8,11 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.control.legged.support_distances import support_distances
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader, can_touch_the_world
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.mujoco.contacts import (
+    ContactForecast,
+    ContactReader,
+    can_touch_the_world,
+    chosen_bodies,
+)
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.queries.momentum import MomentumReader
 from safe_wrappers.wrappers.common.layer import Env, Reset
@@ -151,15 +156,7 @@ class _Robot:
 
 def _trees(model: mujoco.MjModel, roots: Sequence[str] | None) -> NDArray[np.bool_]:
     """Which bodies are, or hang from, the named ones, shape (nbody,); None is all."""
-    if roots is None:
-        return np.ones(model.nbody, dtype=bool)
-    roots = name_list("bodies", roots, "names of bodies", "None for all")
-    names = [model.body(i).name for i in range(model.nbody)]
-    for name in roots:
-        if name not in names:
-            there = ", ".join(known for known in names if known)
-            raise UnknownNameError(f"bodies: the model has no body {name!r}; it has: {there}")
-    own = np.zeros(model.nbody, dtype=bool)
-    for i, name in enumerate(names):  # a parent's id is smaller than its children's
-        own[i] = name in roots or own[model.body_parentid[i]]
+    own = chosen_bodies(model, "bodies", roots)[:-1]
+    for i, parent in enumerate(model.body_parentid):  # a parent's id is smaller than its children's
+        own[i] |= own[parent]
     return own

@@ -9,19 +9,19 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative
+from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.projection import check_solver
-from safe_wrappers.filter.search import Stage
+from safe_wrappers.filter.search import SafeActionSearch, Stage
 from safe_wrappers.plants.default import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array
 
 SAFE_TOLERANCE = 1e-6
@@ -76,6 +76,7 @@ class CBFActionFilter(LayerWrapper):
     """
 
     layer: ClassVar = Layer.FILTER
+    _search: ClassVar[type[SafeActionSearch]] = SafeActionSearch
 
     def __init__(
         self,
@@ -116,8 +117,8 @@ class CBFActionFilter(LayerWrapper):
         return [c.widened(margin) for c in self._own] if margin else self._own
 
     def _filter(self) -> SafetyFilter:
-        box = self._low, self._high
-        return SafetyFilter(self.plant, self.constraints, self._fallback, self._solver, *box, self._dtype)
+        of_actions = self._low, self._high, self._dtype, self._search
+        return SafetyFilter(self.plant, self.constraints, self._fallback, self._solver, *of_actions)
 
     def set_margin(self, margin: float) -> None:
         """Add this to every constraint's own margin from the next decision on, in place of `margin`.

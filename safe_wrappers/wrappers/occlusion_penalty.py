@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.control.estimation.observability import unobservable_directions
 from safe_wrappers.control.estimation.tracks import largest_deviation
@@ -19,7 +19,7 @@ from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.occlusion.imu import EgoMotion, Imu
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
 from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things

@@ -17,7 +17,6 @@ from safe_wrappers.appendix.handover.flexible_joint import (
     damping_ratios,
     manifold,
     ramp_energy,
-    resonance_matrix,
     resonances,
     smoothstep_energy,
     step_energy,
@@ -138,11 +137,6 @@ def test_resonances_are_the_free_frequencies_of_both_masses(seed):
     assert np.abs(squares[:n]).max() < 1e-6 * squares[n]  # both masses together: the rigid motion
     omega = resonances(k, j, m)
     np.testing.assert_allclose(omega, np.sqrt(squares[n:]), rtol=1e-7)
-    root = resonance_matrix(k, j, m)
-    w = np.diag(1 / j) + np.linalg.inv(m)
-    np.testing.assert_allclose(root @ root, k[:, None] * w, rtol=1e-9, atol=1e-9 * omega[-1] ** 2)
-    # The principal root: it alone has all its eigenvalues positive.
-    np.testing.assert_allclose(np.sort(np.linalg.eigvals(root).real), omega, rtol=1e-7)
 
 
 def test_damping_ratios_are_those_of_the_whole_system():
@@ -314,7 +308,6 @@ def test_batches_are_element_by_element():
     together = {
         "accelerations": accelerations(*x, torque, k, j, m, bias=torque, motor_damping=0.1)[1],
         "manifold": manifold(torque, j, m, bias=x[0], motor_friction=x[1]),
-        "matrix": resonance_matrix(k, j, m),
         "resonances": resonances(k, j, m),
         "damping": damping_ratios(k, j, m, 0.1, 0.01),
         "energy": boundary_layer_energy(x[0], x[1], torque, k, j, m, x[2]),
@@ -328,7 +321,6 @@ def test_batches_are_element_by_element():
         alone = {
             "accelerations": accelerations(*y, t, k, j, mi, bias=t, motor_damping=0.1)[1],
             "manifold": manifold(t, j, mi, bias=y[0], motor_friction=y[1]),
-            "matrix": resonance_matrix(k, j, mi),
             "resonances": resonances(k, j, mi),
             "damping": damping_ratios(k, j, mi, 0.1, 0.01),
             "energy": boundary_layer_energy(y[0], y[1], t, k, j, mi, y[2]),

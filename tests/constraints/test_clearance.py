@@ -10,7 +10,7 @@ from asking import Asked
 from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
-from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
+from safe_wrappers.control.backup.stopping import held_limit, held_stop
 from safe_wrappers.errors import ConfigurationError
 
 POINT_MASS = """<mujoco><option timestep="{timestep}" gravity="{pull}" integrator="RK4"/>
@@ -89,7 +89,7 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
         if not len(rows.offsets):
             continue
         asked += 1
-        limit = sampled_acceleration_limit(distance(0.0), approach, 1.5, plant.control_dt)
+        limit = held_limit(distance(0.0), approach, 1.5, plant.control_dt)
         if limit > -1e6:
             assert rows.offsets[0] - rows.normals[0] @ u == pytest.approx(limit - acceleration, abs=1e-4)
     assert asked > 20
@@ -277,4 +277,5 @@ def test_approach_is_what_the_barrier_counts_the_stopping_distance_from(tmp_path
         distance = np.linalg.norm(way)
         assert room[i] == pytest.approx(distance - disc.radius - 0.05, abs=1e-12)
         assert speed[i] == pytest.approx(np.array([0.7, -0.4]) @ way / distance, abs=1e-12)
-    assert clearance.value() == pytest.approx(sampled_inset(room, speed, 2.0, env.dt), abs=1e-12)
+    stops = [held_stop(v, 2.0, env.dt) for v in speed]
+    assert clearance.value() == pytest.approx(room - stops, abs=1e-12)

@@ -79,17 +79,17 @@ def random_scenes(count):
             axes, (0.1, -0.2), (1, 0), (0, 1), rng.uniform(0.05, 0.3), clip_known, WALLS + BLOCKS
         )
         motion, qpos, qvel = np.zeros(4), rng.uniform(-1.9, 1.9, 2), rng.uniform(-5.5, 5.5, 2)
-        left = point_scene.room_left(*scene, qpos, qvel, motion)
+        left = point_scene.room_left(scene, qpos, qvel, motion)
         control = rng.uniform(low, high)
         asked = motion, left, control.copy()
         found = [
             left,
             motion,
-            point_scene.is_admitted(*scene, *asked),
-            point_scene.candidates(*scene, *asked),
+            point_scene.is_admitted(scene, *asked),
+            point_scene.candidates(scene, *asked),
         ]
-        found += [*point_scene.half_spaces(*scene, *asked[:2]), point_scene.backup_pair(*scene, *asked[:2])]
-        stages.append(point_scene.closest_admitted(*scene, *asked[:2], low, high, control))
+        found += [*point_scene.half_spaces(scene, *asked[:2]), point_scene.backup_pair(scene, *asked[:2])]
+        stages.append(point_scene.closest_admitted(scene, *asked[:2], low, high, control))
         for part in (*found, stages[-1], control):
             digest.update(np.asarray(part, dtype=np.float64).tobytes())
     return digest.hexdigest(), [stages.count(stage) for stage in range(8)]

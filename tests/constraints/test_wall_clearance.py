@@ -385,4 +385,4 @@ def test_other_plants_and_machines_are_refused_with_the_alternative():
 
 def test_the_blocks_are_where_the_tests_think():
     env = filtered()
-    assert len(env.filter.bound[0]._scene.walls) == len(BLOCKS)
+    assert len(env.filter.bound[0]._scene[-1]) == len(BLOCKS)

@@ -8,7 +8,6 @@ import sys
 import numpy as np
 
 from safe_wrappers.control.backup import approach_rows as of
-from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.control.numerics import surfaces
 from safe_wrappers.control.numerics.compiled import IS_COMPILED
 from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
@@ -39,12 +38,11 @@ def random_looks(count):
             high[0] = np.inf
         always = low, high, 0.01, 0.05, 0.1, 2.0, 0.02
         scene = some_surfaces(rng, d)
-        found = of.approach_rows_of(scene, point, v, drift, effect, *always)
+        found = of.approach_rows_of(scene, point, v, drift, effect, always)
         near = surfaces.nearest_points(scene, point)
         moving = rng.normal(size=near[1].shape)
-        found += of.approach_rows(near[0], near[1], moving, near[2], v, drift, effect, *always)
-        found += of.out_of_reach(some_surfaces(rng, 3), np.abs(rng.normal(size=18 + m)), *always)
-        found += sampled_inset(point, v, 2.0, 0.05), sampled_acceleration_limit(point, v, 2.0, 0.05)
+        found += of.approach_rows(near[0], near[1], moving, near[2], v, drift, effect, always)
+        found += of.out_of_reach(some_surfaces(rng, 3), np.abs(rng.normal(size=18 + m)), always)
         outline = convex_outline(rng.normal(size=(6, 2))) if i % 2 else np.zeros((0, 2))
         ahead = rng.normal(size=(3, 2))
         ahead /= np.sqrt((ahead**2).sum(axis=1))[:, None]
@@ -77,10 +75,10 @@ def test_a_row_that_is_not_a_number_is_kept():
     always = np.array([-1.0]), np.array([1.0]), 0.0, 0.05, 0.0, 2.0, 0.0
     for drift, rows in ((0.0, 0), (np.nan, 1)):
         found = of.approach_rows_of(
-            wall, np.zeros(1), np.zeros(1), np.array([drift]), np.ones((1, 1)), *always
+            wall, np.zeros(1), np.zeros(1), np.array([drift]), np.ones((1, 1)), always
         )
         assert found[1].shape == (rows, 1) and found[2].shape == (rows,)
     reach = np.ones(19)
-    assert of.out_of_reach(wall, reach, *always)[1]
+    assert of.out_of_reach(wall, reach, always)[1]
     reach[6] = np.nan
-    assert not of.out_of_reach(wall, reach, *always)[1]
+    assert not of.out_of_reach(wall, reach, always)[1]

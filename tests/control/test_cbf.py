@@ -9,7 +9,6 @@ from safe_wrappers.appendix.filtering.barriers import best_rate, nagumo_holds, p
 from safe_wrappers.control.filtering.cbf import (
     cbf_rows,
     lie_derivatives,
-    linear_decay,
     numerical_gradient,
     relative_degree,
 )
@@ -53,7 +52,7 @@ def test_batches_of_any_shape():
     np.testing.assert_allclose(effect[1, 2], row)
     best = best_rate(drift, effect, -np.ones(2), np.ones(2))
     np.testing.assert_allclose(best, drift + np.abs(effect).sum(-1))
-    normals, offsets = cbf_rows(drift, effect, linear_decay(drift, 2.0))
+    normals, offsets = cbf_rows(drift, effect, 2.0 * drift)
     assert normals.shape == (4, 5, 2) and offsets.shape == (4, 5)
 
 
@@ -61,7 +60,7 @@ def test_batches_of_any_shape():
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 10))
 def test_decay_is_class_k(a, b, alpha):
     for decay in (
-        lambda v: linear_decay(v, alpha),
+        lambda v: power_decay(v, alpha, 1.0),
         lambda v: power_decay(v, alpha, 3.0),
         lambda v: power_decay(v, alpha, 0.5),
     ):
@@ -69,7 +68,7 @@ def test_decay_is_class_k(a, b, alpha):
         if a < b:
             assert decay(a) <= decay(b)
         assert decay(-a) == pytest.approx(-decay(a))
-    assert power_decay(a, alpha, 1.0) == pytest.approx(linear_decay(a, alpha))
+    assert power_decay(a, alpha, 1.0) == pytest.approx(alpha * a)
 
 
 @pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
@@ -83,7 +82,7 @@ def test_rows_say_the_same_as_the_condition(seed):
     rng = np.random.default_rng(seed)
     x, u = rng.normal(size=3), rng.normal(size=2)
     drift, effect = lie_derivatives(gradient(x), f(x), g(x))
-    normals, offsets = cbf_rows(drift, effect, linear_decay(h(x), 1.5))
+    normals, offsets = cbf_rows(drift, effect, 1.5 * h(x))
     left = drift + effect @ u + 1.5 * h(x)
     assert offsets - normals @ u == pytest.approx(left, abs=1e-12)
 

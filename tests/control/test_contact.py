@@ -1,4 +1,4 @@
-"""Gaps, unilateral forces, complementarity, and time steps with contacts."""
+"""Complementarity, and time steps with contacts."""
 
 import itertools
 
@@ -8,8 +8,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from safe_wrappers.appendix.contact.contact_lcp import contact_step, delassus_matrix
-from safe_wrappers.appendix.contact.forces import plane_gap, sphere_gap, unilateral_force
+from safe_wrappers.appendix.contact.contact_lcp import contact_step
 from safe_wrappers.appendix.contact.lemke import LcpStatus
 from safe_wrappers.control.contact.contact import complementarity_residuals
 from safe_wrappers.control.contact.impact import effective_mass, normal_impulse, restitution_velocity
@@ -17,26 +16,7 @@ from safe_wrappers.errors import ConfigurationError
 
 G = 9.81
 
-# Gaps and forces ----------------------------------------------------------------------------------------------
-
-
-def test_gaps_are_signed_distances():
-    assert sphere_gap([0.0, 0.0, 0.0], [0.0, 3.0, 4.0], 4.5) == pytest.approx(0.5)
-    assert sphere_gap(np.zeros((2, 3)), [0.0, 3.0, 4.0], [5.0, 6.0]).tolist() == [0.0, -1.0]
-    assert plane_gap([1.0, 7.0], [0.0, 2.0], 4.0, radius=0.5) == pytest.approx(4.5)
-    assert plane_gap([[0.0, 2.0], [0.0, 1.0]], [0.0, 1.0], 2.0).tolist() == [0.0, -1.0]
-
-
-@given(st.floats(-1, 1), st.floats(-5, 5), st.floats(0, 1e4), st.floats(0, 1e3))
-def test_a_unilateral_force_never_pulls_and_acts_only_when_closed(gap, rate, k, c):
-    f = unilateral_force(gap, rate, k, c)
-    assert f >= 0.0 and (gap < 0.0 or f == 0.0)
-    if gap < 0.0 and f > 0.0:
-        assert f == pytest.approx(-k * gap - c * rate)
-    residuals = complementarity_residuals(gap, f)
-    assert residuals.tension == 0.0
-    assert residuals.penetration == max(-gap, 0.0)
-    assert residuals.product == pytest.approx(abs(gap) * f)
+# Complementarity ----------------------------------------------------------------------------------------------
 
 
 def test_residuals_are_zero_for_ideal_contacts_and_name_what_is_missed():
@@ -170,14 +150,6 @@ def test_an_inelastic_step_is_the_nearest_admissible_velocity(seed):
     assert (step.gap >= -1e-9).all()
 
 
-def test_the_delassus_matrix_has_the_effective_masses_on_its_diagonal():
-    _, m, j, _ = machine(4)
-    matrix = delassus_matrix(m, j)
-    np.testing.assert_allclose(np.diag(matrix), 1.0 / effective_mass(m, j))
-    np.testing.assert_allclose(matrix, j @ np.linalg.inv(m) @ j.T, atol=1e-12)
-    np.testing.assert_array_equal(matrix, matrix.T)
-
-
 def test_no_contacts_is_a_free_step():
     step = contact_step(np.eye(2), np.zeros((0, 2)), [], [1.0, 2.0], [3.0, 0.0], 0.1)
     assert step.velocity.tolist() == [1.3, 2.0] and step.impulse.shape == step.gap.shape == (0,)
@@ -186,16 +158,13 @@ def test_no_contacts_is_a_free_step():
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: sphere_gap(1.0, 2.0, 0.1), "center must have shape"),
-        (lambda: sphere_gap([0.0, 0.0], [1.0, 0.0], -0.1), "radii must be 0 m or more"),
-        (lambda: plane_gap([0.0, 0.0], [0.0, 0.0], 1.0), "other than 0"),
-        (lambda: plane_gap(1.0, 1.0, 1.0), "other than 0"),
-        (lambda: plane_gap([0.0], [1.0], 1.0, radius=-1.0), "radius must be 0 m or more"),
-        (lambda: unilateral_force(0.0, 0.0, -1.0), "stiffness and damping"),
         (lambda: complementarity_residuals(np.nan, 1.0), "gap must be finite"),
         (lambda: contact_step(np.eye(2), [[1.0]], [0.0], [0.0], [0.0], 0.1), "expected an inertia of shape"),
         (lambda: contact_step(-np.eye(1), [[1.0]], [0.0], [0.0], [0.0], 0.1), "positive definite"),
-        (lambda: delassus_matrix([[1.0, 0.5], [0.0, 1.0]], [[1.0, 0.0]]), "symmetric"),
+        (
+            lambda: contact_step([[1.0, 0.5], [0.0, 1.0]], [[1.0, 0.0]], [0.0], [0.0] * 2, [0.0] * 2, 0.1),
+            "symmetric",
+        ),
         (
             lambda: contact_step([[1.0]], [[1.0]], [0.0, 1.0], [0.0], [0.0], 0.1),
             r"gap must have shape \(1,\)",

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safe_wrappers.control.backup import damped_axis as of
-from safe_wrappers.control.backup.stopping import held_stopping_distance
+from safe_wrappers.control.backup.stopping import held_stop
 
 SPEEDS = st.floats(-7.0, 7.0).map(lambda v: round(v, 6))
 PLACES = st.floats(-3.0, 3.0)
@@ -115,9 +115,7 @@ def test_without_damping_a_finely_stepped_hold_is_the_held_formula(speed, holds)
     # A thousand steps a hold: the step's own share of the way, gain * timestep, is below the tolerance.
     brake, hold, steps = 3.0, 0.1, 1000
     axis = of.damped_axis(1.0, brake * hold / steps, hold / steps, steps, -1.0, 1.0)
-    assert of.rest(axis, 0.0, speed) == pytest.approx(
-        float(held_stopping_distance(speed, brake, hold)), abs=1e-3
-    )
+    assert of.rest(axis, 0.0, speed) == pytest.approx(held_stop(speed, brake, hold), abs=1e-3)
 
 
 def test_faster_than_the_table_knows_never_stops():

@@ -240,7 +240,7 @@ def test_an_end_gives_what_it_has_heard_of():
     end = EnergyReference("admittance")
     end.receive(1.5, 1.0)
     end.receive(0.5)
-    assert end.heard_j == 1.5
+    assert end.budget_j == 1.5
     free = end.modify(2.0, -1.0, 0.5)
     assert (free.flow, free.correction) == (-1.0, 0.0)
     held = end.modify(2.0, -1.0, 0.5)

@@ -10,9 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from safe_wrappers.appendix.estimation.lever_arm import (
     centre_acceleration_from_imu,
-    centre_velocity,
     imu_specific_force,
-    sensor_pose,
 )
 from safe_wrappers.control.estimation.lever_arm import (
     centre_acceleration,
@@ -80,7 +78,6 @@ def test_mujocos_velocimeter_reads_the_lever_arms_velocity(spinning, seed):
     at_site = lever_arm_velocity(s["velocity"], s["turning"], arm)
     reading = (s["orientation"] * mount.rotation).apply(s["sensors"][2])
     np.testing.assert_allclose(at_site, reading, atol=1e-12)
-    np.testing.assert_allclose(centre_velocity(reading, s["turning"], arm), s["velocity"], atol=1e-12)
     assert np.linalg.norm(reading - s["velocity"]) > 0.1, "without compensation it would be wrong"
 
 
@@ -156,9 +153,7 @@ def test_the_acceleration_has_a_tangential_and_a_centripetal_part():
 
 @settings(max_examples=50, deadline=None)
 @given(VECTORS, VECTORS, VECTORS, VECTORS)
-def test_the_inverses_undo_the_lever_arm(value, turning, speeding, arm):
-    velocity = centre_velocity(lever_arm_velocity(value, turning, arm), turning, arm)
-    np.testing.assert_allclose(velocity, value, atol=1e-12)
+def test_the_inverse_undoes_the_lever_arm(value, turning, speeding, arm):
     there = lever_arm_acceleration(value, turning, speeding, arm)
     back = centre_acceleration(there, turning, speeding, arm)
     np.testing.assert_allclose(back, value, atol=1e-10)
@@ -184,7 +179,7 @@ def test_leading_axes_broadcast():
 def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
     body = rigid_transform(Rotation.from_rotvec(rotvec).as_matrix(), position)
     mount = rigid_transform(Rotation.from_rotvec(mounted).as_matrix(), 0.1 * mounted)
-    pose = sensor_pose(body, mount)
+    pose = body * mount
     np.testing.assert_allclose(pose.as_matrix(), body.as_matrix() @ mount.as_matrix(), atol=1e-12)
     rotation, origin = pose.rotation.as_matrix(), pose.translation
     seen = to_sensor(points, rotation, origin)
@@ -195,7 +190,7 @@ def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
 
 def test_a_sensors_own_position_is_its_origin():
     quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    pose = sensor_pose(rigid_transform(quarter, [1.0, 2.0, 0.0]), rigid_transform(np.eye(3), [0.5, 0.0, 0.0]))
+    pose = rigid_transform(quarter, [1.0, 2.0, 0.0]) * rigid_transform(np.eye(3), [0.5, 0.0, 0.0])
     np.testing.assert_allclose(pose.translation, [1.0, 2.5, 0.0], atol=1e-15)
     # What is 1 m to the left of the sensor is at -x in the world.
     np.testing.assert_allclose(
@@ -240,9 +235,8 @@ def test_what_is_no_vector_is_refused_wherever_it_is_given(bad, at):
         with pytest.raises(ConfigurationError, match=words):
             function(*given)
     if at < 3:
-        for function in (lever_arm_velocity, centre_velocity):
-            with pytest.raises(ConfigurationError, match=words):
-                function(*given[:3])
+        with pytest.raises(ConfigurationError, match=words):
+            lever_arm_velocity(*given[:3])
 
 
 def test_imu_readings_that_are_not_finite_are_named():

@@ -6,12 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.filtering.barriers import kinetic_inset, kinetic_row
-from safe_wrappers.control.backup import stopping
-from safe_wrappers.control.backup.stopping import (
-    predicted_approach,
-    sampled_acceleration_limit,
-    sampled_inset,
-)
+from safe_wrappers.control.backup.stopping import held_limit, held_stop
 
 POSITIVE = st.floats(0.05, 5.0)
 
@@ -48,26 +43,6 @@ def test_standstill_has_its_own_rule():
         kinetic_row(np.array([1.0, 0.0]), np.array([0.0, 0.0]), 1.0, 2.0)
 
 
-def test_batches_are_element_by_element():
-    rng = np.random.default_rng(0)
-    clearance, speed = rng.uniform(-0.5, 3, (4, 5)), rng.uniform(-1, 2, (4, 5))
-    together = sampled_acceleration_limit(clearance, speed, 1.3, 0.1, margin=0.05)
-    inset = sampled_inset(clearance, speed, 1.3, 0.1, margin=0.05)
-    for i in np.ndindex(4, 5):
-        assert together[i] == sampled_acceleration_limit(clearance[i], speed[i], 1.3, 0.1, margin=0.05)
-        assert inset[i] == sampled_inset(clearance[i], speed[i], 1.3, 0.1, margin=0.05)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.floats(-1, 3), st.floats(-2, 2), st.floats(0, 1), st.floats(-2, 2))
-def test_the_prediction_is_exact_motion(clearance, speed, delay, accel):
-    room, v = predicted_approach(clearance, speed, delay, accel)
-    assert v == pytest.approx(speed + accel * delay)
-    times = np.linspace(0, delay, 20001)
-    travelled = np.trapezoid(speed + accel * times, times)
-    assert room == pytest.approx(clearance - travelled, abs=1e-7)
-
-
 def simulate(
     start, speed, wall, brake, hold, *, holds_of_delay=0, error=0.0, margin=0.0, strength=None, seed=0
 ):
@@ -84,11 +59,10 @@ def simulate(
         # exact over the commands in flight, one after the other
         room, fast = measured, v
         for a in queue:
-            room, fast = predicted_approach(room, fast, hold, a)
-        smallest = min(
-            smallest, float(sampled_inset(room, fast, brake, hold, state_error=error, margin=margin))
-        )
-        limit = float(sampled_acceleration_limit(room, fast, brake, hold, state_error=error, margin=margin))
+            room, fast = room - fast * hold - 0.5 * a * hold**2, fast + a * hold
+        room -= error + margin
+        smallest = min(smallest, room - held_stop(fast, brake, hold))
+        limit = held_limit(room, fast, brake, hold)
         queue.append(float(np.clip(min(strength, limit), -brake, strength)))
         a = queue.pop(0)
         turn = -v / a if a < 0 else np.inf
@@ -134,7 +108,7 @@ def simulate_with_error_untold(hold, seed):
     rng = np.random.default_rng(seed)
     x, v, closest = 0.0, 0.3, 1.5
     for _ in range(int(10 / hold)):
-        limit = float(sampled_acceleration_limit(1.5 - x + 0.05 * rng.uniform(-1, 1), v, 1.0, hold))
+        limit = held_limit(1.5 - x + 0.05 * rng.uniform(-1, 1), v, 1.0, hold)
         a = float(np.clip(limit, -1.0, 1.0))
         x, v = x + v * hold + 0.5 * a * hold**2, v + a * hold
         closest = min(closest, 1.5 - x)
@@ -149,14 +123,14 @@ def test_the_margin_is_kept():
 @settings(max_examples=300, deadline=None)
 @given(st.floats(0, 3), st.floats(-2, 3), POSITIVE, st.floats(0.005, 0.5))
 def test_braking_is_always_admissible_inside_the_set(clearance, speed, brake, hold):
-    inset = float(sampled_inset(clearance, speed, brake, hold))
+    inset = clearance - held_stop(speed, brake, hold)
     assume(inset >= 0.0)
-    limit = float(sampled_acceleration_limit(clearance, speed, brake, hold))
+    limit = held_limit(clearance, speed, brake, hold)
     assert limit >= -brake - 1e-9 * max(1.0, brake) - 1e-9 * abs(speed) / hold
     # and so is what it admits: the inset after a hold at the limit (or at full braking) is not negative
     for a in {min(limit, 10.0), max(-brake, min(limit, -brake))}:
         after = clearance - speed * hold - 0.5 * a * hold**2
-        inset_after = float(sampled_inset(after, speed + a * hold, brake, hold))
+        inset_after = after - held_stop(speed + a * hold, brake, hold)
         assert inset_after >= -1e-9 * (1 + abs(speed))
 
 
@@ -164,33 +138,33 @@ def test_braking_is_always_admissible_inside_the_set(clearance, speed, brake, ho
 @given(st.floats(0, 3), st.floats(-2, 3), POSITIVE, st.floats(0.005, 0.5))
 def test_the_limit_is_the_largest(clearance, speed, brake, hold):
     # A little more acceleration than the limit leaves the set, at the end of the hold: nothing is given away.
-    assume(float(sampled_inset(clearance, speed, brake, hold)) >= 1e-6)
-    limit = float(sampled_acceleration_limit(clearance, speed, brake, hold))
+    assume(clearance - held_stop(speed, brake, hold) >= 1e-6)
+    limit = held_limit(clearance, speed, brake, hold)
     more = limit + 1e-3 * max(1.0, abs(limit))
     after = clearance - speed * hold - 0.5 * more * hold**2
-    assert float(sampled_inset(after, speed + more * hold, brake, hold)) < 1e-12
+    assert after - held_stop(speed + more * hold, brake, hold) < 1e-12
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.floats(0, 5), st.floats(0, 3), POSITIVE, st.floats(0.005, 0.5))
 def test_held_braking_takes_little_more_than_continuous(clearance, speed, brake, hold):
     continuous = float(kinetic_inset(clearance, speed, brake))
-    sampled = float(sampled_inset(clearance, speed, brake, hold))
+    sampled = clearance - held_stop(speed, brake, hold)
     assert continuous - brake * hold**2 / 8 - 1e-9 <= sampled <= continuous + 1e-9
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.floats(-1, -0.001), st.floats(-1, 2), POSITIVE, st.floats(0.01, 0.3))
 def test_outside_of_the_set_the_limit_is_finite_and_retreats(clearance, speed, brake, hold):
-    limit = float(sampled_acceleration_limit(clearance, speed, brake, hold))
+    limit = held_limit(clearance, speed, brake, hold)
     assert np.isfinite(limit)
     after = clearance - speed * hold - 0.5 * limit * hold**2
     end = speed + limit * hold
-    back_inside = float(sampled_inset(after, end, brake, hold)) >= -1e-9
+    back_inside = after - held_stop(end, brake, hold) >= -1e-9
     assert back_inside or (end < 0.0 and after - end * hold > after)
 
 
-def test_held_stopping_distance_is_what_the_best_held_braking_needs():
+def test_the_held_stop_is_what_the_best_held_braking_needs():
     # Brute force over the decelerations of every hold, in a coarse grid.
     brake, hold = 1.0, 0.5
     grid = np.linspace(-brake, 0.0, 41)
@@ -208,4 +182,4 @@ def test_held_stopping_distance_is_what_the_best_held_braking_needs():
         return best
 
     for v in (0.1, 0.25, 0.5, 0.75, 1.0):
-        assert float(stopping.held_stopping_distance(v, brake, hold)) == pytest.approx(shortest(v), abs=1e-9)
+        assert held_stop(v, brake, hold) == pytest.approx(shortest(v), abs=1e-9)

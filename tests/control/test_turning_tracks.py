@@ -108,7 +108,7 @@ def test_where_nothing_turns_it_is_the_linear_track():
         np.testing.assert_allclose(turning.mean[:, :4], linear.mean, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(turning.covariance[:, :4, :4], linear.covariance, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(turning.ahead([0.3, 2.0])[0], linear.ahead([0.3, 2.0])[0], rtol=1e-9)
-        assert (turning.turn_rates == 0.0).all() and (turning.covariance[:, 4] == 0.0).all()
+        assert (turning.mean[:, 4] == 0.0).all() and (turning.covariance[:, 4] == 0.0).all()
 
 
 TURNING = Motion(np.diag([0.01, 0.01]), np.inf, np.zeros(2), 0.05)
@@ -165,7 +165,7 @@ def test_simulated_turns_stay_within_k_sigma_and_a_track_that_knows_of_no_turn_l
         assert outside(turning, truth, 3.0) <= 0.03
         assert outside(straight, truth, 3.0) >= 0.2
     fast = np.abs(truth[:, 4]) > 0.5
-    assert np.abs(turning.turn_rates - truth[:, 4])[fast].mean() < 0.3
+    assert np.abs(turning.mean[:, 4] - truth[:, 4])[fast].mean() < 0.3
 
 
 def test_the_turn_rate_of_what_stands_still_cannot_be_told():

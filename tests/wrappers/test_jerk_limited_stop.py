@@ -150,7 +150,8 @@ def test_the_points_that_can_stop_are_those_of_the_closed_form(v, a, room, late,
     fit = admission(([0.0], [side * v])).stoppable(side * chunk[:, None], DT, room, late)
     moving = np.diff(chunk, prepend=0.0) / DT
     gaining = np.diff(moving, prepend=v) / DT
-    ways = chunk + late * moving + jerk_limited_stop(moving, np.maximum(gaining, 0.0), BRAKING, JERK)
+    both = zip(moving, np.maximum(gaining, 0.0), strict=True)
+    ways = chunk + late * moving + [jerk_limited_stop(*one, BRAKING, JERK) for one in both]
     if np.abs(ways - room).min() > 1e-6:
         assert fit == (np.flatnonzero(ways > room)[0] if (ways > room).any() else 30)
 
@@ -160,7 +161,7 @@ def test_axes_add_up_and_what_is_not_finite_does_not_count():
     for direction in np.array([[1.0, 1.0], [0.6, -0.8]]) / [[np.sqrt(2.0)], [1.0]]:
         moving = 0.5 * np.abs(direction)
         fit = admission(([0.0, 0.0], 0.5 * direction), 2).stoppable(line[:, None] * direction, DT, 0.15, 0.0)
-        alone = np.linalg.norm(jerk_limited_stop(moving, 0.0, BRAKING, JERK))
+        alone = np.linalg.norm([jerk_limited_stop(speed, 0.0, BRAKING, JERK) for speed in moving])
         most = np.flatnonzero(line + alone > 0.15)[0]
         # The axes stop together, so that the slower one takes longer than it would alone.
         assert 0 < fit == most - (moving[0] != moving[1]) < 20

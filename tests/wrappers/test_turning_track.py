@@ -60,7 +60,7 @@ def test_the_turn_rate_is_found_and_carries_the_estimate_around_the_circle_unsee
             info = env.step(STILL)[4]
         assert info["occlusion/visible"].all()
         if turn_noise is not None:
-            assert env.tracking.turn_rates == pytest.approx([RATE, 0.0], abs=0.1)
+            assert env.tracking.mean[:, 4] == pytest.approx([RATE, 0.0], abs=0.1)
         hidden(env)
         for _ in range(50):  # 2 s, 3 rad
             info = env.step(STILL)[4]

@@ -17,13 +17,11 @@ ones have an order. It is an idealisation of rigid contact, not a prediction for
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.appendix.contact.lemke import LcpStatus, solve_lcp
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 class ContactStep(NamedTuple):
@@ -41,19 +39,6 @@ class ContactStep(NamedTuple):
     impulse: Array
     gap: Array
     status: LcpStatus
-
-
-def delassus_matrix(inertia: ArrayLike, jacobian: ArrayLike) -> Array:
-    """`J M^-1 J'`, shape (k, k), 1/kg: normal velocities that unit impulses at the contacts cause.
-
-    Its diagonal is one over `impact.effective_mass`; the rest is how contacts act on each other.
-
-    Args:
-        inertia: Joint-space inertia M, symmetric and positive definite, shape (n, n).
-        jacobian: Rows J of the contacts' normals, `normal velocity = J @ qvel`, shape (k, n).
-    """
-    m, j = _matrices(inertia, jacobian)
-    return _delassus(_cholesky(m), j)[1]
 
 
 def contact_step(
@@ -99,22 +84,16 @@ def contact_step(
     if not 0.0 < step_s < np.inf:
         raise ConfigurationError(f"step_s must be positive and finite, got {step_s!r}")
     lower = _cholesky(m)
-    half, matrix = _delassus(lower, j)
+    half: Array = np.asarray(np.linalg.solve(lower, j.T), dtype=np.float64)
+    matrix = half.T @ half
     free = v + step_s * np.linalg.solve(lower.T, np.linalg.solve(lower, f))
     impacts = (phi <= 0.0) | ((e > 0.0) & (phi + step_s * (j @ free) <= 0.0))
     least = np.where(impacts, -e * (j @ v), -phi / step_s)
     if k == 0:
         return ContactStep(free, np.zeros(0), np.zeros(0), LcpStatus.SOLVED)
-    found = solve_lcp(matrix, j @ free - least)
+    found = solve_lcp(0.5 * (matrix + matrix.T), j @ free - least)  # exactly symmetric
     after = free + np.linalg.solve(lower.T, half @ found.z)
     return ContactStep(after, found.z, phi + step_s * (j @ after), found.status)
-
-
-def _delassus(lower: Array, j: Array) -> tuple[Array, Array]:
-    """L^-1 J' and its square, which is exactly symmetric."""
-    half: Array = np.asarray(np.linalg.solve(lower, j.T), dtype=np.float64)
-    matrix = half.T @ half
-    return half, np.asarray(0.5 * (matrix + matrix.T))
 
 
 def _cholesky(m: Array) -> Array:

@@ -17,10 +17,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _SMALL: Final = 1e-11
 """Share of the matrix's largest entry below which a pivot counts as zero."""

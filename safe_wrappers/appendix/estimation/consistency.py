@@ -4,12 +4,9 @@ Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking a
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import whole_number
+from safe_wrappers.checks import Array, whole_number
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def normalised_error_squared(error: Array, cov: Array) -> Array:

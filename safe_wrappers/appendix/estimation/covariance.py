@@ -15,9 +15,9 @@ Source: appendix "Continuous covariance propagation and observability"; Anderson
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.control.estimation.covariance import (
     checked_covariance,
     checked_noise,
@@ -29,9 +29,6 @@ from safe_wrappers.control.estimation.covariance import (
 )
 from safe_wrappers.control.numerics.block_exponentials import doublings_for, norm_or_one, short_exponential
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
-
 
 _MODE = 1e-8
 """Relative to the norm of A: a mode this close to the imaginary axis, or to being unseen, counts as it. Eigenvalues

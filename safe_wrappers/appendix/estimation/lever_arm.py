@@ -1,4 +1,4 @@
-"""Velocity of a body from that of a sensor off its axis, what an accelerometer there reads, poses of sensors.
+"""What an accelerometer off the axis reads, and the acceleration of the body from that.
 
 The conventions are those of `safe_wrappers.control.estimation.lever_arm`.
 """
@@ -8,22 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import Array, finite_arrays
 from safe_wrappers.control.estimation.lever_arm import GRAVITY, centre_acceleration, lever_arm_acceleration
-from safe_wrappers.control.numerics.spatial import check_vectors, cross, finite_result
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation
-
-Array = NDArray[np.float64]
-
-
-def centre_velocity(velocity: Array, angular_velocity: Array, arm: Array) -> Array:
-    """Velocity of O, m/s, from that of P: the inverse of `lever_arm_velocity`."""
-    check_vectors(velocity, angular_velocity, arm)
-    return finite_result(velocity - cross(angular_velocity, arm), velocity, angular_velocity, arm)
 
 
 def imu_specific_force(
@@ -89,8 +80,3 @@ def centre_acceleration_from_imu(
     at_sensor = sensor.apply(f) + g
     arm = orientation.apply(extrinsics.translation)
     return centre_acceleration(at_sensor, sensor.apply(w), sensor.apply(dw), arm)
-
-
-def sensor_pose(body: RigidTransform, extrinsics: RigidTransform) -> RigidTransform:
-    """Pose of a sensor in the world: the body's in the world, then the sensor's in the body."""
-    return body * extrinsics

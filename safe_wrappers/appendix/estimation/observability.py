@@ -1,4 +1,4 @@
-"""Observability of linear systems, with its numbers and the PBH test.
+"""Observability of linear systems, with its numbers.
 
 `safe_wrappers.control.estimation.observability` finds the unobservable directions alone, and
 `safe_wrappers.control.estimation.lie_derivatives` those of nonlinear systems.
@@ -7,11 +7,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.lie_derivatives import (
     Observability,
     checked_tolerance,
@@ -25,8 +25,6 @@ from safe_wrappers.control.estimation.observability import (
     state_names,
     unobservable_subspace,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,32 +96,3 @@ def linear_observability(
         time_scale_s=scaled.time_s,
         unobservable_modes=np.linalg.eigvals(basis.T @ a @ basis).astype(np.complex128),
     )
-
-
-class PBHTest(NamedTuple):
-    """The Popov-Belevitch-Hautus test at each eigenvalue."""
-
-    eigenvalues: NDArray[np.complex128]
-    """Of A, 1/s, shape (n,)."""
-    margins: Array
-    """Smallest singular value of [λI - A; C], scaled as `linear_observability` scales, shape (n,): zero at a mode
-    that no output shows. At an eigenvalue repeated k times in a chain, rounding alone leaves about 1e-16^(1/k)."""
-
-
-def pbh_test(A: ArrayLike, C: ArrayLike) -> PBHTest:
-    """How far [λI - A; C] is from losing rank at each eigenvalue λ: a second opinion, by another way.
-
-    Args:
-        A: Shape (n, n), 1/s.
-        C: Shape (m, n).
-
-    Raises:
-        ConfigurationError: Other shapes, or numbers that are not finite.
-    """
-    scaled = scale_system(*checked_system(A, C))
-    n = len(scaled.a)
-    eigenvalues = np.linalg.eigvals(scaled.a).astype(np.complex128)
-    pencils = eigenvalues[:, None, None] * np.eye(n) - scaled.a
-    stacked = np.concatenate([pencils, np.broadcast_to(scaled.c, (n, *scaled.c.shape))], axis=1)
-    margins = np.linalg.svd(stacked, compute_uv=False)[:, -1]
-    return PBHTest(eigenvalues / scaled.time_s, margins)

@@ -16,12 +16,10 @@ inequality in d dimensions; Pukelsheim, "The Three Sigma Rule" (1994), for the u
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, whole_number
+from safe_wrappers.checks import Array, finite_array, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-
-Array = NDArray[np.float64]
 
 ASSUMPTIONS = ("gaussian", "unimodal", "distribution-free")
 

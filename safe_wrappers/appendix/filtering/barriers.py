@@ -7,7 +7,7 @@ Source: appendix "Relative degree and kinetic stopping insets" and "Safety and C
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 
 def kinetic_inset(clearance: ArrayLike, speed: ArrayLike, brake: float) -> Array:

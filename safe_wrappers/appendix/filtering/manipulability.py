@@ -7,9 +7,9 @@ conventions and caveats.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.control.filtering.manipulability import (
     EPSILON,
     checked_jacobian,
@@ -18,8 +18,6 @@ from safe_wrappers.control.filtering.manipulability import (
 )
 from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,13 +4,11 @@ Source: appendix "Bumpless transfer and smoothstep blending".
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import Array, finite_arrays
 from safe_wrappers.control.handover.polynomials import bracketed_root
 from safe_wrappers.control.handover.smoothstep import ROUND_UP, check_positive, smoothstep
-
-Array = NDArray[np.float64]
 
 
 def blend(prior: ArrayLike, new: ArrayLike, s: ArrayLike) -> Array:

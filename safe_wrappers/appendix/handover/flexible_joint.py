@@ -26,12 +26,11 @@ broadcast with those of M. Anything else raises `ConfigurationError`.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.vibration import smoothstep_share
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def accelerations(
@@ -96,18 +95,8 @@ def manifold(
     return np.asarray(net - j * _solve(m + np.diag(j), net - _array(bias)))
 
 
-def resonance_matrix(stiffness: ArrayLike, rotor_inertia: ArrayLike, link_inertia: ArrayLike) -> Array:
-    """Omega, the principal square root of K W, shape (..., n, n), rad/s.
-
-    K W is not symmetric, but K^1/2 W K^1/2 is, and similar to it.
-    """
-    root, omega, shapes = _modes(stiffness, rotor_inertia, link_inertia)
-    middle = (shapes * omega[..., None, :]) @ shapes.swapaxes(-1, -2)
-    return np.asarray(root[:, None] * middle / root)
-
-
 def resonances(stiffness: ArrayLike, rotor_inertia: ArrayLike, link_inertia: ArrayLike) -> Array:
-    """Eigenvalues of Omega, ascending, shape (..., n), rad/s."""
+    """Eigenvalues of the square root of K W, ascending, shape (..., n), rad/s."""
     return _modes(stiffness, rotor_inertia, link_inertia)[1]
 
 

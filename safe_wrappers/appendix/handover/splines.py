@@ -4,14 +4,12 @@ Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import Array, finite_arrays
 from safe_wrappers.control.handover.interior import interior_extrema
 from safe_wrappers.control.handover.splines import differentiate, hermite_at, positive_duration, value
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def evaluate(coefficients: ArrayLike, t: ArrayLike, derivative: int = 0) -> Array:

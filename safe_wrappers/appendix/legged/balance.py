@@ -7,9 +7,9 @@ not slip.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, finite_arrays
+from safe_wrappers.checks import Array, finite_array, finite_arrays
 from safe_wrappers.control.legged.support import (
     COPLANAR_M,
     COPLANAR_RAD,
@@ -18,8 +18,6 @@ from safe_wrappers.control.legged.support import (
     support_polygon,
 )
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 class Balance(NamedTuple):

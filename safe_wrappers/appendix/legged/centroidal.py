@@ -4,13 +4,11 @@ Conventions as in `safe_wrappers.control.legged.centroidal`. Source: appendix "C
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, finite_arrays
+from safe_wrappers.checks import Array, finite_array, finite_arrays
 from safe_wrappers.control.legged.centroidal import checked_inertias, checked_masses
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def centroidal_momentum_matrix(

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 
 class Bodies(NamedTuple):

@@ -8,11 +8,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.teleop.port_checks import positive, same_shape
-
-Array = NDArray[np.float64]
 
 
 class Port(NamedTuple):

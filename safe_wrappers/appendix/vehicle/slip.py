@@ -6,10 +6,8 @@ Source: appendix "Wheel slip ratio and friction boundaries".
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_arrays, positive
+from safe_wrappers.checks import Array, finite_arrays, positive
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def piecewise_slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike) -> Array:

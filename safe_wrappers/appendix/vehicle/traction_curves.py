@@ -13,11 +13,10 @@ from types import MappingProxyType
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 class TractionCurve(Protocol):

@@ -5,16 +5,15 @@ Source: appendix "Trajectory transit time and reachable distance". Metres stand 
 
 import numpy as np
 import ruckig
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.watchdog.reachability import (
     MotionLimits,
     checked_limits,
     furthest,
     jerk_limited_profile,
 )
-
-Array = NDArray[np.float64]
 
 
 def stopping_distance(speed: ArrayLike, braking: ArrayLike) -> Array:

@@ -6,8 +6,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.nearest_discs import NUMBERS
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Memory
 from safe_wrappers.plants.plant import Plant
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
@@ -19,7 +19,7 @@ from safe_wrappers.control.numerics.outlines import clearances_on_a_course, conv
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, Constraint
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.coasting import Coasting, Course

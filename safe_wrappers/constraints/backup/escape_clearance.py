@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import check_fields, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Disc, Discs, Plane, TrackedDiscs, distances, obstacles_from
@@ -15,7 +15,7 @@ from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Man
 from safe_wrappers.control.backup.way_clearances import Around, least_left, way_clearances
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point

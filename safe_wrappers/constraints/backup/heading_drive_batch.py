@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.constraints.backup.base import Detour
 from safe_wrappers.control.backup import drive_decision as among
-from safe_wrappers.filter.constraint import Array
 from safe_wrappers.filter.constraint_batch import ConstraintBatch
 from safe_wrappers.plants.mujoco.actuators import Actuators, acting_ranges
 

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative
+from safe_wrappers.checks import Array, check_fields, non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
 from safe_wrappers.constraints.backup.heading_drive_batch import HeadingDriveBatch
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
@@ -16,7 +16,7 @@ from safe_wrappers.control.backup.heading_drive import Motion, path_corners, sto
 from safe_wrappers.control.numerics.nearest_discs import nearest_discs
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 from safe_wrappers.filter.constraint_batch import ConstraintBatch
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup import point_scene
 from safe_wrappers.control.backup.damped_axis import braking
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
-from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point, walls
@@ -81,28 +81,28 @@ class BoundWallClearance(BoundBackupClearance):
 
     def clearance(self) -> Array:
         """Distance of the braking path from touching a wall, margin not taken off, m, shape (1,); no walls: (0,)."""
-        self._left = point_scene.room_left(*self._scene, self.plant.qpos, self.plant.qvel, self._motion)
-        return np.array([self._left + self.spec.margin] if len(self._scene.walls) else [])
+        self._left = point_scene.room_left(self._scene, self.plant.qpos, self.plant.qvel, self._motion)
+        return np.array([self._left + self.spec.margin] if len(self._scene[-1]) else [])
 
     def admits(self, control: Array) -> bool:
-        return point_scene.is_admitted(*self._scene, self._motion, self._left, control)
+        return point_scene.is_admitted(self._scene, self._motion, self._left, control)
 
     def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
         """The proposal or the closest candidate, without a solver."""
         control = proposal.copy()
-        stage = point_scene.closest_admitted(*self._scene, self._motion, self._left, low, high, control)
+        stage = point_scene.closest_admitted(self._scene, self._motion, self._left, low, high, control)
         if stage == point_scene.UNRESOLVED:
             return None
         return proposal if stage == point_scene.PROPOSAL else control, stage, self._none
 
     def backup(self) -> Array:
         """The control that is always admitted: brake both axes. From outside it leads back inside."""
-        pair = point_scene.backup_pair(*self._scene, self._motion, self._left)
+        pair = point_scene.backup_pair(self._scene, self._motion, self._left)
         return self._point.control(np.zeros(self.plant.model.nu), pair)
 
     def candidates(self, control: Array) -> list[Array]:
         """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
-        pairs = point_scene.candidates(*self._scene, self._motion, self._left, control)
+        pairs = point_scene.candidates(self._scene, self._motion, self._left, control)
         return [self._point.control(control, pair) for pair in pairs]
 
     def draw(self) -> list[Mark]:
@@ -112,14 +112,14 @@ class BoundWallClearance(BoundBackupClearance):
         longest = max(len(way) for way in ways)
         way = np.stack([np.pad(way, (0, longest - len(way)), mode="edge") for way in ways], axis=1)
         found = [*line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
-        for left, right, low, high in self._scene.walls + self._room * np.array([-1.0, 1.0, -1.0, 1.0]):
+        for left, right, low, high in self._scene[-1] + self._room * np.array([-1.0, 1.0, -1.0, 1.0]):
             corners = [[left, low], [right, low], [right, high], [left, high]]
             found += line("limit", corners, THIN, closed=True)
         return found
 
     def rows(self) -> HalfSpaces:
         """Bounds on the control along x and y: a convex part of what is admitted, braking included."""
-        pairs, offsets = point_scene.half_spaces(*self._scene, self._motion, self._left)
+        pairs, offsets = point_scene.half_spaces(self._scene, self._motion, self._left)
         normals = np.zeros((len(offsets), self.plant.model.nu))
         normals[:, self._point.actuators] = pairs
         return HalfSpaces(normals, offsets)

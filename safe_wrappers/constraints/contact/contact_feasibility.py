@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import check_fields, name_list, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.drawing.marks import Mark, arrow, line, segment
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Array, Constraint
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader, can_touch_the_world
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco

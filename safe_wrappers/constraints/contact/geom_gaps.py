@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.queries.geom_distance import geom_distance, nearest

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import check_fields, non_negative, positive, whole_number
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, whole_number
 from safe_wrappers.constraints.contact.contact_feasibility import checked_friction_share, touching_bodies
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.contact.friction_cone import cone_excess
@@ -19,7 +19,7 @@ from safe_wrappers.control.legged.support import common_plane, support_polygon, 
 from safe_wrappers.control.legged.whole_body import WholeBodySolution, WholeBodyStatus
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco

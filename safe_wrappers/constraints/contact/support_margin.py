@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.constraints.contact.contact_feasibility import contacts_now, require_contacts
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.control.numerics.outlines import convex_outline
 from safe_wrappers.drawing.marks import Mark, ball, line
-from safe_wrappers.filter.constraint import Array, Constraint, Memory
+from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.contacts import ContactForecast
 from safe_wrappers.plants.plant import Plant
 

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from typing import Final
 
-import mujoco
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.drawing.marks import Mark, arrow, ball, line, pad, segment
-from safe_wrappers.filter.constraint import Array
+from safe_wrappers.plants.mujoco.model import SLIDE
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _SHORTEST: Final = 0.08
@@ -72,7 +72,7 @@ def _joint(plant: MujocoPlant, j: int) -> tuple[Array, Array, float, Array | Non
     model, data = plant.model, plant.forward()
     at, axis = data.xanchor[j].copy(), data.xaxis[j].copy()
     q, size = float(plant.qpos[model.jnt_qposadr[j]]), _SHORTEST * float(model.stat.extent)
-    if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_SLIDE):
+    if model.jnt_type[j] == SLIDE:
         return at, axis, q, None, size
     body = int(model.jnt_bodyid[j])
     out = data.xipos[body] - at

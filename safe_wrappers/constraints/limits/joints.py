@@ -8,26 +8,25 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, positive
+from safe_wrappers.checks import Array, name_list, positive
 from safe_wrappers.constraints.limits.joint_marks import range_marks, speed_marks
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, HalfSpaces
+from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, SCALAR_JOINTS
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
-HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-_DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
 def driven_joints(model: mujoco.MjModel) -> list[int]:
     """The hinges and slides that an actuator drives directly."""
-    return [j for j in _direct(model) if model.jnt_type[j] in HINGE_OR_SLIDE]
+    return [j for j in _direct(model) if model.jnt_type[j] in SCALAR_JOINTS]
 
 
 def per_joint(name: str, given: float | Sequence[float], count: int) -> Array:
@@ -40,7 +39,7 @@ def per_joint(name: str, given: float | Sequence[float], count: int) -> Array:
 
 def _direct(model: mujoco.MjModel) -> list[int]:
     kinds = model.actuator_trntype
-    return sorted({int(model.actuator_trnid[a, 0]) for a in range(model.nu) if kinds[a] in _DRIVES})
+    return sorted({int(model.actuator_trnid[a, 0]) for a in range(model.nu) if kinds[a] in AT_A_JOINT})
 
 
 def _tied(model: mujoco.MjModel) -> list[set[int]]:
@@ -94,7 +93,7 @@ def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, 
     says which joints would be covered, which not, and the `remedy`.
     """
     covered = driven_joints(model)
-    only_joints = bool(np.isin(model.actuator_trntype, _DRIVES).all()) and _direct(model) == covered
+    only_joints = bool(np.isin(model.actuator_trntype, AT_A_JOINT).all()) and _direct(model) == covered
     rest = [j for j in joints if j not in covered]
     if forces and only_joints:
         ties = [group for group in _tied(model) if group.intersection(covered)]
@@ -130,13 +129,13 @@ def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
             wanted = "no actuator drives a hinge or slide directly: name the joints"
             raise ConfigurationError(f"{wanted}; the model has: {there}")
         # What flies freely is no joint of a machine.
-        own = [j for j in range(model.njnt) if model.jnt_type[j] != int(mujoco.mjtJoint.mjJNT_FREE)]
-        every = [model.joint(j).name for j in own if model.jnt_type[j] in HINGE_OR_SLIDE]
+        own = [j for j in range(model.njnt) if model.jnt_type[j] != FREE]
+        every = [model.joint(j).name for j in own if model.jnt_type[j] in SCALAR_JOINTS]
         refuse_uncovered(model, own, f"Name those that you mean: joints={every}", plant.has_acceleration)
         return ids
     ids = [plant.named("joint", name) for name in names]
     for j, name in zip(ids, names, strict=True):
-        if model.jnt_type[j] not in HINGE_OR_SLIDE:
+        if model.jnt_type[j] not in SCALAR_JOINTS:
             raise ConfigurationError(f"joint {name!r} is neither a hinge nor a slide")
     return ids
 

@@ -8,11 +8,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits import joints as of_joints
 from safe_wrappers.control.filtering.manipulability import signed_manipulability
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array
+from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS, SLIDE
 from safe_wrappers.plants.mujoco.native import mj_kinematics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
@@ -101,14 +102,14 @@ class SerialChain:
             first = int(model.body_jntadr[body])
             carriers += range(first, first + int(model.body_jntnum[body])) if first >= 0 else []
             body = int(model.body_parentid[body])
-        scalar = sorted(j for j in carriers if model.jnt_type[j] in of_joints.HINGE_OR_SLIDE)
+        scalar = sorted(j for j in carriers if model.jnt_type[j] in SCALAR_JOINTS)
         self.joints = np.array(scalar, dtype=int)
         if not self.joints.size:
             wanted = f"no hinge or slide moves {self._what}: it has no manipulability"
             raise ConfigurationError(f"{wanted}; the model has the joints {', '.join(plant.names('joint'))}")
         self.qpos, self.dofs = model.jnt_qposadr[self.joints], model.jnt_dofadr[self.joints]
         self.scalar = len(self.joints) == len(carriers)
-        self._slides = (model.jnt_type[self.joints] == int(mujoco.mjtJoint.mjJNT_SLIDE))[:, None]
+        self._slides = (model.jnt_type[self.joints] == SLIDE)[:, None]
         self._data = mujoco.MjData(model)
         # Names, not views of the data: a copy of this object would hold on to the old one's.
         kinds = {"site": "site_", "body": "", "geom": "geom_"}

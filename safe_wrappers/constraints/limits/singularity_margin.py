@@ -6,13 +6,13 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from safe_wrappers.checks import check_fields, name_list, positive
+from safe_wrappers.checks import Array, check_fields, name_list, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain, Task
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering import manipulability as of_arm
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, HalfSpaces
+from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 

@@ -5,12 +5,12 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import check_fields, positive
+from safe_wrappers.checks import Array, check_fields, positive
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.drawing.marks import Mark, arrow, ball
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import Array, Memory
+from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 

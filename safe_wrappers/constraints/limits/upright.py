@@ -6,11 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import positive
+from safe_wrappers.checks import Array, positive
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 

@@ -6,14 +6,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import name_list, non_negative
+from safe_wrappers.checks import Array, name_list, non_negative
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import distances, obstacles_from
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.drawing.marks import Mark, ball, edges, pad
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 

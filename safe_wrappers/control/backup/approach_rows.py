@@ -8,17 +8,27 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.stopping import held_limit, held_stop
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.control.numerics.surfaces import nearest_points
 
-Array = NDArray[np.float64]
-
 _ROUNDING: Final = 1.0 + 1e-9
 _UNBOUNDED: Final = 1e12
 """A control without a bound counts as this large."""
+
+
+Machine = tuple[Array, Array, float, float, float, float, float]
+"""What is the same for all points.
+
+* low, high: bounds of the control, shape (m,)
+* delay_s: as for `approaches`
+* control_dt: control interval, s
+* radius: as for `approaches`
+* braking: deceleration to count on, m/s^2
+* reserve: kept free in the rows, m, but not in the rooms
+"""
 
 
 @compiled
@@ -84,13 +94,7 @@ def approach_rows(
     velocity: Array,
     drift: Array,
     effect: Array,
-    low: Array,
-    high: Array,
-    delay_s: float,
-    control_dt: float,
-    radius: float,
-    braking: float,
-    reserve: float,
+    machine: Machine,
 ) -> tuple[Array, Array, Array]:
     """Rooms left after braking, and a row for every surface whose limit the actuators could exceed.
 
@@ -102,17 +106,12 @@ def approach_rows(
         velocity: As for `approaches`.
         drift: The point's acceleration is `drift + effect @ u`, m/s^2, shape (d,).
         effect: Shape (d, m).
-        low: Bound of the control, shape (m,).
-        high: Likewise.
-        delay_s: As for `approaches`.
-        control_dt: Control interval, s.
-        radius: As for `approaches`.
-        braking: Deceleration to count on, m/s^2.
-        reserve: Kept free in the rows, m, but not in the rooms.
+        machine: See `Machine`.
 
     Returns:
         Rooms, m, shape (k,); normals, shape (r, m), and offsets, shape (r,), of the rows.
     """
+    low, high, delay_s, control_dt, radius, braking, reserve = machine
     clearance, speed = approaches(distance, normal, surface_velocity, velocity, delay_s, radius)
     room, rows, d, m = np.empty(len(distance)), 0, len(velocity), len(low)
     normals, offsets = np.zeros((len(distance), m)), np.empty(len(distance))
@@ -137,42 +136,21 @@ def approach_rows(
 
 @compiled
 def approach_rows_of(
-    surfaces: Array,
-    point: Array,
-    velocity: Array,
-    drift: Array,
-    effect: Array,
-    low: Array,
-    high: Array,
-    delay_s: float,
-    control_dt: float,
-    radius: float,
-    braking: float,
-    reserve: float,
+    surfaces: Array, point: Array, velocity: Array, drift: Array, effect: Array, machine: Machine
 ) -> tuple[Array, Array, Array]:
     """`approach_rows` of surfaces that stand still, as in `control/numerics/surfaces.py`, shape (k, 8)."""
     distance, normal, curvature = nearest_points(surfaces, point)
     still = np.zeros(normal.shape)
-    moving = velocity, drift, effect, low, high, delay_s, control_dt, radius, braking, reserve
-    return approach_rows(distance, normal, still, curvature, *moving)
+    return approach_rows(distance, normal, still, curvature, velocity, drift, effect, machine)
 
 
 @compiled
-def out_of_reach(
-    surfaces: Array,
-    reach: Array,
-    low: Array,
-    high: Array,
-    delay_s: float,
-    control_dt: float,
-    radius: float,
-    braking: float,
-    reserve: float,
-) -> tuple[Array, bool]:
+def out_of_reach(surfaces: Array, reach: Array, machine: Machine) -> tuple[Array, bool]:
     """The rooms of `approach_rows_of`, and whether it certainly has no rows.
 
-    `reach` is what `Points.reaches` says of the point; the others are as for `approach_rows`.
+    `reach` is what `Points.reaches` says of the point.
     """
+    low, high, delay_s, control_dt, radius, braking, reserve = machine
     velocity = reach[3:6]
     distance, normal, curvature = nearest_points(surfaces, reach[:3])
     still, none = np.zeros(normal.shape), np.zeros(3)

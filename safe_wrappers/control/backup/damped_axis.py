@@ -10,11 +10,9 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
-
-Array = NDArray[np.float64]
 
 _MOST_HOLDS: Final = 4096
 """Length of the table, in holds of full braking; the distance beyond it is infinite."""

@@ -4,8 +4,8 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import (
     HeadingDrive,
     Motion,
@@ -17,8 +17,6 @@ from safe_wrappers.control.backup.heading_drive import (
     stopping_path,
 )
 from safe_wrappers.control.numerics.compiled import compiled, hypot
-
-Array = NDArray[np.float64]
 
 RECOVERY_RATE: Final = 1.0
 """1/s: an unsafe start must shrink its violation at least this fast, where the drive can."""

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.drive_among_discs import (
-    Array,
     Look,
     admits,
     backup_drive,
@@ -38,10 +38,7 @@ def _decide(
     side: float,
     brake: bool,
     detour: bool,
-    low: Array,
-    high: Array,
-    least: Array,
-    most: Array,
+    bounds: Array,
     out: Array,
 ) -> tuple[int, float, Array, Array]:
     """The closest admissible (drive, turn) that a search finds, in the order of `filter/search.py`.
@@ -53,16 +50,14 @@ def _decide(
         side: Of a detour that goes on, or 0.
         brake: Whether the backup manoeuvre brakes along the heading.
         detour: Whether to try ways around before projecting.
-        low: Of the controls, shape (2,).
-        high: Of the controls, shape (2,).
-        least: The controls between which the forces still change, shape (2,), inside low and high.
-        most: Likewise.
+        bounds: Low and high of the controls, least and most between which the forces still change, shape (4, 2).
         out: What to execute, shape (2,).
 
     Returns:
         The stage that found it (UNRESOLVED: none did); the side of a detour that was tried, or 0; the rows that the
         control keeps, shapes (k, 2) and (k,).
     """
+    low, high, least, most = bounds[0], bounds[1], bounds[2], bounds[3]
     drive, turn = proposal[0], proposal[1]
     out[0], out[1] = drive, turn
     normals, offsets = np.zeros((0, 2)), np.zeros(0)
@@ -194,9 +189,9 @@ def closest_admitted(
     bounds: Array,
     out: Array,
 ) -> tuple[int, float, Array, Array]:
-    """`_decide` from the present state; `bounds` are low, high, least and most, shape (4, 2)."""
+    """`_decide` from the present state."""
     at = look(models[0], motion, discs, brake)
-    return _decide(models, at, proposal, side, brake, detour, bounds[0], bounds[1], bounds[2], bounds[3], out)
+    return _decide(models, at, proposal, side, brake, detour, bounds, out)
 
 
 @compiled
@@ -285,11 +280,10 @@ def decide_each(
     for r in range(len(chosen)):
         i = chosen[r]
         at = look(models[i, 0], motions[i], discs[first[i] : first[i + 1]], brake)
-        low, high, least, most = bounds[r, 0], bounds[r, 1], bounds[r, 2], bounds[r, 3]
         stage, side, normals, offsets = _decide(
-            models[i], at, proposals[i], sides[i], brake, detour, low, high, least, most, out[i]
+            models[i], at, proposals[i], sides[i], brake, detour, bounds[r], out[i]
         )
         sides[i] = side
         if single:
-            _round_inside(out[i], normals, offsets, low, high)
+            _round_inside(out[i], normals, offsets, bounds[r, 0], bounds[r, 1])
         stages[i] = stage if math.isfinite(out[i, 0]) and math.isfinite(out[i, 1]) else UNRESOLVED

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis, brake
 from safe_wrappers.control.numerics.compiled import compiled
-
-Array = NDArray[np.float64]
 
 _FASTEST_M_S = 50.0
 """Speeds up to this one are tabulated."""

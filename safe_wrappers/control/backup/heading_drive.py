@@ -15,11 +15,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled, hypot
-
-Array = NDArray[np.float64]
 
 _WANDER = 0.012
 """Bound on the lateral deviation of the stopping path, per metre of sideways coasting: drag turns a sliding body.

@@ -10,14 +10,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup import damped_axis as along
 from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.control.numerics.rectangles import Rectangle, apart, closer, nearest, one_of
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 """Numbers along x and along y."""
 

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup import damped_axis as along
 from safe_wrappers.control.backup.point_among_walls import (
-    Array,
     Pair,
     PointAmongWalls,
     PointMotion,

@@ -1,13 +1,12 @@
 """A point mass among walls for plain Python: what lasts from step to step in arrays, and one call per question."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.backup.point_among_walls import (
-    Array,
     Pair,
     PointAmongWalls,
     PointMotion,
@@ -22,22 +21,14 @@ PROPOSAL, CANDIDATE, UNRESOLVED = 0, 2, 7
 """What `closest_admitted` returns: a `Stage` of the search, or that it has found no admitted control."""
 
 
-class Scene(NamedTuple):
-    """What the functions below take first.
+Scene = tuple[Array, Array, Array, Array, Array, Array]
+"""What the functions below take first, as a plain tuple, which compiled code takes fastest.
 
-    Attributes:
-        numbers: Along x and along y, shape (2, 16): the numbers of the axis; where the point is at qpos = 0, m; the
-            indices of its slide in qpos and qvel, and of its actuator; the distance to keep, m; `clip_known`.
-        x_up, x_down, y_up, y_down: The tables of the axes.
-        walls: Rectangles, m, shape (n, 4).
-    """
-
-    numbers: Array
-    x_up: Array
-    x_down: Array
-    y_up: Array
-    y_down: Array
-    walls: Array
+* numbers: along x and along y, shape (2, 16): the numbers of the axis; where the point is at qpos = 0, m; the
+  indices of its slide in qpos and qvel, and of its actuator; the distance to keep, m; `clip_known`
+* the tables of the axes: x up, x down, y up, y down
+* walls: rectangles, m, shape (n, 4)
+"""
 
 
 def scene(
@@ -56,7 +47,7 @@ def scene(
     ]
     x_axis, y_axis = axes
     tables = x_axis.up, x_axis.down, y_axis.up, y_axis.down
-    return Scene(np.array(rows, dtype=np.float64), *tables, np.array(among, dtype=np.float64).reshape(-1, 4))
+    return np.array(rows, dtype=np.float64), *tables, np.array(among, dtype=np.float64).reshape(-1, 4)
 
 
 @compiled
@@ -66,9 +57,8 @@ def _axis(numbers: Array, up: Array, down: Array) -> DampedAxis:
 
 
 @compiled
-def _in(
-    numbers: Array, x_up: Array, x_down: Array, y_up: Array, y_down: Array, walls: Array
-) -> PointAmongWalls:
+def _in(scene: Scene) -> PointAmongWalls:
+    numbers, x_up, x_down, y_up, y_down, walls = scene
     x_axis, y_axis = _axis(numbers[0], x_up, x_down), _axis(numbers[1], y_up, y_down)
     return PointAmongWalls(x_axis, y_axis, walls, numbers[0, 15] != 0.0)
 
@@ -84,19 +74,9 @@ def _pair(numbers: Array, control: Array) -> Pair:
 
 
 @compiled
-def room_left(
-    numbers: Array,
-    x_up: Array,
-    x_down: Array,
-    y_up: Array,
-    y_down: Array,
-    walls: Array,
-    qpos: Array,
-    qvel: Array,
-    motion: Array,
-) -> float:
+def room_left(scene: Scene, qpos: Array, qvel: Array, motion: Array) -> float:
     """What braking leaves beyond the room, m; NaN if the state is not finite. Writes the clipped motion, (4,)."""
-    among = _in(numbers, x_up, x_down, y_up, y_down, walls)
+    among, numbers = _in(scene), scene[0]
     for axis in range(2):
         motion[axis] = qpos[int(numbers[axis, 12])] + numbers[axis, 11]
         motion[2 + axis] = qvel[int(numbers[axis, 12])]
@@ -107,38 +87,18 @@ def room_left(
 
 
 @compiled
-def is_admitted(
-    numbers: Array,
-    x_up: Array,
-    x_down: Array,
-    y_up: Array,
-    y_down: Array,
-    walls: Array,
-    motion: Array,
-    left: float,
-    control: Array,
-) -> bool:
+def is_admitted(scene: Scene, motion: Array, left: float, control: Array) -> bool:
     """Whether a control, shape (m,), keeps the room, or from outside shrinks the violation."""
-    among = _in(numbers, x_up, x_down, y_up, y_down, walls)
+    among, numbers = _in(scene), scene[0]
     return admits(among, _moving(motion), numbers[0, 14], left, _pair(numbers, control), 0.0)
 
 
 @compiled
 def closest_admitted(
-    numbers: Array,
-    x_up: Array,
-    x_down: Array,
-    y_up: Array,
-    y_down: Array,
-    walls: Array,
-    motion: Array,
-    left: float,
-    low: Array,
-    high: Array,
-    control: Array,
+    scene: Scene, motion: Array, left: float, low: Array, high: Array, control: Array
 ) -> int:
     """Replaces a control, shape (m,), by the closest candidate in the box that is admitted; the stage that did it."""
-    among = _in(numbers, x_up, x_down, y_up, y_down, walls)
+    among, numbers = _in(scene), scene[0]
     now, room, asked = _moving(motion), numbers[0, 14], _pair(numbers, control)
     if admits(among, now, room, left, asked, 0.0):
         return PROPOSAL
@@ -153,49 +113,21 @@ def closest_admitted(
 
 
 @compiled
-def candidates(
-    numbers: Array,
-    x_up: Array,
-    x_down: Array,
-    y_up: Array,
-    y_down: Array,
-    walls: Array,
-    motion: Array,
-    left: float,
-    control: Array,
-) -> Array:
+def candidates(scene: Scene, motion: Array, left: float, control: Array) -> Array:
     """Admissible pairs near a refused control, the nearest first, shape (k, 2)."""
-    among = _in(numbers, x_up, x_down, y_up, y_down, walls)
+    among, numbers = _in(scene), scene[0]
     return near(among, _moving(motion), numbers[0, 14], left, _pair(numbers, control))
 
 
 @compiled
-def backup_pair(
-    numbers: Array,
-    x_up: Array,
-    x_down: Array,
-    y_up: Array,
-    y_down: Array,
-    walls: Array,
-    motion: Array,
-    left: float,
-) -> Pair:
+def backup_pair(scene: Scene, motion: Array, left: float) -> Pair:
     """The pair that is always admitted: brake both axes. From outside it leads back inside."""
-    among = _in(numbers, x_up, x_down, y_up, y_down, walls)
+    among, numbers = _in(scene), scene[0]
     return backup(among, _moving(motion), numbers[0, 14], left)
 
 
 @compiled
-def half_spaces(
-    numbers: Array,
-    x_up: Array,
-    x_down: Array,
-    y_up: Array,
-    y_down: Array,
-    walls: Array,
-    motion: Array,
-    left: float,
-) -> tuple[Array, Array]:
+def half_spaces(scene: Scene, motion: Array, left: float) -> tuple[Array, Array]:
     """Bounds on the pair: a convex part of what is admitted, shapes (k, 2) and (k,)."""
-    among = _in(numbers, x_up, x_down, y_up, y_down, walls)
+    among, numbers = _in(scene), scene[0]
     return bounds(among, _moving(motion), numbers[0, 14], left)

@@ -7,12 +7,10 @@ their force comes from a penetration or a margin. Small residuals do not validat
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_arrays, float_array
+from safe_wrappers.checks import Array, finite_arrays, float_array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 class ComplementarityResiduals(NamedTuple):

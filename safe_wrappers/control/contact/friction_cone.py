@@ -11,12 +11,10 @@ This is Coulomb's law with one coefficient in every direction. It does not say t
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, finite_arrays, whole_number
+from safe_wrappers.checks import Array, finite_array, finite_arrays, whole_number
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _UNIT = 1e-6
 """Tolerance of a normal's length."""

@@ -18,13 +18,11 @@ infinite. Anything else raises `ConfigurationError`.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, finite_arrays, float_array
+from safe_wrappers.checks import Array, finite_array, finite_arrays, float_array
 from safe_wrappers.control.contact.contact import in_series, positive
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def restitution_velocity(velocity: ArrayLike, restitution: ArrayLike) -> Array:

@@ -10,13 +10,11 @@ Source: appendix "Continuous covariance propagation and observability"; Van Loan
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.control.numerics.block_exponentials import Discrete, integral, van_loan
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _SYMMETRY = 1e-9
 """Relative asymmetry, and relative size of negative eigenvalues, up to which they count as rounding."""

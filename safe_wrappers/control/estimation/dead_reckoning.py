@@ -8,14 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.lever_arm import GRAVITY, centre_acceleration
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation
-
-Array = NDArray[np.float64]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 _SHARES, _PARTS = 0.5 * (_NODES + 1.0)[:, None], 0.5 * _WEIGHTS

@@ -5,11 +5,9 @@ from collections.abc import Iterable
 from operator import mul
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 """Error of an eigenvalue over the largest one, where the shape is not diagonal."""

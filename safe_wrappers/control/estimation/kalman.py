@@ -11,9 +11,8 @@ The consistency test: `safe_wrappers.appendix.estimation.consistency`.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 
 class Updated(NamedTuple):

@@ -14,16 +14,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.control.numerics.spatial import check_vectors, cross, finite_result
 from safe_wrappers.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
-
-Array = NDArray[np.float64]
 
 GRAVITY: Final = (0.0, 0.0, -9.81)
 """m/s², in a world whose z points up: MuJoCo's default."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.observability import (
     LONGEST_TIME_SCALE_S,
     TOLERANCE,
@@ -20,8 +21,6 @@ from safe_wrappers.control.estimation.observability import (
 )
 from safe_wrappers.control.estimation.taylor import Function, output_series
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _STATE_ROUNDING = 1e-12
 """Relative; what this much of an error in the state can make of a coefficient is not told from zero."""

@@ -9,12 +9,10 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 TOLERANCE: Final = 1e-9
 """Default: singular values below this share of the scale count as zero."""

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
-Array = NDArray[np.float64]
 Function = Callable[[NDArray[Any]], ArrayLike]
 
 

@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.covariance import discretise, discretise_drift
 from safe_wrappers.control.estimation.kalman import predict, update
-
-Array = NDArray[np.float64]
 
 _KEPT = 256
 """Number of cached discretisations."""

@@ -17,7 +17,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
+
 Complex = NDArray[np.complex128]
 
 SIZE: Final = 5

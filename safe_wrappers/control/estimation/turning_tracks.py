@@ -6,9 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.lie_derivatives import nonlinear_observability
 from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
-from safe_wrappers.control.estimation.turning import SIZE, Array, Turns, flow, gathered_noise, rates
+from safe_wrappers.control.estimation.turning import SIZE, Turns, flow, gathered_noise, rates
 from safe_wrappers.errors import ConfigurationError
 
 _SHORTEST_S: Final = 1e-3
@@ -49,11 +50,6 @@ class TurningTracks(Tracks):
             np.array([1.0 / motion.reversion_s for motion in self.motions]),
             np.stack([motion.mean_velocity for motion in self.motions]),
         )
-
-    @property
-    def turn_rates(self) -> Array:
-        """Estimated turn rates, shape (n,), rad/s, positive to the left."""
-        return self.mean[:, 4]
 
     def advance(self, time_s: float) -> None:
         """Predict over a time without measurements."""

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 
 def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Array, Array]:
@@ -26,11 +26,6 @@ def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Ar
     if dh.ndim == drift.ndim == 1 and effect.ndim == 2:  # half the time of einsum
         return np.asarray(dh @ drift), np.asarray(dh @ effect)
     return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
-
-
-def linear_decay(h: ArrayLike, alpha: float) -> Array:
-    """The linear class-K function `alpha * h` (alpha in 1/s)."""
-    return alpha * np.asarray(h, dtype=np.float64)
 
 
 def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array, Array]:

@@ -19,12 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array, finite_arrays, positive
+from safe_wrappers.checks import Array, finite_array, finite_arrays, positive
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 EPSILON = float(np.finfo(np.float64).eps)
 

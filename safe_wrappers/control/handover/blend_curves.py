@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.interior import interior_extrema
 from safe_wrappers.control.handover.seams import Blend, backward_differences, stream_derivatives
 from safe_wrappers.control.handover.splines import (
@@ -21,8 +21,6 @@ from safe_wrappers.control.handover.splines import (
     quintic_coefficients,
     value,
 )
-
-Array = NDArray[np.float64]
 
 _SMOOTHSTEP = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
 

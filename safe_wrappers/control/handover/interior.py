@@ -4,8 +4,9 @@ Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.polynomials import Extrema, extrema
 from safe_wrappers.control.handover.splines import (
     checked_samples,
@@ -14,8 +15,6 @@ from safe_wrappers.control.handover.splines import (
     positive_duration,
 )
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def interior_extrema(coefficients: ArrayLike, duration: ArrayLike, derivative: int) -> Extrema:

@@ -8,10 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.splines import differentiate, value
-
-Array = NDArray[np.float64]
-
 
 _MOST_STEPS = 120
 

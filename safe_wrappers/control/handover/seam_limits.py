@@ -9,15 +9,13 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import positive
+from safe_wrappers.checks import Array, positive
 from safe_wrappers.control.handover.blend_curves import BlendCurve, Motion
 from safe_wrappers.control.handover.interior import knot_torque_step
 from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE
 from safe_wrappers.errors import ConfigurationError
 
-Array = NDArray[np.float64]
 Entries = float | Sequence[float | None] | None
 Inertia = Callable[[Array], Array]
 """Of joint positions, shape (k, m): their inertia matrices, shape (k, m, m), kg m^2."""

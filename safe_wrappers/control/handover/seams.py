@@ -14,10 +14,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.smoothstep import smoothstep
 from safe_wrappers.control.handover.splines import hermite_at, quintic_coefficients, value
-
-Array = NDArray[np.float64]
 
 Blend = Literal["smoothstep", "quintic", "hermite"]
 BLENDS: Final = ("smoothstep", "quintic", "hermite")

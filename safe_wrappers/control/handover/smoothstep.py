@@ -5,12 +5,10 @@ Source: appendix "Bumpless transfer and smoothstep blending".
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import Array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 SMOOTHSTEP_PEAK_RATE = 1.875
 """Largest derivative of the smoothstep, alpha'(1/2)."""

@@ -8,12 +8,10 @@ Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, finite_arrays
+from safe_wrappers.checks import Array, finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def differentiate(coefficients: ArrayLike, times: int = 1) -> Array:

@@ -11,11 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 class Modes(NamedTuple):

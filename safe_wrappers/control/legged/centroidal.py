@@ -7,23 +7,20 @@ moving centre of mass; where both are stacked, the linear part comes first.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, finite_arrays
+from safe_wrappers.checks import Array, finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 class CentroidalMomentum(NamedTuple):
-    """Momentum of several bodies: mass (...), kg; centre of mass and its velocity (..., 3), m and m/s.
+    """Momentum of several bodies: mass (...), kg; centre of mass (..., 3), m.
 
-    `linear` is `mass * com_velocity`, kg m/s, `angular` is about the centre of mass, kg m^2/s; shape (..., 3).
+    `linear`, kg m/s, and `angular` about the centre of mass, kg m^2/s, have shape (..., 3).
     """
 
     mass: Array
     com: Array
-    com_velocity: Array
     linear: Array
     angular: Array
 
@@ -51,7 +48,7 @@ def centroidal_momentum(
     # Relative to the centre of mass; the bodies' velocities need no such shift, since sum m (p - c) = 0.
     orbital = np.cross(p - com[..., None, :], m[..., None] * v).sum(axis=-2)
     angular = orbital + np.einsum("...nij,...nj->...i", inertia, spin)
-    return CentroidalMomentum(total, com, linear / total[..., None], linear, angular)
+    return CentroidalMomentum(total, com, linear, angular)
 
 
 def checked_masses(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array, Array, Array]:

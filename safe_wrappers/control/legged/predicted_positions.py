@@ -5,12 +5,10 @@ not cover the motion between samples. Choose the horizon no shorter than stoppin
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_arrays, positive
+from safe_wrappers.checks import Array, finite_arrays, positive
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float) -> Array:

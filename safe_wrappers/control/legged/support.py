@@ -11,14 +11,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, finite_arrays, non_negative
+from safe_wrappers.checks import Array, finite_array, finite_arrays, non_negative
 from safe_wrappers.control.contact.friction_cone import tangents
 from safe_wrappers.control.numerics.outlines import convex_chain, turn
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 COPLANAR_M = 0.01
 """m; default of the largest distance of coplanar contacts from their plane."""

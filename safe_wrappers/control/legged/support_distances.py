@@ -10,12 +10,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import Array, finite_arrays
 from safe_wrappers.control.legged.support import COPLANAR_M, COPLANAR_RAD
 from safe_wrappers.control.numerics.compiled import compiled, hypot
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-12
 """Of the points' extent: a narrower hull is a line."""

@@ -12,8 +12,8 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.contact.friction_cone import cone_excess, friction_pyramid
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.control.legged.whole_body_program import (
@@ -26,8 +26,6 @@ from safe_wrappers.control.legged.whole_body_program import (
 )
 from safe_wrappers.control.numerics.conic_program import Candidate, Program, by_clarabel, by_daqp
 from safe_wrappers.errors import UnknownNameError
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""

@@ -8,13 +8,11 @@ forces are eliminated; the misses are the errors of the contact accelerations.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.contact.friction_cone import tangents
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.control.numerics.conic_program import Program
-
-Array = NDArray[np.float64]
 
 _RANK = 1e-9
 """Eigenvalues of the contacts' inverse inertia below this share of the largest count as zero."""

@@ -16,9 +16,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled, inlined
-
-Array = NDArray[np.float64]
 
 SOLVED: Final = 0
 CONTRADICTORY: Final = 1

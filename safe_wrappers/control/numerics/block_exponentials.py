@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 _TERMS = 24
 """Terms of the exponential's series: for matrices of norm 2 the first neglected one is below 1e-17."""

@@ -10,9 +10,8 @@ from typing import NamedTuple
 import clarabel
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 _UNBOUNDED = 1e30
 """daqp's infinity."""

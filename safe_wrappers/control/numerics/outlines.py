@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
 
-Array = NDArray[np.float64]
 Point = tuple[float, float]
 
 
@@ -58,19 +57,6 @@ def distance_to_outline(outline: Array, x: float, y: float) -> float:
         if beyond > deepest or beyond != beyond:
             deepest = beyond
     return deepest if deepest <= 0.0 else math.sqrt(nearest)
-
-
-@compiled
-def _distances(outline: Array, points: Array) -> Array:
-    found = np.empty(len(points))
-    for i in range(len(points)):
-        found[i] = distance_to_outline(outline, points[i, 0], points[i, 1])
-    return found
-
-
-def distances_to_outline(outline: Array, points: Array) -> Array:
-    """Signed distances (...), m, of points (..., 2) to a convex outline with corners (c, 2) counter-clockwise."""
-    return _distances(outline, points.reshape(-1, 2)).reshape(points.shape[:-1])
 
 
 @compiled

@@ -6,11 +6,9 @@ At most a dozen bounds are in play, so trying all of them beats any iteration.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
-
-Array = NDArray[np.float64]
 
 _PARALLEL = 1e-12
 """Sine of the angle between two bounds below which their crossing is not looked for."""

@@ -7,12 +7,9 @@ axis that separates them.
 from collections.abc import Iterable
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled, hypot
 
-Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]
 """x from, x to, y from, y to, m."""
 

@@ -4,11 +4,9 @@ A pose is a rotation matrix (3, 3), whose columns are the frame's axes in the ou
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 

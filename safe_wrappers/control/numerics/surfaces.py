@@ -9,11 +9,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
-
-Array = NDArray[np.float64]
 
 PLANE: Final = 0.0
 ROUND: Final = 1.0

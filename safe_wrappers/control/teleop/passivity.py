@@ -13,8 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.teleop.port_checks import (
     RunningSum,
     energy_j,
@@ -23,8 +24,6 @@ from safe_wrappers.control.teleop.port_checks import (
     positive,
     same_shape,
 )
-
-Array = NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
 

@@ -14,8 +14,9 @@ import math
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.teleop.port_checks import (
     RunningSum,
     energy_j,
@@ -25,8 +26,6 @@ from safe_wrappers.control.teleop.port_checks import (
     positive,
 )
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 Causality = Literal["impedance", "admittance"]
 
@@ -73,11 +72,6 @@ class EnergyReference:
     def message_j(self) -> float:
         """Energy that this end has taken in from outside, J, without its own dissipation; to be sent. Never falls."""
         return self._taken_in.value
-
-    @property
-    def heard_j(self) -> float:
-        """Largest energy that the other end has reported to have taken in, J."""
-        return self._heard
 
     @property
     def budget_j(self) -> float:

@@ -3,12 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import finite_array, float_array
+from safe_wrappers.checks import Array, finite_array, float_array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def same_shape(**values: ArrayLike) -> tuple[Array, Array]:

@@ -18,13 +18,11 @@ from collections.abc import Iterable
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import whole_number
+from safe_wrappers.checks import Array, whole_number
 from safe_wrappers.control.teleop.port_checks import RunningSum, port_energy, port_vector, positive
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 Rule = Literal["queue", "hold", "zero"]
 

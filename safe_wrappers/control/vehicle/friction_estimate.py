@@ -12,9 +12,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 PEAK_SLIPS: Final = (0.05, 0.07, 0.09, 0.11, 0.13, 0.15, 0.18, 0.22)
 """Slips of the peak, one per hypothesis."""

@@ -18,11 +18,10 @@ mean. Adding b / j to the delays instead would be wrong on either side of that.
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
 """Relative bound on the accumulated rounding of the formulas below."""
@@ -129,7 +128,7 @@ def _lease_by_jerk(room: float, v: float, b: float, late: float, a: float, top: 
         rising = tau if a == 0.0 else min(tau, (top - v) / a)
         onset = v if a == 0.0 else min(v + a * rising, top)
         way = v * rising + 0.5 * a * rising * rising + (top * (tau - rising) if rising < tau else 0.0)
-        stop = _stop(onset, a, b, jerk, top)
+        stop = jerk_limited_stop(onset, a, b, jerk, top)
         sizes = abs(v) * rising + 0.5 * a * rising * rising + abs(stop)
         return way + stop + 2.0 * _ROUNDING * sizes <= room
 
@@ -146,41 +145,19 @@ def _lease_by_jerk(room: float, v: float, b: float, late: float, a: float, top: 
     return low - late - _ROUNDING * (low + late) - _TINY
 
 
-def jerk_limited_stop(
-    speed: ArrayLike,
-    acceleration: ArrayLike,
-    braking: ArrayLike,
-    jerk: ArrayLike,
-    top_speed: ArrayLike = np.inf,
-) -> Array:
-    """The way of a stop with limited jerk, m, shape (...), from a speed and an acceleration that is wound down first.
+def jerk_limited_stop(v: float, a: float, b: float, jerk: float, top: float = math.inf) -> float:
+    """The way of a stop with limited jerk, m, from a speed and an acceleration that is wound down first.
 
     The shortest stop that ends without acceleration; below zero where the machine recedes by more than it comes
-    back, 0 where it does not come back at all. inf without brakes or jerk, and where an input (but `top_speed` and an
-    infinite jerk) is not finite.
+    back, 0 where it does not come back at all.
 
     Args:
-        speed: At the start, m/s, positive towards the obstacle, shape (...).
-        acceleration: At the start, at least 0, m/s^2, shape (...).
-        braking: Largest deceleration, m/s^2, shape (...).
-        jerk: Largest change of the acceleration, m/s^3, shape (...); inf: none.
-        top_speed: m/s, shape (...): at it the winding down no longer speeds up.
-
-    Raises:
-        ConfigurationError: For a negative acceleration, jerk or top speed.
+        v: Speed at the start, m/s, positive towards the obstacle.
+        a: Acceleration at the start, at least 0, m/s^2.
+        b: Largest deceleration, above 0, m/s^2.
+        jerk: Largest change of the acceleration, above 0, m/s^3; inf: none.
+        top: At this speed, at least v, the winding down no longer speeds up, m/s.
     """
-    given = (speed, acceleration, braking, jerk, top_speed)
-    several = np.broadcast(*(np.asarray(x, dtype=np.float64) for x in given))
-    _not_negative(acceleration=acceleration, jerk=jerk, top_speed=top_speed)
-    found = []
-    for v, a, b, j, top in (map(float, one) for one in several):
-        known = all(map(math.isfinite, (v, a, b))) and b > 0.0 and j > 0.0 and not math.isnan(top)
-        found.append(_stop(v, a, b, j, max(top, v)) if known else math.inf)
-    return np.array(found).reshape(several.shape)
-
-
-def _stop(v: float, a: float, b: float, jerk: float, top: float) -> float:
-    """`jerk_limited_stop` of one machine, whose speed v is at most its top speed."""
     winding = a / jerk
     highest = v + 0.5 * a * winding
     if highest <= top:

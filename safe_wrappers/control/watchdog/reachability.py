@@ -12,9 +12,9 @@ import numpy as np
 import ruckig
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
-Array = NDArray[np.float64]
 State = tuple[ArrayLike, ArrayLike, ArrayLike]
 """Position (m), velocity (m/s), acceleration (m/s^2), each of shape (..., axes) or scalar."""
 

@@ -13,11 +13,10 @@ Source: appendix "Discrete-time sampling and zero-order hold phase lag" with its
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 
 def _quantity(name: str, given: ArrayLike, unit: str, *, zero: bool) -> Array:

@@ -3,8 +3,8 @@
 import numpy as np
 
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import NOT_REPLAYED, Env, Recording, braking_horizon, physics
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.recording import NOT_REPLAYED, Env, Recording, braking_horizon
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, require_physics
 from safe_wrappers.diagnosis.symptoms.limits import touches_fixed
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
@@ -13,9 +13,8 @@ from safe_wrappers.protect import protect
 
 def measure(env: Env, recording: Recording) -> Measured:
     """The largest force between two bodies above the usual one, in weights of all that moves."""
-    found, forces = physics(env), recording.of_info("contact/peak_force")
-    if found is None:
-        raise NotMeasuredError("the env has no MuJoCo model whose contacts could be read")
+    model, _ = require_physics(env, "whose contacts could be read")
+    forces = recording.of_info("contact/peak_force")
     if np.isnan(forces).all():
         raise NotMeasuredError("no ContactMonitor goes around this env: a step of its outer wrapper is many")
     bad = recording.diverged | ~np.isfinite(np.column_stack([recording.qpos, recording.qvel])).all(axis=1)
@@ -27,7 +26,7 @@ def measure(env: Env, recording: Recording) -> Measured:
         )
     if recording.of_info("contact/partial").mean() > 0.5:
         raise NotMeasuredError(NOT_REPLAYED)
-    weight = weight_n(found[0])
+    weight = weight_n(model)
     deepest = float(np.nanmax(recording.of_info("contact/penetration")))
     # What presses all the time, maybe where it cannot move, is no impact.
     impacts = np.maximum(forces - np.nanmedian(forces), 0.0)
@@ -42,8 +41,6 @@ def measure(env: Env, recording: Recording) -> Measured:
 
 def lines(env: Env, recording: Recording) -> tuple[str, str]:
     """`protect`, where it keeps the machine off what is fixed; else a limit of the pair that hit hardest."""
-    found = physics(env)
-    assert found is not None
     if recording.diverged.any():
         return "", "The simulation diverged: a shorter timestep, softer contacts, or weaker actuators."
     if touches_fixed(env, recording).any():
@@ -57,8 +54,9 @@ def lines(env: Env, recording: Recording) -> tuple[str, str]:
     depth, pair = float(recording.of_info("contact/penetration")[k]), recording.struck[k]
     if pair is None or not depth > 0.0:
         return "", "Limit the speed of what hits: ImpactSpeedLimit, or a lower speed of the whole machine."
-    fixed = fixed_bodies(found[0])
-    names = sorted(pair, key=lambda name: bool(fixed[found[0].body(name).id]))
+    model, _ = require_physics(env, "whose contacts could be read")
+    fixed = fixed_bodies(model)
+    names = sorted(pair, key=lambda name: bool(fixed[model.body(name).id]))
     limit = (
         f"limit = sw.constraints.ImpactSpeedLimit(\n    bodies=[{names[0]!r}], against=[{names[1]!r}], "
         f"force_limit={forces[k] / 3.0:.4g}, stiffness={forces[k] / depth:.4g}, "

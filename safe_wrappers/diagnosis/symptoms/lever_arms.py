@@ -6,11 +6,11 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.lever_arm import lever_arm_acceleration
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.recording import Env, Recording
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, replayed, require_physics
+from safe_wrappers.plants.mujoco.model import HINGE, SLIDE
 
 _READ = (int(mujoco.mjtSensor.mjSENS_ACCELEROMETER), int(mujoco.mjtSensor.mjSENS_VELOCIMETER))
-_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def _sites(model: mujoco.MjModel) -> list[int]:
@@ -25,7 +25,7 @@ def _turning_joint(model: mujoco.MjModel, body: int) -> int:
     while body:
         first = int(model.body_jntadr[body])
         for j in reversed(range(first, first + int(model.body_jntnum[body]))):
-            if model.jnt_type[j] != _SLIDE:
+            if model.jnt_type[j] != SLIDE:
                 return j
         body = int(model.body_parentid[body])
     return -1
@@ -34,7 +34,7 @@ def _turning_joint(model: mujoco.MjModel, body: int) -> int:
 def _arm(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> Array:
     """From the turning centre to a site, m: off a hinge's axis, or from the centre of mass of what turns freely."""
     j = _turning_joint(model, int(model.site_bodyid[site]))
-    if model.jnt_type[j] == _HINGE:
+    if model.jnt_type[j] == HINGE:
         off = data.site_xpos[site] - data.xanchor[j]
         return np.asarray(off - (off @ data.xaxis[j]) * data.xaxis[j])
     return np.asarray(data.site_xpos[site] - data.subtree_com[model.jnt_bodyid[j]])
@@ -42,19 +42,12 @@ def _arm(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> Array:
 
 def measure(env: Env, recording: Recording) -> Measured:
     """The acceleration that turning adds at the worst sensor, but for one in twenty steps, m/s^2."""
-    found = physics(env)
-    if found is None:
-        raise NotMeasuredError("the env has no MuJoCo model whose sensors could be read")
-    model, data, velocity = found[0], mujoco.MjData(found[0]), np.zeros(6)
+    (model, _), velocity = require_physics(env, "whose sensors could be read"), np.zeros(6)
     sites = _sites(model)
     if not sites:
         raise NotMeasuredError("no accelerometer and no velocimeter sits on a body that turns")
     rates, arms = np.zeros((2, len(recording.qpos), len(sites), 3))
-    for k, (qpos, qvel) in enumerate(zip(recording.qpos, recording.qvel, strict=True)):
-        data.qpos[:], data.qvel[:] = qpos, qvel
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_comVel(model, data)
+    for k, data in replayed(model, recording):
         for i, site in enumerate(sites):
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, site, velocity, 0)
             rates[k, i], arms[k, i] = velocity[:3], _arm(model, data, site)

@@ -8,7 +8,7 @@ from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits.joints import JointPositionLimit, driven_joints
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording, braking_horizon, physics
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, require_physics
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.protect import protect
@@ -70,9 +70,8 @@ def measure(env: Env, recording: Recording) -> Measured:
         Evidence("steps in contact with something fixed, not the ground", float(hits.mean()), "share"),
     ]
     if beyond.size:
-        found = physics(env)
-        assert found is not None
-        model, joints = found[0], _stopped(found[0])
+        model, _ = require_physics(env, "whose limits could be read")
+        joints = _stopped(model)
         worst = int(np.argmax(beyond.max(axis=0)))
         speed = float(np.abs(recording.qvel[:, model.jnt_dofadr[joints[worst]]]).max())
         evidence.append(

@@ -6,8 +6,8 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.control.watchdog.sampling import phase_lag
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.recording import Env, Recording
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, require_physics
 from safe_wrappers.diagnosis.symptoms.late_commands import ages
 
 LINEAR = 0.9
@@ -92,10 +92,7 @@ def loop(a: Array, b: Array, gains: Array, delay: int, broken: int, dt: float) -
 
 def measure(env: Env, recording: Recording) -> Measured:
     """The phase that hold and delay take, as a multiple of what is left, in the worst actuator's loop."""
-    found = physics(env)
-    if found is None:
-        raise NotMeasuredError("the env has no MuJoCo model that could be linearised")
-    model, dt = found[0], recording.control_dt
+    (model, _), dt = require_physics(env, "that could be linearised"), recording.control_dt
     if model.nq != model.nv or model.na or recording.actions.shape[1] != model.nu:
         raise NotMeasuredError(
             "only machines of hinges and slides, whose actions are controls without activation, are linearised"

@@ -8,19 +8,19 @@ from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits.joints import driven_joints
 from safe_wrappers.control.filtering.manipulability import manipulability
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.recording import Env, Recording
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, require_physics
+from safe_wrappers.plants.mujoco.model import HINGE
 
 NEAR = 0.2
 """Share of the largest manipulability below which a pose is near a singular one."""
 LEAST_STEPS = 10
-_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SAMPLES = 500
 
 
 def _arm(model: mujoco.MjModel) -> tuple[int, NDArray[np.int64]]:
     """The body at the tip of the longest chain of driven hinges on a fixed base, and their degrees of freedom."""
-    driven = {j for j in driven_joints(model) if model.jnt_type[j] == _HINGE}
+    driven = {j for j in driven_joints(model) if model.jnt_type[j] == HINGE}
     best: tuple[int, list[int]] = (0, [])
     for body in range(1, model.nbody):
         joints: list[int] = []
@@ -70,10 +70,7 @@ def _reach(model: mujoco.MjModel, tip: int, dofs: NDArray[np.int64]) -> tuple[fl
 
 def measure(env: Env, recording: Recording) -> Measured:
     """How many times as fast joints turn near singular poses as elsewhere (95th percentiles)."""
-    found = physics(env)
-    if found is None:
-        raise NotMeasuredError("the env has no MuJoCo model whose joints could be read")
-    model = found[0]
+    model, _ = require_physics(env, "whose joints could be read")
     tip, dofs = _arm(model)
     largest, _ = _reach(model, tip, dofs)
     share = _manipulability(model, tip, dofs, recording.qpos)[0] / largest
@@ -100,9 +97,7 @@ def measure(env: Env, recording: Recording) -> Measured:
 
 def lines(env: Env, recording: Recording) -> tuple[str, str]:
     """A margin of the manipulability, twice as wide as what counts as near."""
-    found = physics(env)
-    assert found is not None
-    model = found[0]
+    model, _ = require_physics(env, "whose joints could be read")
     tip, dofs = _arm(model)
     largest, directions = _reach(model, tip, dofs)
     name = model.body(tip).name

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, box, physics
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.recording import Env, Recording, box
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, require_physics
 from safe_wrappers.errors import SafeWrappersError
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check
@@ -17,16 +17,14 @@ SHARE = 0.0025
 
 
 def _checked(env: Env) -> tuple[mujoco.MjModel, RigidModelCheck]:
-    found = physics(env)
-    if found is None:
-        raise NotMeasuredError("the env has no MuJoCo model whose joints could be read")
+    model, _ = require_physics(env, "whose joints could be read")
     try:
         check = rigid_model_check(env.unwrapped)
     except SafeWrappersError as error:
         raise NotMeasuredError(f"the springs of this machine cannot be read: {error}") from error
     if not check.springs:
         raise NotMeasuredError("no spring lies behind a motor")
-    return found[0], check
+    return model, check
 
 
 def _joints(model: mujoco.MjModel, check: RigidModelCheck) -> NDArray[np.intp]:

@@ -12,8 +12,8 @@ from safe_wrappers.constraints.limits.joints import driven_joints
 from safe_wrappers.control.estimation.observability import Scaled, unobservable_subspace
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.linear_model import Linearised
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.recording import Env, Recording
+from safe_wrappers.diagnosis.symptom import Measured, Symptom, replayed, require_physics
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
@@ -97,10 +97,7 @@ def _hidden(linear: Linearised, step: int, more: Callable[[], Array], together: 
 
 def measure(env: Env, recording: Recording) -> Measured:
     """The number of directions of the state that the task counts and observations do not show; its lower median."""
-    found = physics(env)
-    if found is None:
-        raise NotMeasuredError("the env has no MuJoCo model that could be linearised")
-    model, data = found
+    model, data = require_physics(env, "that could be linearised")
     linear = Linearised(env, recording, _places(model))
     together = max(round(WINDOW_S / recording.control_dt), 1)
     usable = np.flatnonzero(~recording.diverged)
@@ -152,9 +149,7 @@ def _out_of_sight(env: Env, recording: Recording) -> list[Evidence]:
 
 def lines(env: Env, recording: Recording) -> tuple[str, str]:
     """Tracks of what moves by itself and is not shown, where the machine has a camera or a site to look from."""
-    found = physics(env)
-    assert found is not None
-    model = found[0]
+    model, _ = require_physics(env, "that could be linearised")
     told = (
         "Show them: put them into the observation, or estimate them (OcclusionPenalty tracks bodies and published "
         "positions). A policy has to be trained with the new observation."
@@ -205,13 +200,9 @@ def _plain(numbers: Array) -> str:
 
 def _velocities(model: mujoco.MjModel, recording: Recording) -> tuple[list[int], Array]:
     """Bodies of others that have moved in the plane, and their velocities, shape (k, bodies, 2), m/s."""
-    data, bodies, found = mujoco.MjData(model), _others(model).bodies, np.zeros(6)
+    bodies, found = _others(model).bodies, np.zeros(6)
     velocities = np.zeros((len(recording.qpos), len(bodies), 2))
-    for k, (qpos, qvel) in enumerate(zip(recording.qpos, recording.qvel, strict=True)):
-        data.qpos[:], data.qvel[:] = qpos, qvel
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_comVel(model, data)
+    for k, data in replayed(model, recording):
         for i, body in enumerate(bodies):
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, found, 0)
             velocities[k, i] = found[3:5]

@@ -7,8 +7,9 @@ from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits.joints import driven_joints
 from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.recording import Env, Recording
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, replayed, require_physics
+from safe_wrappers.plants.mujoco.model import HINGE
 
 SLIPS = 0.2
 """Slip ratio from which on a wheel is beyond the peak of its traction on all usual grounds."""
@@ -16,7 +17,6 @@ REGULARIZATION = 0.5
 """m/s, as of `SlipLimiter`."""
 _LEVEL = 0.5
 """Of the vertical part of an axle's direction: a wheel does not turn about a steep one."""
-_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SPHERE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 
 
@@ -26,7 +26,7 @@ def wheels(model: mujoco.MjModel) -> dict[int, float]:
     mujoco.mj_kinematics(model, data)
     for j in driven_joints(model):
         level = abs(data.xaxis[j, 2]) < _LEVEL
-        if model.jnt_type[j] != _HINGE or model.jnt_limited[j] or not level or not model.joint(j).name:
+        if model.jnt_type[j] != HINGE or model.jnt_limited[j] or not level or not model.joint(j).name:
             continue
         for g in np.flatnonzero(model.geom_bodyid == model.jnt_bodyid[j]):
             axis = np.zeros(3)
@@ -42,19 +42,12 @@ def wheels(model: mujoco.MjModel) -> dict[int, float]:
 
 def slips(env: Env, recording: Recording) -> Array:
     """The slip ratio of each wheel after each step, shape (k, wheels)."""
-    found = physics(env)
-    if found is None:
-        raise NotMeasuredError("the env has no MuJoCo model whose wheels could be read")
-    model, data = found[0], mujoco.MjData(found[0])
+    model, _ = require_physics(env, "whose wheels could be read")
     rolling = wheels(model)
     if not rolling:
         raise NotMeasuredError("no driven joint turns a wheel")
     ratio, velocity = np.zeros((len(recording.qpos), len(rolling))), np.zeros(6)
-    for k, (qpos, qvel) in enumerate(zip(recording.qpos, recording.qvel, strict=True)):
-        data.qpos[:], data.qvel[:] = qpos, qvel
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_comVel(model, data)
+    for k, data in replayed(model, recording):
         for i, (j, radius) in enumerate(rolling.items()):
             body = int(model.jnt_bodyid[j])
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
@@ -77,9 +70,8 @@ def measure(env: Env, recording: Recording) -> Measured:
 
 def lines(env: Env, recording: Recording) -> tuple[str, str]:
     """A slip limiter of these wheels."""
-    found = physics(env)
-    assert found is not None
-    names = [found[0].joint(j).name for j in wheels(found[0])]
+    model, _ = require_physics(env, "whose wheels could be read")
+    names = [model.joint(j).name for j in wheels(model)]
     return f"env = sw.SlipLimiter(env, wheels={names})", ""
 
 

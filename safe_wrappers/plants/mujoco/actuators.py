@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.mujoco.model import Remade, control_range
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, Remade, control_range
 
-_JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 _HANDLED = (
@@ -256,7 +255,7 @@ class AffineActuators(Remade):
             depends = m.actuator_biasprm[:, 1:3].any(axis=1) | m.actuator_gainprm[:, 1:3].any(axis=1)
             depends &= m.actuator_forcelimited.astype(bool)
             depends &= (m.actuator_biastype > 0) | (m.actuator_gaintype > 0)
-            scalar = np.isin(m.actuator_trntype, _JOINT_TRANSMISSIONS)
+            scalar = np.isin(m.actuator_trntype, AT_A_JOINT)
             joint = np.where(scalar, m.actuator_trnid[:, 0], 0)
             scalar &= m.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE)  # slide or hinge
             self._joints_suffice = bool((scalar | ~depends).all())

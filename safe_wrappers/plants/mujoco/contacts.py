@@ -42,7 +42,7 @@ class Contacts:
         self, model: mujoco.MjModel, bodies: Sequence[str] | None = None, against: Sequence[str] | None = None
     ) -> None:
         self.model = model
-        one, other = _chosen(model, "bodies", bodies), _chosen(model, "against", against)
+        one, other = chosen_bodies(model, "bodies", bodies), chosen_bodies(model, "against", against)
         self.watched = one[:, None] & other | other[:, None] & one
         self._watched = self.watched.tolist()
         # The last entry is for geom -1, of something flexible.
@@ -201,7 +201,7 @@ def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:
     return found
 
 
-def _chosen(model: mujoco.MjModel, argument: str, names: Sequence[str] | None) -> np.ndarray:
+def chosen_bodies(model: mujoco.MjModel, argument: str, names: Sequence[str] | None) -> NDArray[np.bool_]:
     """Which bodies are named, shape (nbody + 1,); the last entry stands for flexible parts, which have no name."""
     if names is None:
         return np.ones(model.nbody + 1, dtype=bool)

@@ -10,9 +10,9 @@ from safe_wrappers.control.handover.blend_curves import Motion
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
+from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 
 
@@ -35,7 +35,7 @@ class InverseDynamics:
         self._model, self._data = model, mujoco.MjData(model)
         for i in range(model.nu):
             joint = int(model.actuator_trnid[i, 0])
-            on_joint = model.actuator_trntype[i] == _ON_JOINT and model.jnt_type[joint] in (_HINGE, _SLIDE)
+            on_joint = model.actuator_trntype[i] == _ON_JOINT and model.jnt_type[joint] in SCALAR_JOINTS
             gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
             if not (on_joint and gain > 0.0 and bias[1] == -gain and bias[0] == 0.0):
                 raise UnsupportedEnvError(

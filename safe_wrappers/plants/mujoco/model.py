@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnknownNameError
 
-_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+FREE, BALL, SLIDE, HINGE = (
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
+)
+SCALAR_JOINTS = SLIDE, HINGE
+"""The kinds of joints with one position."""
+AT_A_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+"""The transmissions of actuators that act on one joint."""
 
 
 class Remade:
@@ -121,10 +127,10 @@ def position_rate(model: mujoco.MjModel, qpos: Array, qvel: Array) -> Array:
     for j in range(model.njnt):
         q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
         kind = model.jnt_type[j]
-        if kind == _FREE:
+        if kind == FREE:
             rate[q : q + 3] = qvel[v : v + 3]
             q, v = q + 3, v + 3
-        if kind in (_FREE, _BALL):
+        if kind in (FREE, BALL):
             # Angular velocities of these joints are in the body's frame; mju_derivQuat wants the world's.
             turn = np.zeros(4)
             mujoco.mju_mulQuatAxis(turn, qpos[q : q + 4].copy(), qvel[v : v + 3].copy())

@@ -11,15 +11,13 @@ from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle.wheel import Wheel
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
-from safe_wrappers.plants.mujoco.model import inertia
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _ROUND = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("SPHERE", "CYLINDER", "CAPSULE")]
 _FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
 _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
 _FLAT = 1e-6  # level part of an axle's direction below which it has none
-_DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 class DrivenWheels:
@@ -45,13 +43,13 @@ class DrivenWheels:
         m = plant.model
         self._joints = np.array([plant.named("joint", name) for name in names])
         for joint, name in zip(self._joints, names, strict=True):
-            if m.jnt_type[joint] != _HINGE:
-                hinges = [m.joint(j).name for j in np.flatnonzero(m.jnt_type == _HINGE)]
+            if m.jnt_type[joint] != HINGE:
+                hinges = [m.joint(j).name for j in np.flatnonzero(m.jnt_type == HINGE)]
                 there = ", ".join(filter(None, hinges))
                 wanted = f"joint {name!r} is no hinge, so it is no wheel's axle"
                 raise ConfigurationError(f"{wanted}; hinges are {there}")
         self.dofs = m.jnt_dofadr[self._joints]
-        direct = np.isin(m.actuator_trntype, _DRIVES)
+        direct = np.isin(m.actuator_trntype, AT_A_JOINT)
         self._drives = direct & (m.actuator_trnid[:, 0] == self._joints[:, None])
         data = mujoco.MjData(m)
         mujoco.mj_forward(m, data)

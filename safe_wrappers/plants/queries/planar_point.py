@@ -11,12 +11,12 @@ from safe_wrappers.control.backup.damped_axis import DampedAxis, damped_axis
 from safe_wrappers.control.numerics.rectangles import Rectangle, merged
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, SLIDE
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _ALIGNED = 1e-6
 _EXACT = 1e-9  # tolerance between the model's own step and the axes' constants, m and m/s
 _TRIED = 12
-_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _PLANE, _BOX = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
@@ -68,7 +68,7 @@ def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> Pl
 
 def _slides(m: mujoco.MjModel, body: int | None) -> tuple[int, int]:
     """Two slides of one body: of the only one that moves, or of the one with this index."""
-    slides = [j for j in range(m.njnt) if m.jnt_type[j] == _SLIDE and body in (None, m.jnt_bodyid[j])]
+    slides = [j for j in range(m.njnt) if m.jnt_type[j] == SLIDE and body in (None, m.jnt_bodyid[j])]
     if body is None and (len(slides), m.njnt, len(set(m.jnt_bodyid.tolist()))) != (2, 2, 1):
         kinds = [mujoco.mjtJoint(k).name[6:].lower() for k in m.jnt_type]
         _refuse(f"it needs one body on two slides and nothing else that moves; the model has {kinds}")
@@ -91,8 +91,7 @@ def _along_x_and_y(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
 
 
 def _actuators(m: mujoco.MjModel, joints: tuple[int, int], alone: bool) -> tuple[int, int]:
-    joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    driven = [int(m.actuator_trnid[a, 0]) if m.actuator_trntype[a] in joint else -1 for a in range(m.nu)]
+    driven = [int(m.actuator_trnid[a, 0]) if m.actuator_trntype[a] in AT_A_JOINT else -1 for a in range(m.nu)]
     if alone and sorted(driven) != [0, 1]:
         _refuse("each of its slides needs a force actuator of its own, and there must be no other actuator")
     if [driven.count(j) for j in joints] != [1, 1]:

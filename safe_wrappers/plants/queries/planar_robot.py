@@ -9,11 +9,10 @@ from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import HeadingDrive
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, SLIDE
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-_SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 _AT_SITE = int(mujoco.mjtTrn.mjTRN_SITE)
-_AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 class PlanarFrame:
@@ -34,7 +33,7 @@ class PlanarFrame:
         kinds = [int(m.jnt_type[j]) for j in joints]
         axes = m.jnt_axis[joints] if joints else np.zeros((0, 3))
         planar = (
-            kinds == [_SLIDE, _SLIDE, _HINGE]
+            kinds == [SLIDE, SLIDE, HINGE]
             and m.body_parentid[b] == 0
             and np.allclose(axes, np.eye(3), atol=1e-9)
             and np.allclose(m.body_quat[b], [1, 0, 0, 0], atol=1e-9)
@@ -54,7 +53,7 @@ class PlanarFrame:
                 f"expected 2 actuators, a drive and a turning one; the model has {m.nu}"
             )
         kind, at, gear = m.actuator_trntype, m.actuator_trnid[:, 0], m.actuator_gear
-        turning = [a for a in range(2) if kind[a] in _AT_JOINT and at[a] == joints[2]]
+        turning = [a for a in range(2) if kind[a] in AT_A_JOINT and at[a] == joints[2]]
         pushing = [
             a
             for a in range(2)

@@ -16,7 +16,6 @@ LEFT_OVER: Final = 0.05
 """Share of a vibration's amplitude that may be left after a control interval for a rigid model to be good enough."""
 LIGHT_DAMPING: Final = 0.05
 """Damping ratio below which torque steps ring on."""
-_SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
     if not len(springs):
         return RigidModelCheck((), (), (), 0.0, 0.0, plant.control_dt)
     stiffness, damping = np.zeros((model.nv, model.nv)), np.diag(model.dof_damping)
-    scalar = np.isin(model.jnt_type, _SCALAR)
+    scalar = np.isin(model.jnt_type, of_model.SCALAR_JOINTS)
     every = model.jnt_dofadr[scalar]
     stiffness[every, every] = model.jnt_stiffness[scalar]
     affine = (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE))[: len(moment)]
@@ -129,7 +128,7 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
 def _springs(model: mujoco.MjModel, driven: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Joints with stiffness that no actuator drives and that have a driven joint before them, shape (n,)."""
     found = []
-    for j in np.flatnonzero(np.isin(model.jnt_type, _SCALAR) & (model.jnt_stiffness > 0.0)):
+    for j in np.flatnonzero(np.isin(model.jnt_type, of_model.SCALAR_JOINTS) & (model.jnt_stiffness > 0.0)):
         dof = int(model.jnt_dofadr[j])
         before = int(model.dof_parentid[dof])
         while before >= 0 and not driven[before]:

@@ -4,12 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.wrappers.common.layer import Array, Env
+from safe_wrappers.wrappers.common.layer import Env
 
 
 class FallbackController:

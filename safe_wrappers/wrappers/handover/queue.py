@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.seam_limits import SeamCheck
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, Seam, drawn_out, join
 from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
-from safe_wrappers.wrappers.common.layer import Array
 from safe_wrappers.wrappers.common.receiver import whole_steps
 
 REPLACE: Final = "replace"

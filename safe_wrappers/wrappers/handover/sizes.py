@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import positive, whole_number
+from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE
@@ -14,7 +14,6 @@ from safe_wrappers.control.handover.splines import hermite_series
 from safe_wrappers.control.handover.vibration import shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck
-from safe_wrappers.wrappers.common.layer import Array
 from safe_wrappers.wrappers.common.receiver import whole_steps
 from safe_wrappers.wrappers.handover.queue import BASELINES
 

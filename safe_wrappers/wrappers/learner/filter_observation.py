@@ -7,14 +7,14 @@ import numpy as np
 from gymnasium import spaces
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import whole_number
+from safe_wrappers.checks import Array, whole_number
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 KEY: Final = "filter"
 """Of the features in a Dict observation."""

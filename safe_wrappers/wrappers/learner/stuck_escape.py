@@ -9,11 +9,11 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import action_array
 
 ValueFunction = Callable[[Any, Array], ArrayLike]

@@ -8,6 +8,7 @@ import numpy as np
 import ruckig
 from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.watchdog.reachability import (
     MotionLimits,
     admits,
@@ -17,7 +18,7 @@ from safe_wrappers.control.watchdog.reachability import (
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import actions_are_controls
 from safe_wrappers.plants.mujoco.model import control_range
-from safe_wrappers.wrappers.common.layer import Array, Env
+from safe_wrappers.wrappers.common.layer import Env
 
 Measured = Callable[[Env], tuple[ArrayLike, ...]]
 """Takes the env; returns what the actions are setpoints of, velocities and, if known, accelerations, shapes (m,)."""

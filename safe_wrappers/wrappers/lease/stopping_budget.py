@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.control.watchdog.leases import longest_lease, longest_lease_of_room, round_trip_ceiling
 from safe_wrappers.errors import ConfigurationError
@@ -16,7 +16,7 @@ from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
-from safe_wrappers.wrappers.common.layer import Array, Env
+from safe_wrappers.wrappers.common.layer import Env
 
 ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
 """Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""

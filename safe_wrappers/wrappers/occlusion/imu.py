@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.control.estimation.dead_reckoning import DeadReckoning
 from safe_wrappers.control.estimation.lever_arm import rigid_transform
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import named
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
-from safe_wrappers.wrappers.common.layer import Array
 
 
 @dataclass

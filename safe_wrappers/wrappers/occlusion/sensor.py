@@ -7,13 +7,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_noise
 from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_numbers
-from safe_wrappers.wrappers.common.layer import Array
 from safe_wrappers.wrappers.occlusion.imu import EgoMotion, Imu
 
 

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_covariance
 from safe_wrappers.control.estimation.tracks import Motion
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.serialize import plain_numbers
-from safe_wrappers.wrappers.common.layer import Array
 
 
 @dataclass

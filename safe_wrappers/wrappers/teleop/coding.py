@@ -6,14 +6,14 @@ from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.teleop.passivity import ChannelLedger, effort_and_outgoing, to_waves
 from safe_wrappers.control.teleop.passivity_control import EnergyReference
 from safe_wrappers.control.teleop.port_checks import RunningSum, port_energy
 from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import refuse_changed_actions
-from safe_wrappers.wrappers.common.layer import Array, Env
+from safe_wrappers.wrappers.common.layer import Env
 from safe_wrappers.wrappers.teleop.link import Packet
 from safe_wrappers.wrappers.teleop.port import PortReading, TeleopPort
 

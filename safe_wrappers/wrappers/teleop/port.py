@@ -7,9 +7,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import check_fields, non_negative, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, settings_from
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.layer import Array, Env
+from safe_wrappers.wrappers.common.layer import Env
 
 
 @dataclass(frozen=True)

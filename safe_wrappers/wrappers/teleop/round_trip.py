@@ -3,10 +3,10 @@
 import math
 from dataclasses import KW_ONLY, dataclass
 
-from safe_wrappers.checks import check_fields, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.layer import Array, Env
+from safe_wrappers.wrappers.common.layer import Env
 from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, StoppingBudget, budget_from
 
 
