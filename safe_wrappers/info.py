@@ -200,7 +200,7 @@ HANDOVER_REFUSED: Final = _key("handover/refused", "bool")
 """A chunk was refused: not finite, not newer than the one in force, too late, out of reach, or without a blend that
 keeps `limits`."""
 HANDOVER_CLIPPED: Final = _key("handover/clipped", "float64", unit="action")
-"""L2 norm of clipped minus proposed, of the chunk's entry with the largest; numbers that are not finite count as 0."""
+"""The largest L2 norm of clipped minus proposed, of the chunk's entries; numbers that are not finite count as 0."""
 HANDOVER_LATENCY: Final = _key("handover/latency", "int64")
 """Control steps from the observation to the takeover of the last chunk that took over in this step; -1 without."""
 HANDOVER_STEPS: Final = _key("handover/steps", "int64")

@@ -60,7 +60,7 @@ _FLAGS = (
     "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/clipped", "cbf/intervened",
     "handover/refused", "handover/starved", "handover/limited", "handover/clipped", "lease/refused", "lease/braking",
     "lease/expired", "lease/clipped", "teleop/revoked", "teleop/lost", "teleop/clipped", "contact/partial",
-    "balance/partial", "occlusion/expired",
+    "balance/partial", "occlusion/expired", "fault/active",
 )  # fmt: skip
 
 

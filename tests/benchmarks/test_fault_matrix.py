@@ -13,6 +13,7 @@ from benchmarks.faults.constraint_examples import EXAMPLES, NO_CONSTRAINT
 from benchmarks.faults.lifecycle import lifecycle
 from benchmarks.faults.outcomes import DEFECTS, Outcome
 from benchmarks.faults.stacks import Row, rows
+from safe_wrappers.wrappers.faults import FAULTS
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -30,7 +31,7 @@ QUICK = {
 
 
 def test_every_export_has_a_row_and_nothing_else_has():
-    assert {row.name for row in rows() if row.kind == "wrapper"} == WRAPPERS
+    assert {row.name for row in rows() if row.kind == "wrapper"} == WRAPPERS | set(FAULTS)
     constraints = {row.name for row in rows() if row.kind == "constraint"}
     assert constraints | set(NO_CONSTRAINT) == set(sw.constraints.__all__)
     assert constraints == set(EXAMPLES) and not constraints & set(NO_CONSTRAINT)
@@ -194,11 +195,13 @@ def test_who_decides_nothing_counts_actions_outside_the_space_and_warns_once(key
     env = make(gym.make("Reacher-v5"))
     assert env.reset(seed=0)[1][key] == 0.0
     told = {}
-    for action in ((0.5, 1.0), (0.5, 1.5), (-2.0, 3.0), (np.nan, 1.25), (np.nan, -np.inf), (-1.0, 1.0)):
+    odd = (np.nan, 1.25), (np.nan, -np.inf), (-1.0, 1.0), (3e300, -4e300)
+    for action in ((0.5, 1.0), (0.5, 1.5), (-2.0, 3.0), *odd):
         told[action] = env.step(np.array(action))[4][key]
         warned = [w for w in recwarn if "left the action space by 0.5" in str(w.message)]
         assert len(warned) == (len(told) > 1)
-    assert list(told.values()) == pytest.approx([0.0, 0.5, 5.0**0.5, 0.25, 0.0, 0.0], abs=0)
+    assert list(told.values()) == pytest.approx([0.0, 0.5, 5.0**0.5, 0.25, 0.0, 0.0, 5e300], abs=0)
+    assert not [w for w in recwarn if w.category is RuntimeWarning]
     assert warned[0].filename == __file__
 
 

@@ -74,7 +74,7 @@ def outside(action: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> floa
     if ((action >= low) & (action <= high)).all():
         return 0.0
     beyond = np.where(np.isfinite(action), action - np.clip(action, low, high), 0.0)
-    return float(np.linalg.norm(beyond, axis=-1).max())
+    return max(math.hypot(*one) for one in np.atleast_2d(beyond).tolist())  # squares may overflow
 
 
 def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None) -> NDArray[Any]:
