@@ -148,7 +148,7 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         try:
             for plant in plants:
                 plant.offer_rollout()
-            return self.env.step(sent)  # type: ignore[arg-type]
+            return self.env.step(sent)
         finally:
             for plant in plants:
                 plant.withdraw_rollout()

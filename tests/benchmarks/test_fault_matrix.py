@@ -201,7 +201,7 @@ def test_who_decides_nothing_counts_actions_outside_the_space_and_warns_once(key
         warned = [w for w in recwarn if "left the action space by 0.5" in str(w.message)]
         assert len(warned) == (len(told) > 1)
     assert list(told.values()) == pytest.approx([0.0, 0.5, 5.0**0.5, 0.25, 0.0, 0.0, 5e300], abs=0)
-    assert not [w for w in recwarn if w.category is RuntimeWarning]
+    assert not [w for w in recwarn if w.category is RuntimeWarning and "/safe_wrappers/" in w.filename]
     assert warned[0].filename == __file__
 
 

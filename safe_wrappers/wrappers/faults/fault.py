@@ -108,11 +108,11 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
     def _refuse_what_is_no_action(self, action: Any) -> None:
         """Now, and not when it arrives, at a step whose action is a right one."""
         self._refuse_what_is_not_finite(action)
-        shape = self.action_space.shape
+        space: Any = self.action_space
         given = numbers_of(action)
         # Of a `ChunkHandover` with chunks of one entry actions (m,) are taken, too.
-        if given is None or given.ndim == 0 or (1, *given.shape) != shape:
-            action_array(action, shape)
+        if given is None or given.ndim == 0 or (1, *given.shape) != space.shape:
+            action_array(action, space.shape)
 
     def begin(self) -> None:
         """A new episode; `random` is ready."""
