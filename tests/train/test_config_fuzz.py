@@ -261,6 +261,15 @@ def test_aliases_share_nothing(folder):
     assert read_config(path, ["a.b=2"]) == {"a": {"b": 2}, "c": {"b": 1}}
 
 
+@pytest.mark.parametrize("key", ["null", "1", "2.5", "on", "? [a]\n    ", "? {a: 1}\n    "])
+def test_a_key_that_is_no_text_is_refused_wherever_it_is(folder, key):
+    """JSON, which runs keep their settings in, has no others."""
+    path = folder / "config.yaml"
+    path.write_text(f"name: x\nenv:\n  kwargs:\n  - {key}: 3\n")
+    with pytest.raises(SafeWrappersError, match=r"a key is a text; .* is none \(put it in quotes\)"):
+        read_config(path)
+
+
 @pytest.mark.parametrize("line", LINES)
 def test_strange_yaml_is_read_or_refused(folder, line):
     path = folder / "config.yaml"
