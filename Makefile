@@ -146,6 +146,7 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.balance
 	$(BIN)/python -m benchmarks.teleop
 	$(BIN)/python -m benchmarks.kills
+	$(BIN)/python -m benchmarks.kills --seeds 2 --workers 2 --kills 10 --name kills_together
 	$(BIN)/python -m benchmarks.scaling
 	$(BIN)/python -m benchmarks.wrapper_cost
 	$(BIN)/python -m benchmarks.occlusion_cost

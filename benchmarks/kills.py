@@ -1,12 +1,13 @@
 """`compare` is killed at random moments until it has come to its end; is what is there then what should be there?
 
-    python -m benchmarks.kills    # 120 kills, some minutes; goes on where it was stopped
+    python -m benchmarks.kills                                            # 120 kills, some minutes
+    python -m benchmarks.kills --seeds 2 --workers 2 --kills 12 --name kills_together    # runs side by side
 
 The command of `benchmarks/kills.yaml` runs in a process group of its own: PPO without a filter and SAC through one,
 checkpoints, evaluation, report. SIGKILL goes to the whole group, at a random moment of a phase that is drawn, and the
 same command is given again; after some kills it is left alone to its end. Whatever takes long to import is imported
 once, and commands and runs are forked from there instead of started (`multiprocessing`'s fork for its spawn): nothing
-else is other than at a terminal. Films are left out (no display is needed then).
+else is other than at a terminal. Films are left out (no display is needed then). It goes on where it was stopped.
 
 What should be there. A run that goes on from a checkpoint makes new episodes, so a run that was killed is not the one
 that was not. But it must be the run that was cut off cleanly right after the checkpoints from which it went on: such
@@ -30,7 +31,7 @@ import struct
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,34 +64,35 @@ _SUBREAPER = 36
 
 @dataclass
 class Attempt:
-    """One command: how it ended, in which phase, and the steps that its run had made."""
+    """One command: how it ended, in which phase (of runs side by side: the last that began), and their steps."""
 
     status: int | None
     """None: it was killed."""
     phase: str
-    arm: str
-    steps: int
-    saved: int
-    """Of these, those that were in a checkpoint."""
+    run: str
+    steps: dict[str, tuple[int, int]]
+    """By run: those that it has made, and of these those that were in a checkpoint."""
     seconds: dict[tuple[str, str], list[float]] = field(default_factory=dict)
-    """How long its phases took, by phase and arm, in their order."""
+    """How long its phases took, by phase and run, in their order."""
 
 
 class Stage:
     """What forked processes say of themselves: their phases through a pipe, their steps in shared memory."""
 
-    def __init__(self) -> None:
+    def __init__(self, runs: Sequence[str]) -> None:
         self.told, self._tell = os.pipe()
-        self.steps = mmap.mmap(-1, 16)
+        self._places = {run: 16 * place for place, run in enumerate(runs)}
+        self._steps = mmap.mmap(-1, 16 * len(runs))
+        self.run = ""  # of this process
 
-    def say(self, phase: str, arm: str = "") -> None:
-        os.write(self._tell, f"{phase} {arm}\n".encode())
+    def say(self, phase: str, run: str = "") -> None:
+        os.write(self._tell, f"{phase} {run}\n".encode())
 
-    def note(self, at: int, steps: int) -> None:
-        struct.pack_into("q", self.steps, 8 * at, steps)
+    def note(self, steps: int, saved: bool = False) -> None:
+        struct.pack_into("q", self._steps, self._places[self.run] + 8 * saved, steps)
 
-    def noted(self, at: int) -> int:
-        return int(struct.unpack_from("q", self.steps, 8 * at)[0])
+    def noted(self) -> dict[str, tuple[int, int]]:
+        return {run: struct.unpack_from("qq", self._steps, place) for run, place in self._places.items()}
 
 
 def staged(stage: Stage) -> list[Any]:
@@ -99,28 +101,26 @@ def staged(stage: Stage) -> list[Any]:
     evaluate, summarize, step = experiment.evaluate_run, experiment.summarize_experiment, EpisodeRows._on_step
     fork = multiprocessing.get_context("fork")
 
-    def trained(arm: ArmConfig, *given: Any, **named: Any) -> None:
-        stage.note(0, 0)
-        stage.note(1, 0)
-        stage.say("training", arm.name)
-        train(arm, *given, **named)
+    def trained(arm: ArmConfig, seed: int, *given: Any, **named: Any) -> None:
+        stage.run = _name(arm, seed)
+        stage.say("training", stage.run)
+        train(arm, seed, *given, **named)
         stage.say("start")
 
     def saved(root: Path, model: Any, *given: Any, final: bool = False, **named: Any) -> Path:
-        arm = root.parents[1].name
-        stage.say("checkpoint", arm)
+        stage.say("checkpoint", stage.run)
         folder: Path = save(root, model, *given, final=final, **named)
-        stage.note(1, model.num_timesteps)
-        stage.say("policy" if final else "training", arm)
+        stage.note(model.num_timesteps, saved=True)
+        stage.say("policy" if final else "training", stage.run)
         return folder
 
     def stepped(self: EpisodeRows) -> bool:
-        stage.note(0, self.num_timesteps)
+        stage.note(self.num_timesteps)
         return step(self)
 
-    def evaluated(arm: ArmConfig, *given: Any) -> None:
-        stage.say("evaluation", arm.name)
-        evaluate(arm, *given)
+    def evaluated(arm: ArmConfig, seed: int, *given: Any) -> None:
+        stage.say("evaluation", _name(arm, seed))
+        evaluate(arm, seed, *given)
         stage.say("start")
 
     def summarized(*given: Any) -> Any:
@@ -168,16 +168,20 @@ def ended(group: int) -> int:
 
 
 def attempt(
-    folder: Path, target: tuple[str, str] | None = None, skip: int = 0, delay_s: float = 0.0
+    folder: Path,
+    settings: Sequence[str] = (),
+    target: tuple[str, str] | None = None,
+    skip: int = 0,
+    delay_s: float = 0.0,
 ) -> Attempt:
     """Gives the command; kills it so long after the phase begins that comes after `skip` such ones."""
-    stage = Stage()
+    stage = Stage(list(runs_of(read_experiment(folder, settings))))
 
     def command() -> int:
         for patch in staged(stage):
             patch.start()
         stage.say("start")
-        return cli.main(["compare", str(CONFIG), f"output={folder}", "--report"])
+        return cli.main(["compare", str(CONFIG), f"output={folder}", *settings, "--report"])
 
     group = in_a_fork(command, folder.with_suffix(".log"))
     os.close(stage._tell)
@@ -212,23 +216,31 @@ def attempt(
         if lines:
             now = _place(lines[-1])
     os.close(stage.told)
-    return Attempt(None if killed else status, *now, stage.noted(0), stage.noted(1), seconds)
+    return Attempt(None if killed else status, *now, stage.noted(), seconds)
 
 
 def _place(line: bytes) -> tuple[str, str]:
-    phase, _, arm = line.decode().partition(" ")
-    return phase, arm
+    phase, _, run = line.decode().partition(" ")
+    return phase, run
 
 
-def read_experiment(folder: Path) -> ExperimentConfig:
-    return parse_experiment(read_config(CONFIG, [f"output={folder}"]))
+def read_experiment(folder: Path, settings: Sequence[str] = ()) -> ExperimentConfig:
+    return parse_experiment(read_config(CONFIG, [f"output={folder}", *settings]))
 
 
-def cut_off(folder: Path, arm: str, cuts: tuple[int, ...]) -> Path:
+def _name(arm: ArmConfig, seed: int) -> str:
+    return f"{arm.name}_{seed}"
+
+
+def runs_of(told: ExperimentConfig) -> dict[str, tuple[ArmConfig, int]]:
+    """By name."""
+    return {_name(arm, seed): (arm, seed) for seed in told.seeds for arm in told.arms}
+
+
+def cut_off(folder: Path, arm: ArmConfig, seed: int, cuts: tuple[int, ...]) -> Path:
     """A run that is cut off cleanly after each of these checkpoints, then trained to its end and evaluated."""
     told = read_experiment(folder)
-    config = next(each for each in told.arms if each.name == arm)
-    run = told.run_folder(config, 0)
+    run = told.run_folder(arm, seed)
     save = training.save_checkpoint
 
     def part(cut: int | None) -> int:
@@ -239,8 +251,8 @@ def cut_off(folder: Path, arm: str, cuts: tuple[int, ...]) -> Path:
             return made
 
         with mock.patch.object(training, "save_checkpoint", saved):
-            train_run(config, 0, run, QUIET)
-            evaluate_run(config, 0, run, told.evaluation, told.evaluation_filter, QUIET)
+            train_run(arm, seed, run, QUIET)
+            evaluate_run(arm, seed, run, told.evaluation, told.evaluation_filter, QUIET)
         return 0
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -272,74 +284,78 @@ def left_by(run: Path) -> dict[str, str]:
 def done(told: ExperimentConfig) -> dict[str, str]:
     """What is finished by now, as checksums: nothing of it may go or change."""
     found = {}
-    for arm in told.arms:
-        run = told.run_folder(arm, 0)
+    for name, (arm, seed) in runs_of(told).items():
+        run = told.run_folder(arm, seed)
         of_training = ("finished.json", "episodes.csv", "policy/config.json", "policy/model.npz")
         names = of_training if (run / "finished.json").exists() else ()
         if (run / "evaluation" / "evaluation.json").exists():
             names = (*names, *(f"evaluation/{path.name}" for path in (run / "evaluation").iterdir()))
-        for name in names:
-            found[f"{arm.name}/{name}"] = hashlib.sha256((run / name).read_bytes()).hexdigest()
+        for file in names:
+            found[f"{name}/{file}"] = hashlib.sha256((run / file).read_bytes()).hexdigest()
     return found
 
 
-def resumes_at(told: ExperimentConfig, arm: str) -> int:
+def resumes_at(run: Path) -> int:
     """The step from which a run will go on."""
-    run = told.output / told.name / arm / "seed_0"
     checkpoint = latest_checkpoint(run / "checkpoints", lambda line: None)
     return 0 if checkpoint is None else checkpoint.timesteps
 
 
-def round_of_kills(number: int, folder: Path, typical: dict[tuple[str, str], float]) -> dict[str, Any]:
+def round_of_kills(
+    number: int, folder: Path, typical: dict[tuple[str, str], float], settings: Sequence[str] = ()
+) -> dict[str, Any]:
     """One comparison: some kills, then its end; and what is wrong with it then."""
     rng = np.random.default_rng([20261123, number])
-    told = read_experiment(folder)
+    told = read_experiment(folder, settings)
+    runs = runs_of(told)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    cuts: dict[str, list[int]] = {arm.name: [] for arm in told.arms}
+    cuts: dict[str, list[int]] = {run: [] for run in runs}
     kills, wrong = [], []
     # In the order in which they come, so that none is behind the end of the one before.
     places = list(typical)
     for at in sorted(rng.integers(0, len(places), KILLS_A_ROUND)):
         skip = int(rng.integers(0, 2)) if places[at][0] in ("training", "checkpoint") else 0
         before = done(told)
-        made = attempt(folder, places[at], skip, float(rng.uniform(0, typical[places[at]])))
+        made = attempt(folder, settings, places[at], skip, float(rng.uniform(0, typical[places[at]])))
         if made.status is not None:
             if made.status:
                 wrong.append(f"the command ended with {made.status}, see {folder.with_suffix('.log')}")
             break
         lost = 0
-        if made.phase in ("training", "checkpoint", "policy"):
-            step = resumes_at(told, made.arm)
-            lost = max(0, made.steps - step)
-            if step < made.saved:
-                wrong.append(f"{made.arm} had a checkpoint of step {made.saved} and goes on from {step}")
-            if step and not (told.output / told.name / made.arm / "seed_0" / "finished.json").exists():
-                cuts[made.arm].append(step)
+        for run, (steps, saved) in made.steps.items():
+            where = told.run_folder(*runs[run])
+            if (where / "finished.json").exists():
+                continue
+            step = resumes_at(where)
+            lost += max(0, steps - step)
+            if step < saved:
+                wrong.append(f"{run} had a checkpoint of step {saved} and goes on from {step}")
+            if step not in (0, *cuts[run][-1:]):
+                cuts[run].append(step)
         after = done(told)
         gone = [name for name, checksum in before.items() if after.get(name) != checksum]
         wrong += [f"{name} is gone or changed after a kill in phase {made.phase}" for name in gone]
-        kills.append({"phase": made.phase, "arm": made.arm, "lost": lost, "results_lost": len(gone)})
+        kills.append({"phase": made.phase, "run": made.run, "lost": lost, "results_lost": len(gone)})
     before = done(told)
-    status = attempt(folder).status
+    status = attempt(folder, settings).status
     if status:
         wrong.append(f"the command ended with {status}, see {folder.with_suffix('.log')}")
         return {"round": number, "kills": kills, "wrong": wrong}
     after = done(told)
     wrong += [f"{name} was made again" for name, checksum in before.items() if after.get(name) != checksum]
-    for arm in told.arms:
+    for run, (arm, seed) in runs.items():
         # After its last checkpoint a run makes no step any more.
-        points = tuple(step for step in cuts[arm.name] if step < arm.total_steps)
-        name = "_".join(("cut", arm.name, *map(str, points)))
-        reference = folder.parent / name
+        points = tuple(step for step in cuts[run] if step < arm.total_steps)
+        reference = folder.parent / "_".join(("cut", run, *map(str, points)))
         if not (reference / "left.json").exists():
-            left = left_by(cut_off(reference, arm.name, points))
+            left = left_by(cut_off(reference, arm, seed, points))
             (reference / "left.json").write_text(json.dumps(left))
         expected = json.loads((reference / "left.json").read_text())
-        found = left_by(told.run_folder(arm, 0))
+        found = left_by(told.run_folder(arm, seed))
         differ = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
         if differ:
-            wrong.append(f"{arm.name}, cut at {points}: other than a clean cut: {', '.join(differ)}")
+            wrong.append(f"{run}, cut at {points}: other than a clean cut: {', '.join(differ)}")
     litter = [str(path.relative_to(folder)) for path in folder.rglob(".*") if path.name != ".lock"]
     wrong += [f"left behind: {name}" for name in litter]
     if not wrong:
@@ -347,19 +363,19 @@ def round_of_kills(number: int, folder: Path, typical: dict[tuple[str, str], flo
     return {"round": number, "kills": kills, "wrong": wrong, "cuts": cuts}
 
 
-def warm_up(folder: Path) -> dict[tuple[str, str], float]:
+def warm_up(folder: Path, settings: Sequence[str]) -> dict[tuple[str, str], float]:
     """Imports and compiles all that is needed, in this process; then how long each phase takes, s."""
     torch.set_num_threads(1)
     shutil.rmtree(folder, ignore_errors=True)
-    for arm in (told := read_experiment(folder)).arms:
-        train_run(arm, 0, told.run_folder(arm, 0), QUIET)
-        evaluate_run(arm, 0, told.run_folder(arm, 0), told.evaluation, told.evaluation_filter, QUIET)
+    for arm, seed in runs_of(told := read_experiment(folder, settings)).values():
+        train_run(arm, seed, told.run_folder(arm, seed), QUIET)
+        evaluate_run(arm, seed, told.run_folder(arm, seed), told.evaluation, told.evaluation_filter, QUIET)
     experiment.summarize_experiment(told)
     from safe_wrappers.train.report import write_report
 
     write_report(told, experiment.summarize_experiment(told))
     shutil.rmtree(folder)
-    made = attempt(folder)
+    made = attempt(folder, settings)
     if made.status:
         raise RuntimeError(f"see {folder.with_suffix('.log')}")
     shutil.rmtree(folder)
@@ -399,22 +415,23 @@ def summary(rounds: list[dict[str, Any]], command: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kills", type=int, default=120)
-    parser.add_argument("--folder", type=Path, default=Path("runs/kills"))
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--seeds", type=int, default=1, help="of each arm (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=1, help="runs side by side (default: %(default)s)")
+    parser.add_argument("--name", default="kills", help="of the results and of the folder in runs/")
     options = parser.parse_args()
     ctypes.CDLL(None).prctl(_SUBREAPER, 1, 0, 0, 0)  # orphans of a killed command are waited for here
-    path = options.results / "kills.json"
+    folder, path = Path("runs") / options.name, RESULTS / f"{options.name}.json"
+    settings = f"seeds={list(range(options.seeds))}", f"workers={options.workers}"
     rounds: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
-    options.folder.mkdir(parents=True, exist_ok=True)
-    typical = warm_up(options.folder / "undisturbed")
+    folder.mkdir(parents=True, exist_ok=True)
+    typical = warm_up(folder / "undisturbed", settings)
     while sum(len(each["kills"]) for each in rounds) < options.kills:
         number = len(rounds)
-        rounds.append(round_of_kills(number, options.folder / f"round_{number}", typical))
+        rounds.append(round_of_kills(number, folder / f"round_{number}", typical, settings))
         path.write_text("[\n" + ",\n".join(map(json.dumps, rounds)) + "\n]\n")
         print(rounds[-1], flush=True)
-    (options.results / "kills.md").write_text(
-        summary(rounds, f"python -m benchmarks.kills --kills {options.kills}")
-    )
+    given = " ".join(f"--{option} {value}" for option, value in vars(options).items())
+    path.with_suffix(".md").write_text(summary(rounds, f"python -m benchmarks.kills {given}"))
 
 
 if __name__ == "__main__":

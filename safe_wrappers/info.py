@@ -199,6 +199,8 @@ HANDOVER_STRETCHED: Final = _key("handover/stretched", "int64")
 HANDOVER_REFUSED: Final = _key("handover/refused", "bool")
 """A chunk was refused: not finite, not newer than the one in force, too late, out of reach, or without a blend that
 keeps `limits`."""
+HANDOVER_CLIPPED: Final = _key("handover/clipped", "float64", unit="action")
+"""The largest L2 norm of clipped minus proposed, of the chunk's entries; numbers that are not finite count as 0."""
 HANDOVER_LATENCY: Final = _key("handover/latency", "int64")
 """Control steps from the observation to the takeover of the last chunk that took over in this step; -1 without."""
 HANDOVER_STEPS: Final = _key("handover/steps", "int64")
@@ -212,6 +214,9 @@ LEASE_EXPIRED: Final = _key("lease/expired", "bool", chunk="any", log="lease_exp
 LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
 """A command was refused: no lease was granted, or it was not finite, older than the one in force or from the future,
 or a chunk's end was out of reach."""
+LEASE_CLIPPED: Final = _key("lease/clipped", "float64", unit="action", chunk="max")
+"""L2 norm by which the action left the action space; numbers that are not finite count as 0. Missing where a
+CBFActionFilter inside boxes it (`cbf/clipped`)."""
 LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_braking")
 """The fallback acted at this control step."""
 
@@ -234,6 +239,8 @@ TELEOP_CREATED_J: Final = _key("teleop/created_j", "float64", unit="J")
 """The largest excess of energy out and in flight over energy in, so far; 0 is passive."""
 TELEOP_LOST: Final = _key("teleop/lost", "int64", chunk="sum")
 """Packets of this step that got lost, both ways; actions that are not finite, or from the future, count as lost."""
+TELEOP_CLIPPED: Final = _key("teleop/clipped", "float64", unit="action", chunk="max")
+"""As `lease/clipped`, of the action that the operator sends in this step."""
 TELEOP_LATE: Final = _key("teleop/late", "int64", chunk="sum")
 """Commands that arrived in this step behind or together with a newer one."""
 

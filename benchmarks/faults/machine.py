@@ -130,7 +130,7 @@ def _silent(row: Row) -> Cell:
 
 
 def _less_is_known(info: dict[str, Any], usual: dict[str, Any]) -> str:
-    """What info says of a silence: nothing in sight, a lease that runs down, an old image, no new chunk."""
+    """What info says of a silence: nothing in sight, a lease that runs down, an old image, no chunk, no command."""
     if "occlusion/visible" in info and not np.any(info["occlusion/visible"]):
         return "occlusion/visible is False, occlusion/sigma grows"
     if "occlusion/sigma" in info and np.any(info["occlusion/sigma"] > usual["occlusion/sigma"]):
@@ -138,7 +138,7 @@ def _less_is_known(info: dict[str, Any], usual: dict[str, Any]) -> str:
     for key, sign in (("lease/remaining_s", -1), ("teleop/round_trip_s", 1), ("handover/latency", -1)):
         if key in info and sign * (info[key] - usual[key]) > 0.0:
             return key
-    return ""
+    return "fault/active" if info.get("fault/active", False) else ""
 
 
 def _published(row: Row) -> list[str]:

@@ -58,8 +58,9 @@ class Found(NamedTuple):
 OF_OURS = (SafeWrappersError, gym.error.ResetNeeded)
 _FLAGS = (
     "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/clipped", "cbf/intervened",
-    "handover/refused", "handover/starved", "handover/limited", "lease/refused", "lease/braking", "lease/expired",
-    "teleop/revoked", "teleop/lost", "contact/partial", "balance/partial", "occlusion/expired",
+    "handover/refused", "handover/starved", "handover/limited", "handover/clipped", "lease/refused", "lease/braking",
+    "lease/expired", "lease/clipped", "teleop/revoked", "teleop/lost", "teleop/clipped", "contact/partial",
+    "balance/partial", "occlusion/expired", "fault/active",
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The rows of the fault matrix: every wrapper and every constraint, over an env that sees what reaches it."""
+"""The rows of the fault matrix: wrappers, fault injectors and constraints, over an env that sees what reaches it."""
 
 import threading
 import warnings
@@ -10,14 +10,14 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.faults import constraint_examples, wrapper_examples
+from benchmarks.faults import constraint_examples, injector_examples, wrapper_examples
 from benchmarks.faults.episodes import actions, plain, trace
 from safe_wrappers.plants.env_checks import wrappers_of
 
 LONG, BEFORE = 24, 6
 """Steps of an episode, and those before the fault."""
 VECTOR = "VectorCBFActionFilter"
-PASSING = (*wrapper_examples.ONLY_LOOKING, "LeaseExpiry", "TeleopChannel")
+PASSING = (*wrapper_examples.ONLY_LOOKING, *injector_examples.EXAMPLES, "LeaseExpiry", "TeleopChannel")
 """Wrappers that judge no action: it is for a filter inside to keep the action space."""
 
 
@@ -86,7 +86,7 @@ class Row:
 
     Attributes:
         name: As it is exported.
-        case: Of a wrapper's examples; "" of a constraint.
+        case: Of a wrapper's or an injector's examples; "" of a constraint.
         build: Makes it; takes what is put around the task, and more arguments of the wrapper.
         passes: It judges no action, and passes finite ones as they are.
     """
@@ -99,7 +99,7 @@ class Row:
     @property
     def kind(self) -> str:
         """Wrapper or constraint."""
-        return "wrapper" if self.name in sw.__all__ else "constraint"
+        return "constraint" if self.name in constraint_examples.EXAMPLES else "wrapper"
 
     def open(self, **more: Any) -> "Session":
         """A new one, before its first episode."""
@@ -221,11 +221,18 @@ def _wrapper(name: str, case: str) -> Callable[..., Any]:
     )
 
 
+def _injector(name: str, case: str) -> Callable[..., Any]:
+    return lambda around, **more: injector_examples.build(name, case, around, **more)
+
+
 def rows(only: str = "") -> Iterator[Row]:
     """All rows, wrappers first; of one name alone."""
     for name, case in wrapper_examples.CASES:
         if only in ("", name):
             yield Row(name, case, _wrapper(name, case), name in PASSING)
+    for name, case in injector_examples.CASES:
+        if only in ("", name):
+            yield Row(name, case, _injector(name, case), name in PASSING)
     if only in ("", VECTOR):
         yield Row(VECTOR, "two envs", _vector)
     for name in constraint_examples.EXAMPLES:

@@ -24,7 +24,7 @@ from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
-from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
+from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, outside, receiver_inside
 from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs
 
@@ -41,8 +41,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     **What it guarantees.** With `rate_limit`, the commands that it sends in neighbouring control steps of an episode
     differ by at most `rate_limit` times the control interval in every component, whatever the chunks; commands that
     are held back for it are counted (`handover/limited`). A chunk with an entry that is not finite is refused as a
-    whole. Entries outside the action box are clipped to it. **What it does not.** A filter inside may have to break
-    the limit. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
+    whole. Entries outside the action box are clipped to it (`handover/clipped`). **What it does not.** A filter
+    inside may have to break the limit. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter`
+    belong inside.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -69,7 +70,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
     ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/stretched``, ``handover/refused``,
-    ``handover/latency``, ``handover/steps``. The inner layers' info is merged over the control steps.
+    ``handover/clipped``, ``handover/latency``, ``handover/steps``. The inner layers' info is merged over the control
+    steps.
 
     Raises:
         ConfigurationError: Sizes that do not fit together, a time or limit that is not positive, nothing to blend
@@ -162,12 +164,14 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback.reset()
         self._queue.reset()
         self._start()
-        info.update(self._measured([], False, -1))
+        info.update(self._measured([], False, -1, 0.0))
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Execute the next `execution_horizon` control steps, with this chunk from when it is there."""
-        refused = not self._submit(self._checked(action))
+        chunk = self._checked(action)
+        clipped = self._clipped(chunk)
+        refused = not self._submit(chunk)
         total, infos, commands, latency = 0.0, [], [], -1
         terminated = truncated = False
         for _ in range(self.execution_horizon):
@@ -191,7 +195,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
                 break
         self._observed_s = self.now_s
         info = macro_info(infos)
-        info.update(self._measured(commands, refused, latency))
+        info.update(self._measured(commands, refused, latency, clipped))
         return observation, total, terminated, truncated, info
 
     @property
@@ -245,11 +249,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             return True
         if not np.isfinite(chunk).all():
             return False
-        space: Any = self.action_space
-        if ((chunk < space.low) | (chunk > space.high)).any():
-            self._warn_once(
-                "clipped", "the policy's action left the action space; entries of the chunk are clipped to it"
-            )
         observed_s = self._observed_s
         if self.now_s < observed_s <= self.now_s + self._clock_error_s + SAME_STEP * self.control_dt:
             observed_s = self.now_s
@@ -270,7 +269,18 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             self._seam_until = now + command.blend_steps + DIFFERENCES - 1  # it ends a blend under way
         return now <= self._seam_until
 
-    def _measured(self, commands: list[Command], refused: bool, latency: int) -> dict[str, Any]:
+    def _clipped(self, chunk: Array) -> float:
+        """By how much a chunk left the action space; the first one that does is warned of."""
+        space: Any = self.action_space
+        clipped = outside(chunk, space.low, space.high)
+        if clipped > 0.0:
+            message = f"the policy's action left the action space by {clipped:.3g} (handover/clipped)"
+            self._warn_once("clipped", f"{message}; entries of the chunk are clipped to it")
+        return clipped
+
+    def _measured(
+        self, commands: list[Command], refused: bool, latency: int, clipped: float
+    ) -> dict[str, Any]:
         counted = np.array(self._in_seam, dtype=bool)
         jump, peak = np.zeros(DIFFERENCES), 0.0
         for order in range(1, DIFFERENCES + 1):
@@ -294,6 +304,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             keys.HANDOVER_STRETCHED: sum(c.stretched for c in commands),
             keys.HANDOVER_STEPS: len(commands),
             keys.HANDOVER_REFUSED: refused,
+            keys.HANDOVER_CLIPPED: clipped,
             keys.HANDOVER_LATENCY: latency,
         }
 

@@ -66,7 +66,8 @@ class TeleopChannel(CommandGate):
 
     Info, at every step: ``teleop/round_trip_s``, ``teleop/ceiling_s``, ``teleop/clearance_m``,
     ``teleop/energy_in_j``, ``teleop/energy_out_j``, ``teleop/in_flight_j``, ``teleop/created_j`` (float),
-    ``teleop/revoked`` (bool), ``teleop/lost``, ``teleop/late`` (int), and ``executed_action``.
+    ``teleop/revoked`` (bool), ``teleop/lost``, ``teleop/late`` (int), and ``executed_action``; without a filter
+    inside ``teleop/clipped`` (float).
 
     Raises:
         ConfigurationError: A link, a port, an impedance or a ceiling that cannot be, or a wrong order.
@@ -82,6 +83,7 @@ class TeleopChannel(CommandGate):
     """
 
     layer: ClassVar = Layer.CHANNEL
+    clipped_key: ClassVar = keys.TELEOP_CLIPPED
 
     def __init__(
         self,
@@ -191,6 +193,7 @@ class TeleopChannel(CommandGate):
     def _sendable(self, action: Any) -> NDArray[Any] | None:
         """A copy of the action; None, which counts as lost, where it is not finite."""
         given = action_array(action, self._shape)
+        self._measure(given, "operator's")
         if self._is_finite(given, "operator's", "it is not sent"):
             return given
         self._lost += 1

@@ -23,6 +23,8 @@ from safe_wrappers.wrappers.common.episode_guard import EpisodeGuard
 from safe_wrappers.wrappers.common.receiver import action_array
 
 Mask = NDArray[np.bool_]
+Rows = NDArray[Any] | list[NDArray[Any]]
+"""The envs' actions; a list where they have different dtypes."""
 
 
 if TYPE_CHECKING:
@@ -119,7 +121,8 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         started = time.perf_counter()
         given = action_array(actions, (self.num_envs, *self._low.shape))
         judged = ~self._ended if self._next_step else np.ones(self.num_envs, dtype=bool)
-        sent = given.astype(np.result_type(given, self._dtype))
+        # What is written is in the space's dtype, in which an env may compute; the rest stays in that of the policy.
+        sent = given.copy() if given.dtype == self._dtype else list(given)
         reports = self._judge(given, sent, judged)
         each = (time.perf_counter() - started) / max(1, int(judged.sum()))
         for single, was_judged in zip(self.filters, judged.tolist(), strict=True):
@@ -138,7 +141,7 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         self._start(infos, restarted)
         return observations, rewards, terminated, truncated, infos
 
-    def _step(self, sent: NDArray[Any], judged: Mask) -> Any:
+    def _step(self, sent: Rows, judged: Mask) -> Any:
         """Step the envs; what was simulated for the decisions is not simulated again."""
         decided = () if self.constraint_batch is not None else np.flatnonzero(judged).tolist()
         plants = [self.filters[i].plant for i in decided]
@@ -164,7 +167,7 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
             own = {key: value[i] for key, value in numbers.items() if infos[f"_{key}"][i]}
             self.filters[i].plant.received(copy.deepcopy(each[i]), own)
 
-    def _judge(self, given: NDArray[Any], sent: NDArray[Any], judged: Mask) -> dict[str, NDArray[Any]]:
+    def _judge(self, given: NDArray[Any], sent: Rows, judged: Mask) -> dict[str, NDArray[Any]]:
         """Write what to send where it is not what was given; the info keys of all envs, shape (n, ...)."""
         n = self.num_envs
         reports: dict[str, NDArray[Any]] = {key: np.zeros(n, dtype=bool) for key in keys.CBF_BOOLS}
@@ -192,7 +195,7 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         self,
         batch: ConstraintBatch,
         given: NDArray[Any],
-        sent: NDArray[Any],
+        sent: Rows,
         judged: Mask,
         reports: dict[str, NDArray[Any]],
     ) -> Mask:
@@ -211,7 +214,11 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         changed = usual & (stages != Stage.PROPOSAL)
         cast = np.clip(controls, self._low, self._high).astype(self._dtype)
         written = usual & (changed | ~inside)
-        sent[written] = cast[written]
+        if isinstance(sent, list):
+            for i in np.flatnonzero(written).tolist():
+                sent[i] = cast[i]
+        else:
+            sent[written] = cast[written]
         executed = np.where(written[:, None], cast.astype(np.float64), proposed)
         found = {
             keys.CBF_INTERVENED: changed & (executed != boxed).any(axis=1),

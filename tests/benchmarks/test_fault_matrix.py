@@ -13,6 +13,7 @@ from benchmarks.faults.constraint_examples import EXAMPLES, NO_CONSTRAINT
 from benchmarks.faults.lifecycle import lifecycle
 from benchmarks.faults.outcomes import DEFECTS, Outcome
 from benchmarks.faults.stacks import Row, rows
+from safe_wrappers.wrappers.faults import FAULTS
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -30,7 +31,7 @@ QUICK = {
 
 
 def test_every_export_has_a_row_and_nothing_else_has():
-    assert {row.name for row in rows() if row.kind == "wrapper"} == WRAPPERS
+    assert {row.name for row in rows() if row.kind == "wrapper"} == WRAPPERS | set(FAULTS)
     constraints = {row.name for row in rows() if row.kind == "constraint"}
     assert constraints | set(NO_CONSTRAINT) == set(sw.constraints.__all__)
     assert constraints == set(EXAMPLES) and not constraints & set(NO_CONSTRAINT)
@@ -177,19 +178,41 @@ def test_a_budget_reads_nothing_of_a_state_that_is_broken_elsewhere():
     assert env.step(np.zeros(2, np.float32))[4]["lease/refused"]
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda env: sw.ChunkHandover(env, 1, 1, blend="replace", fallback="zero"),
-        lambda env: sw.TeleopChannel(env, 0.0, 0.0),
-    ],
-)
-def test_who_decides_nothing_warns_once_of_an_action_outside_the_space(make, recwarn):
+def leased(env):
+    limit = sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"])
+    return sw.LeaseExpiry(env, sw.StoppingBudget(limit, closing_speed=1.0))
+
+
+DECIDE_NOTHING = {
+    "handover/clipped": lambda env: sw.ChunkHandover(env, 1, 1, blend="replace", fallback="zero"),
+    "lease/clipped": leased,
+    "teleop/clipped": lambda env: sw.TeleopChannel(env, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize(("key", "make"), DECIDE_NOTHING.items())
+def test_who_decides_nothing_counts_actions_outside_the_space_and_warns_once(key, make, recwarn):
     env = make(gym.make("Reacher-v5"))
+    assert env.reset(seed=0)[1][key] == 0.0
+    told = {}
+    odd = (np.nan, 1.25), (np.nan, -np.inf), (-1.0, 1.0), (3e300, -4e300)
+    for action in ((0.5, 1.0), (0.5, 1.5), (-2.0, 3.0), *odd):
+        told[action] = env.step(np.array(action))[4][key]
+        warned = [w for w in recwarn if "left the action space by 0.5" in str(w.message)]
+        assert len(warned) == (len(told) > 1)
+    assert list(told.values()) == pytest.approx([0.0, 0.5, 5.0**0.5, 0.25, 0.0, 0.0, 5e300], abs=0)
+    assert not [w for w in recwarn if w.category is RuntimeWarning and "/safe_wrappers/" in w.filename]
+    assert warned[0].filename == __file__
+
+
+def test_of_a_chunk_the_worst_entry_counts_and_a_filter_inside_counts_itself():
+    env = sw.ChunkHandover(gym.make("Reacher-v5"), 3, 2, rate_limit=1e3, fallback="zero")
     env.reset(seed=0)
-    env.step(np.array([0.5, 1.0]))
-    assert not [w for w in recwarn if "left the action space" in str(w.message)]
-    env.step(np.array([0.5, 1.5]))
-    env.step(np.array([0.5, 1.5]))
-    (warned,) = [w for w in recwarn if "left the action space" in str(w.message)]
-    assert warned.filename == __file__
+    for last, expected in ((4.0, 3.0), (-1.0, 1.0)):
+        found = env.step(np.array([[0.0, 0.0], [0.0, -2.0], [last, 0.5]]))[4]
+        assert found["handover/clipped"] == expected
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
+    for env in (leased(filtered), sw.TeleopChannel(filtered, 0.0, 0.0)):
+        env.reset(seed=0)
+        info = env.step(np.array([0.0, 3.0]))[4]
+        assert info["cbf/clipped"] == 2.0 and not {"lease/clipped", "teleop/clipped"} & info.keys()

@@ -228,6 +228,7 @@ def folder(tmp_path, monkeypatch):
 @example(b"", [])
 @example(b"\xff\xfe", [])
 @example("name: x\n".encode("utf-16"), [])
+@example(yaml.dump(MINIMAL | {"env": {"id": "linear_0"}}).encode(), [])
 @example(CONFIGS["demo"].encode(), ["seeds=" + "[" * 2000])
 def test_a_config_is_an_experiment_or_a_line_for_people(folder, capsys, content, overrides):
     path = folder / "config.yaml"
@@ -236,6 +237,7 @@ def test_a_config_is_an_experiment_or_a_line_for_people(folder, capsys, content,
         experiment = parse_experiment(read_config(path, overrides))
     except SafeWrappersError as refusal:
         assert str(refusal).strip()
+        capsys.readouterr()  # gymnasium-robotics prints news when it is first imported
         assert main(["train", str(path), *overrides]) == 1
         told = capsys.readouterr()
         assert told.err == f"error: {refusal}\n" and not told.out
@@ -257,6 +259,15 @@ def test_aliases_share_nothing(folder):
     path = folder / "config.yaml"
     path.write_text("a: &a {b: 1}\nc: *a\n")
     assert read_config(path, ["a.b=2"]) == {"a": {"b": 2}, "c": {"b": 1}}
+
+
+@pytest.mark.parametrize("key", ["null", "1", "2.5", "on", "? [a]\n    ", "? {a: 1}\n    "])
+def test_a_key_that_is_no_text_is_refused_wherever_it_is(folder, key):
+    """JSON, which runs keep their settings in, has no others."""
+    path = folder / "config.yaml"
+    path.write_text(f"name: x\nenv:\n  kwargs:\n  - {key}: 3\n")
+    with pytest.raises(SafeWrappersError, match=r"a key is a text; .* is none \(put it in quotes\)"):
+        read_config(path)
 
 
 @pytest.mark.parametrize("line", LINES)

@@ -170,6 +170,19 @@ def test_long_episodes_among_the_hazards_with_detours_and_other_precisions(seed)
     assert play(alike, together, actions.astype(np.float32 if seed else np.float64), seed) > 30
 
 
+@pytest.mark.parametrize(
+    "form", [np.ndarray.tolist, np.float64, np.float16], ids=["list", "float64", "float16"]
+)
+@pytest.mark.parametrize("env_id", ["SafePointGoal1-v0", "Reacher-v5"])
+def test_what_is_written_has_the_dtype_of_the_space_in_which_an_env_may_compute(env_id, form):
+    changes, inner = TABLE[env_id]
+    make = functools.partial(made, env_id, inner or (lambda env: env))
+    alike, together = pair(make, recommended(env_id, **changes))
+    assert (
+        play(alike, together, map(form, script(alike, 40))) > 3
+    )  # the reward of Reacher has the action's dtype
+
+
 @pytest.mark.parametrize("options", [{"plant": lambda: sw.MujocoPlant(delay_s=0.02)}, {"margin": 0.05}])
 def test_a_delay_is_decided_one_by_one_and_a_margin_together(options):
     make = functools.partial(made, "SafePointGoal1-v0", AtHazard)

@@ -30,6 +30,7 @@ TYPES = {
     "handover/limited": "int",
     "handover/stretched": "int",
     "handover/refused": "bool",
+    "handover/clipped": "float",
     "handover/latency": "int",
     "handover/steps": "int",
 }

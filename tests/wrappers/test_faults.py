@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
+from benchmarks.faults.wrapper_examples import build
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.common.receiver import CommandReceiver
 from safe_wrappers.wrappers.faults import (
@@ -303,6 +304,35 @@ def test_a_held_command_is_not_the_policys_buffer():
     env.random.draw.random = lambda: 0.0
     env.step(buffer)
     assert cart.given[0].tolist() == [0.25, 0.0]
+
+
+@every_fault
+@pytest.mark.parametrize(
+    "bad", [[np.nan, 0.0], [np.inf, 0.0], [0.0] * 3, [[0.0, 0.0]], 0.1, ["a", "b"], None]
+)
+@pytest.mark.parametrize("around", [lambda env: env, sw.RecordInterventions], ids=["bare", "recorded"])
+def test_what_is_no_action_is_refused_when_it_is_given_and_leaves_no_trace(kind, bad, around):
+    ears = Ear(BrakedCart()), Ear(BrakedCart())
+    env, twin = (faulty(kind, faulty("Jitter", around(ear))) for ear in ears)
+    env.reset(seed=0), twin.reset(seed=0)
+    for t in range(40):
+        if t % 3 == 0:
+            with pytest.raises(sw.SafeWrappersError, match="expected an action of"):
+                env.step(bad)
+        env.step(numbered(t)), twin.step(numbered(t))
+    assert ears[0].heard == ears[1].heard and len(ears[0].heard) == 40
+
+
+@every_fault
+def test_what_a_layer_inside_answers_is_carried_to_it(kind):
+    env = faulty(kind, build("LeaseExpiry", "a Clearance"))
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="the policy's action is not finite"):
+        for t in range(40):
+            env.step(np.full(1, np.nan if t % 2 else 0.0))
+    single = faulty(kind, sw.ChunkHandover(BrakedCart(), 1, 1, rate_limit=1e3, fallback="zero"))
+    single.reset(seed=0)
+    assert not single.step(np.zeros(2))[4]["handover/limited"]  # without the chunk's axis, too
 
 
 def test_info_is_there_at_resets_and_steps():

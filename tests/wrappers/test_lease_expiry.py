@@ -457,7 +457,8 @@ def test_what_is_finite_stays_finite_in_a_blend(huge):
 
 
 def test_keys_and_types_are_the_same_at_resets_and_steps():
-    kinds = {"lease/remaining_s": float, "lease/expired": bool, "lease/refused": bool, "lease/braking": bool}
+    kinds = {"lease/remaining_s": float, "lease/clipped": float}
+    kinds |= dict.fromkeys(("lease/expired", "lease/refused", "lease/braking"), bool)
     cart = BrakedCart(wall=3.0)
     env = leased(cart)
     infos = [env.reset()[1]]

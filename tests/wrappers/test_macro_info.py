@@ -27,6 +27,8 @@ INFOS = [
         keys.CBF_CLIPPED: correction / 2,
         keys.CBF_MARGIN: margin,
         keys.LEASE_REMAINING_S: 0.1 * i,
+        keys.LEASE_CLIPPED: correction / 4,
+        keys.TELEOP_CLIPPED: correction / 8,
         keys.EXECUTED_ACTION: np.array([i], np.float32),
         keys.ADAPTION_PENALTY: 0.5 * i,
         keys.ADAPTION_TASK_REWARD: 1.0 * i,
@@ -62,6 +64,7 @@ def test_sums_flags_extremes_and_the_last():
     assert found[keys.SLIP_RATIO].tolist() == [0.2, 0.0]
     assert found[keys.SPIN_OUT] == 1.0 and type(found[keys.SPIN_OUT]) is float
     assert found[keys.CBF_CORRECTION] == 0.7 and found[keys.CBF_CLIPPED] == 0.35
+    assert found[keys.LEASE_CLIPPED] == 0.175 and found[keys.TELEOP_CLIPPED] == 0.0875
     assert found[keys.CBF_MARGIN] == -0.1
     assert found[keys.ADAPTION_PENALTY] == 1.5 and found[keys.ADAPTION_TASK_REWARD] == 3.0
     assert found[keys.COLLISIONS] == 3

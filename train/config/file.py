@@ -40,8 +40,8 @@ class _Loader(yaml.SafeLoader):
         seen: set[object] = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, Hashable):
-                raise _unreadable(key_node, "a key is a text; this one is a list or a mapping")
+            if not isinstance(key, str):
+                raise _unreadable(key_node, f"a key is a text; {key!r} is none (put it in quotes)")
             if key in seen:
                 raise ConfigurationError(f"{key!r} is given twice (line {key_node.start_mark.line + 1}).")
             seen.add(key)

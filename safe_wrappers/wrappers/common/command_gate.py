@@ -1,6 +1,6 @@
 """CommandGate: base of the wrappers that decide whether a command or the fallback is executed."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,14 @@ from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step
-from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver
+from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, outside
 
 
 class CommandGate(LayerWrapper, CommandReceiver):
     """Base of `LeaseExpiry` and `TeleopChannel`; the env has a one-dimensional Box action space."""
 
+    clipped_key: ClassVar[str]
+    """Of the info: by how much an action left the space."""
     _fallback: FallbackController | None
 
     def __init__(self, env: Env, control_dt: float | None) -> None:
@@ -33,6 +35,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
         self._observed_s = 0.0
         if not self._filtered:
             info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
+            info[self.clipped_key] = 0.0
 
     def _boxed(self, control: Any) -> Array:
         """Clipped to the action box, shape (m,)."""
@@ -43,15 +46,20 @@ class CommandGate(LayerWrapper, CommandReceiver):
         return self._boxed(np.zeros(self._shape)).astype(self._dtype)
 
     def _is_finite(self, action: NDArray[Any], whose: str, consequence: str) -> bool:
-        """Whether an action is finite; the first one that is not, or is outside the space, is warned of."""
-        numbers = action.astype(np.float64)
-        finite = bool(np.isfinite(numbers).all())
+        """Whether an action is finite; the first one that is not is warned of."""
+        finite = bool(np.isfinite(action).all())
         if not finite:
-            self._warn_once("nonfinite", f"the {whose} action is not finite ({numbers}); {consequence}")
-        elif not self._filtered and ((numbers < self._low) | (numbers > self._high)).any():
-            message = f"the {whose} action left the action space; no CBFActionFilter inside boxes it"
-            self._warn_once("outside", message)
+            self._warn_once("nonfinite", f"the {whose} action is not finite ({action}); {consequence}")
         return finite
+
+    def _measure(self, action: NDArray[Any], whose: str) -> None:
+        """By how much the action of this step is outside the space; the first one that is is warned of."""
+        if self._filtered:
+            return
+        self._clipped = outside(action.astype(np.float64), self._low, self._high)
+        if self._clipped > 0.0:
+            message = f"the {whose} action left the action space by {self._clipped:.3g} ({self.clipped_key})"
+            self._warn_once("outside", f"{message}; no CBFActionFilter inside boxes it")
 
     def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:
         """Step the env; returns what was executed, which a filter inside may have changed, and the env's answer."""
@@ -63,6 +71,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
             executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)
         else:
             info[keys.EXECUTED_ACTION] = executed.copy()
+            info[self.clipped_key] = self._clipped
         if self._fallback is not None:
             self._fallback.executed(executed)
         self._steps_done += 1

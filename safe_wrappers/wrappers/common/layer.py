@@ -45,13 +45,16 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
 
     def _pass_on(self, action: Any) -> Step:
         """Step the env with an action that this wrapper only passes on, to the env itself if it is finite."""
+        self._refuse_what_is_not_finite(action)
+        return self.env.step(action)
+
+    def _refuse_what_is_not_finite(self, action: Any) -> None:
         if self._passes_numbers:
             given = numbers_of(action)
             if given is None or not np.isfinite(given).all():
                 raise ActionError(
                     f"expected an action of finite numbers, got {action!r}; the env was not stepped"
                 )
-        return self.env.step(action)
 
     def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
         """Warn, unless `warned` has it, at the line that called the outermost of this library's wrappers."""

@@ -69,6 +69,14 @@ def receiver_inside(env: Env) -> CommandReceiver | None:
     return next((inner for inner in wrappers_of(env) if isinstance(inner, CommandReceiver)), None)
 
 
+def outside(action: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> float:
+    """The L2 norm by which an action (m,) left its box, of a chunk (h, m) the largest; NaN and inf count as 0."""
+    if ((action >= low) & (action <= high)).all():
+        return 0.0
+    beyond = np.where(np.isfinite(action), action - np.clip(action, low, high), 0.0)
+    return max(math.hypot(*one) for one in np.atleast_2d(beyond).tolist())  # squares may overflow
+
+
 def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None) -> NDArray[Any]:
     """A copy of an action, in its own dtype unless told; an `ActionError` for another shape or no numbers."""
     given = numbers_of(action)

@@ -2,18 +2,22 @@
 
 import copy
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import numbers_of
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import check_timing, wrappers_of
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
-from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
+from safe_wrappers.wrappers.common.receiver import CommandReceiver, action_array, receiver_inside
+
+_DECIDING: Final = (Layer.FILTER, Layer.LEASE, Layer.CHANNEL, Layer.HANDOVER)
+"""Layers that have an answer to an action that is not finite."""
 
 
 class Carried(NamedTuple):
@@ -35,6 +39,11 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
         env: With a Box action space; it must say how long a step lasts (`dt`) if nothing inside counts the time.
         control_dt: The time that a step lasts, s; None reads the env's.
         arguments: Of the fault itself, for the spec.
+
+    Raises:
+        ConfigurationError: Another action space, or no control interval.
+        ActionError: No numbers, another shape, or, where no layer inside decides, not finite; the env was not
+            stepped, and nothing was carried.
     """
 
     layer: ClassVar = Layer.FAULT
@@ -51,6 +60,9 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
         if self._inside is not None and control_dt is not None:
             inside = type(self._inside).__name__
             raise ConfigurationError(f"{inside} inside counts the time: leave control_dt out")
+        self._passes_numbers = not any(
+            getattr(inner, "layer", None) in _DECIDING for inner in wrappers_of(env)
+        )
         # Nested faults of one kind must not strike together.
         faults = [inner for inner in wrappers_of(env) if isinstance(inner, Fault)]
         same = sum(isinstance(inner, type(self)) for inner in faults)
@@ -69,6 +81,7 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     def step(self, action: Any) -> Step:
         """Carry the action, or not, and step the env with what arrives."""
+        self._refuse_what_is_no_action(action)
         given = None if self._observed_s is None else Carried(copy.copy(action), self._observed_s)
         arrived = self.carry(given, self.now_s)
         active = arrived is not given or arrived is None
@@ -76,7 +89,7 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
             self._last = arrived.action
         if self._inside is not None:
             self._inside.set_observation_time(None if arrived is None else arrived.observed_s)
-        observation, reward, terminated, truncated, info = self._pass_on(copy.copy(self._last))
+        observation, reward, terminated, truncated, info = self.env.step(copy.copy(self._last))
         self._steps_done += 1
         self._observed_s = self.now_s
         info[keys.FAULT_ACTIVE] = bool(active or (self._nested and info[keys.FAULT_ACTIVE]))
@@ -91,6 +104,15 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
         return self._inside is None or self._inside.admits_chunk(commands)
+
+    def _refuse_what_is_no_action(self, action: Any) -> None:
+        """Now, and not when it arrives, at a step whose action is a right one."""
+        self._refuse_what_is_not_finite(action)
+        space: Any = self.action_space
+        given = numbers_of(action)
+        # Of a `ChunkHandover` with chunks of one entry actions (m,) are taken, too.
+        if given is None or given.ndim == 0 or (1, *given.shape) != space.shape:
+            action_array(action, space.shape)
 
     def begin(self) -> None:
         """A new episode; `random` is ready."""
