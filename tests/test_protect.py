@@ -52,6 +52,9 @@ KNOWN = {
 TOUCHING = ("FetchPush", "FetchSlide")
 """Their own resets put the fingers 3 mm into the table."""
 known = pytest.mark.parametrize("env_id", KNOWN)
+newest = pytest.mark.parametrize(
+    "env_id", [env_id for env_id in KNOWN if not env_id.endswith("-v4") or "Fetch" in env_id]
+)
 
 
 def make(env_id, **options):
@@ -88,7 +91,7 @@ def test_known_envs_get_their_recipe_and_run(env_id):
             env.reset()
 
 
-@known
+@newest
 def test_a_protected_env_passes_gymnasiums_checks(env_id):
     env = sw.protect(make(env_id))
     with warnings.catch_warnings():
@@ -102,8 +105,7 @@ def test_a_protected_env_passes_gymnasiums_checks(env_id):
         check_env(env, skip_render_check=True)
 
 
-@known
-@pytest.mark.filterwarnings("ignore:.*is out of date")
+@newest
 def test_protect_is_recorded_in_the_spec_and_in_json(env_id):
     env = sw.protect(make(env_id))
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))

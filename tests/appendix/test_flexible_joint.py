@@ -85,7 +85,7 @@ def simulate(torque, times, k, j, m):
 # The model -----------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_accelerations_are_those_of_the_whole_system(seed):
     k, j, m = machine(seed)
@@ -107,7 +107,7 @@ def test_accelerations_are_those_of_the_whole_system(seed):
     np.testing.assert_allclose(m @ (links - shifted[1]), bias, rtol=1e-9, atol=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_on_the_manifold_motor_and_link_move_as_one_rigid_arm(seed):
     k, j, m = machine(seed)
@@ -127,7 +127,7 @@ def test_on_the_manifold_motor_and_link_move_as_one_rigid_arm(seed):
 # Resonances ----------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_resonances_are_the_free_frequencies_of_both_masses(seed):
     k, j, m = machine(seed)
@@ -275,7 +275,7 @@ def test_ramps_at_the_limit_stay_below_the_energy_and_come_near_it(hold, weights
     assert 0.97 * allowed < worst <= allowed * (1 + 1e-9)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1))
 def test_no_ramp_within_the_limit_exceeds_the_energy(seed):
     k, j, m = machine(seed)

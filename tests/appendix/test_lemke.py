@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog, nnls
 
@@ -49,7 +49,6 @@ def problem(seed, n, rank, whole):
 problems = st.tuples(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 5), st.booleans())
 
 
-@settings(max_examples=300, deadline=None)
 @given(problems)
 def test_semidefinite_problems_are_solved_exactly_where_they_can_be(drawn):
     m, q = problem(*drawn)
@@ -66,7 +65,6 @@ def test_semidefinite_problems_are_solved_exactly_where_they_can_be(drawn):
         assert not enumerated(m, q) and not found.z.any()
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 12))
 def test_definite_problems_have_the_minimum_that_nnls_finds(seed, n):
     rng = np.random.default_rng(seed)
@@ -79,7 +77,6 @@ def test_definite_problems_have_the_minimum_that_nnls_finds(seed, n):
     np.testing.assert_allclose(found.z, least, atol=1e-7 * max(1.0, least.max()))
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32), st.integers(2, 4))
 def test_a_p_matrix_gives_the_only_solution(seed, n):
     # Not symmetric: diagonally dominant, so every principal minor is positive.

@@ -56,8 +56,8 @@ def test_a_row_counts_what_the_shield_did():
 
     bare = drive("no filter", lambda env: env, fling, episodes=1, limit=400)
     assert bare.falls == 1 and bare.changed == bare.infeasible == 0
-    row = drive("shield", lambda env: shielded(env, stop, 0), fling, episodes=1, limit=300)
-    assert row.falls == 1 and row.changed > 0
+    row = drive("shield", lambda env: shielded(env, stop, 0), fling, episodes=1, limit=125)
+    assert row.changed > 0
     assert row.infeasible > 0, "without a controller standing is no rest that lasts, and that is said"
 
 

@@ -4,7 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import judges
@@ -79,7 +79,6 @@ def test_joints_without_a_motor_do_not_count(reacher):
     assert PROTECTED["Reacher-v5"].judge(raw).start() == pytest.approx(-5.0)
 
 
-@settings(deadline=None, max_examples=60)
 @given(st.floats(-3.1, 3.1), st.floats(-2.9, 2.9))
 def test_a_fingertip_in_a_disc(reacher, shoulder, elbow):
     raw = placed(reacher, {"joint0": shoulder, "joint1": elbow})

@@ -1,6 +1,5 @@
 """CoastingClearance: what it admits, suggests, refuses and says."""
 
-import json
 import warnings
 
 import gymnasium as gym
@@ -12,7 +11,6 @@ from asking import Asked
 import safe_wrappers as sw
 from safe_wrappers.constraints.backup.base import Detour
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
-from safe_wrappers.serialize import constraint_from, plain_data
 
 FULL = np.array([1.0, 1.0])
 BACK = -FULL
@@ -216,16 +214,6 @@ def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
     limit.observe(Detour(-1.0, 24))  # not needed in this step
     assert limit.executed(FULL) == Detour(-1.0, 23)
     assert limit.start() == Detour(0.0, 0)
-
-
-def test_plain_data_rebuilds_it():
-    constraint = sw.constraints.CoastingClearance(
-        keep_out=[sw.constraints.Disc([1.0, 2.0], 0.2)],
-        untouched=[sw.constraints.Discs("vase_positions", 0.1)],
-        outline=SQUARE,
-        max_decrease=0.1,
-    )
-    assert constraint_from(json.loads(json.dumps(plain_data(constraint)))) == constraint
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """ContactFeasibility: where a pushed ball would slide, and closed loops judged on the env's own contacts."""
 
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ import safe_wrappers as sw
 from safe_wrappers.constraints.contact.contact_feasibility import _worst
 from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.serialize import constraint_from, plain_data
 
 ROUNDING = 1e-6
 """Executed actions are rounded to float32, and a robot in contact makes more of it."""
@@ -153,12 +150,6 @@ def test_what_it_cannot_watch_is_refused_when_it_is_bound():
     )
     with pytest.raises(UnsupportedEnvError, match="AnalyticPlant"):
         sw.constraints.ContactFeasibility().bind(plant)
-
-
-def test_it_is_plain_data():
-    limit = sw.constraints.ContactFeasibility(0.6, 0.02, ["torso"], 0.01)
-    again = constraint_from(json.loads(json.dumps(plain_data(limit))))
-    assert again == limit and again.promise == "best effort"
 
 
 CASES = [

@@ -1,7 +1,6 @@
 """EscapeClearance against MuJoCo: every way out played on the env's model, the cars on their foretold paths."""
 
 import copy
-import json
 
 import gymnasium as gym
 import mujoco
@@ -11,7 +10,6 @@ from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.serialize import constraint_from, plain_data
 
 HOLD, RADIUS, CAR, PILLAR, MARGIN = 0.04, 0.2, 0.4, 0.35, 0.05
 TRUE_CARS = sw.constraints.TrackedDiscs(CAR, 0.0, attribute="car_tracks")
@@ -338,21 +336,6 @@ def test_from_outside_the_way_back_is_asked_for_and_taken():
         env.step(np.array([0.0, 1.0, 0.0]))
         gaps.append(np.linalg.norm(env.unwrapped.agent_position - [0.0, -2.02]) - PILLAR - RADIUS)
     assert gaps[-1] >= MARGIN - 2e-3 and min(gaps) >= 0.02
-
-
-def test_it_is_plain_data():
-    given = sw.constraints.EscapeClearance(
-        "robot", [TRUE_CARS, PILLARS, sw.constraints.Plane([0, 0], [0, 1])], RADIUS, 0.1, 2.0
-    )
-    again = constraint_from(json.loads(json.dumps(plain_data(given))))
-    assert again == given and again.promise == "best effort"
-    env = sw.protect(gym.make("OccludedCrossing-v0"), cars="true")
-    rebuilt = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    for e in (env, rebuilt):
-        e.reset(seed=1)
-    for _ in range(30):
-        a, b = (e.step(np.array([0.1, 1.0, 0.0])) for e in (env, rebuilt))
-        assert a[0].tobytes() == b[0].tobytes()
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import mujoco
 import numpy as np
 import pytest
 from asking import Asked
-from gymnasium.envs.registration import EnvSpec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judged_loops import Scene
@@ -90,7 +89,7 @@ def full(raw, k):
 # What a contact comes to --------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     speed=st.floats(0.0, 2.0),
     mass=st.floats(0.5, 40.0),
@@ -112,7 +111,6 @@ def test_the_peak_is_that_of_the_differential_equation(speed, mass, stiffness, p
     assert contact.peak == pytest.approx(stiffness * done.y[0].max(), rel=1e-3, abs=1e-3)
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     speed=st.floats(0.0, 2.0),
     mass=st.floats(0.1, 40.0),
@@ -502,25 +500,12 @@ class Reaching(gym.Wrapper):
     """For specs: Reacher whose links can be told from its border."""
 
 
-def test_it_is_rebuilt_from_the_spec_and_from_json():
+def test_the_filters_margin_adds_up_and_a_region_gives_its_limit():
     given = sw.constraints.ImpactSpeedLimit(
-        ["fingertip", "body1"],
-        ["sideE", "sideN"],
-        region="hands and fingers",
-        clamped=True,
-        stiffness=1e4,
-        effective_mass=20.0,
-        braking=3.0,
-        margin=1.0,
-        horizon=4,
+        ["fingertip"], ["sideE"], region="hands and fingers", clamped=True, stiffness=1e4, margin=1.0
     )
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [given])
-    for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
-        again = gym.make(spec).constraints
-        assert again == [given] and type(again[0]) is sw.constraints.ImpactSpeedLimit
     wider = sw.CBFActionFilter(gym.make("Reacher-v5"), [given], margin=2.0)
-    assert wider.constraints[0].margin == 3.0
-    assert given.promise == "best effort" and filtered.filter.bound[0].scale == 140.0
+    assert wider.constraints[0].margin == 3.0 and wider.filter.bound[0].scale == 140.0
 
 
 PLAIN = {"force_limit": 100.0, "stiffness": 1e4}

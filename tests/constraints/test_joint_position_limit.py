@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from asking import Asked
-from gymnasium.envs.registration import EnvSpec
 from judged_loops import DRIVERS, Judge, drive, flagged, sliders
 
 import safe_wrappers as sw
@@ -189,17 +188,6 @@ def test_conflicting_limits_are_infeasible_and_the_action_stays_sound():
         assert info["cbf/infeasible"] and info["cbf/fallback"] and info["cbf/unsafe"]
         assert np.isfinite(info["executed_action"]).all() and (np.abs(info["executed_action"]) <= 1.0).all()
         assert filtered.constraint_names == ["JointPositionLimit 1", "JointPositionLimit 2"]
-
-
-def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limit = sw.constraints.JointPositionLimit(
-        [-1.0, -np.inf], 2, joints=["joint1", "joint0"], margin=0.1, horizon=7, max_decrease=0.5
-    )
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
-    for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
-        again = gym.make(spec).constraints
-        assert again == [limit] and type(again[0]) is sw.constraints.JointPositionLimit
-    assert limit.promise == "best effort"
 
 
 @pytest.mark.parametrize(

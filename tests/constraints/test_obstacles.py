@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
@@ -53,7 +53,6 @@ def truth(obstacle, point):
 
 
 @every_shape
-@settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_distance_is_signed_and_its_gradient_is_the_normal(name, size, data):
     obstacle = SHAPES[name]

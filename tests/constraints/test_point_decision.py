@@ -2,9 +2,6 @@
 
 import hashlib
 import math
-import os
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -14,7 +11,6 @@ from point_worlds import PointWorld
 import safe_wrappers as sw
 from safe_wrappers.control.backup import point_scene
 from safe_wrappers.control.backup.damped_axis import damped_axis
-from safe_wrappers.control.numerics.compiled import IS_COMPILED
 from safe_wrappers.filter.engine import SafetyFilter
 
 WALLS = [(-3.0, 3.0, -3.0, -2.0), (-3.0, 3.0, 2.0, 3.0), (-3.0, -2.0, -2.0, 2.0), (2.0, 3.0, -2.0, 2.0)]
@@ -95,16 +91,6 @@ def random_scenes(count):
     return digest.hexdigest(), [stages.count(stage) for stage in range(8)]
 
 
-def test_plain_python_gives_the_same_bits():
-    assert IS_COMPILED or os.environ.get("SAFE_WRAPPERS_COMPILED") == "0"
-    code = "import test_point_decision as t; print(t.IS_COMPILED, *t.random_scenes(200))"
-    environment = os.environ | {
-        "SAFE_WRAPPERS_COMPILED": "0",
-        "PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *sys.path]),
-    }
-    said = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    digest, stages = random_scenes(200)
-    assert said.stdout.split("\n")[0] == f"False {digest} {stages}"
+def test_the_random_scenes_have_everything_in_them():
+    _, stages = random_scenes(200)
     assert stages[point_scene.PROPOSAL] > 10 and stages[point_scene.CANDIDATE] > 10

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from asking import Asked
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
@@ -55,7 +55,6 @@ def stopping_distance(v, u):
     return x + whole * v * DT - 0.5 * TOP * (whole * DT) ** 2 + 0.5 * rest * DT
 
 
-@settings(max_examples=60, deadline=None)
 @given(x=st.floats(-2.0, 4.9), v=st.floats(0.1, 3.0), u=st.floats(-1.0, 1.0))
 def test_it_admits_what_can_stop_before_the_wall(x, v, u):
     needed, room = stopping_distance(v, u), WALL - x

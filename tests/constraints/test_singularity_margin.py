@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from asking import Asked
 from fetch_truth import ARM, watch
-from gymnasium.envs.registration import EnvSpec
 from judged_loops import DRIVERS, Judge, Scene, drive, flagged
 
 import safe_wrappers as sw
@@ -400,29 +399,6 @@ def test_no_actuator_moves_fetch_s_arm_so_its_joints_have_to_be_named():
 
 
 # Plain data, and what is refused ------------------------------------------------------------------------------
-
-
-def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limits = [
-        sw.constraints.SingularityMargin(
-            0.003, body="fingertip", directions="xy", joints=["joint0", "joint1"], margin=0.1
-        ),
-        sw.constraints.SingularityMargin(
-            geom="fingertip",
-            directions="xy",
-            frame="own",
-            task_speed=0.1,
-            rate_limit=6.0,
-            horizon=7,
-            max_decrease=2.0,
-        ),
-    ]
-    env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
-    for spec in (env.spec, EnvSpec.from_json(env.spec.to_json())):
-        again = gym.make(spec)
-        assert again.constraints == limits and type(again.constraints[0]) is sw.constraints.SingularityMargin
-        assert again.constraints[1].validated == env.constraints[1].validated is not None
-    assert limits[0].promise == "best effort"
 
 
 def test_an_analytic_plant_is_refused():

@@ -1,7 +1,5 @@
 """Stance on a table with driven legs, against the whole program put together from MuJoCo by hand, and on robots."""
 
-import json
-
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -14,7 +12,6 @@ from scipy.sparse import csc_matrix
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint
-from safe_wrappers.serialize import constraint_from, plain_data
 
 LEGS = [(x, y) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
 FRICTION = 0.8
@@ -365,8 +362,3 @@ def test_plants_that_it_cannot_read_are_refused():
     reacher.bind(gym.make("Reacher-v5"))
     with pytest.raises(UnsupportedEnvError, match="nothing to stand on"):
         sw.constraints.Stance().bind(reacher)
-
-
-def test_it_is_plain_data():
-    stance = sw.constraints.Stance(0.6, "exact", 6, None, 0.02, 0.1)
-    assert constraint_from(json.loads(json.dumps(plain_data(stance)))) == stance

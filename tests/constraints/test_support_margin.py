@@ -1,7 +1,5 @@
 """SupportMargin: a pushed table that tips at a known force, and polygons by another library."""
 
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from scipy.spatial import ConvexHull
 import safe_wrappers as sw
 from safe_wrappers.constraints.contact.support_margin import edge_distances
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.serialize import constraint_from, plain_data
 
 HALF, HEIGHT, MASS = 0.2, 0.5, 5.0
 WEIGHT = MASS * 9.81
@@ -171,8 +168,3 @@ def test_an_inset_larger_than_the_polygon_is_infeasible_and_flagged():
 def test_bad_arguments_are_refused(arguments):
     with pytest.raises(ConfigurationError, match=r"inset|margin"):
         sw.constraints.SupportMargin(**arguments)
-
-
-def test_it_is_plain_data():
-    limit = sw.constraints.SupportMargin(0.02, 0.01)
-    assert constraint_from(json.loads(json.dumps(plain_data(limit)))) == limit

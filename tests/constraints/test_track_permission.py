@@ -1,14 +1,11 @@
 """TrackPermission: its rows against the model itself, and that the machine stands when it says so."""
 
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.serialize import constraint_from, plain_data
 
 NOTHING_SEEN = sw.occlusion.Sensor("eye", range_m=0.01)
 FAR_CARS = {"layout": {"cars": [[-9.0 - i, 0.0] for i in range(6)], "agent": [0.0, 1.0, 0.0]}}
@@ -126,9 +123,3 @@ def test_what_it_is_given_is_checked():
         sw.CBFActionFilter(
             gym.make("Pendulum-v1"), [sw.constraints.TrackPermission("robot", 3.0)], plant=plant
         )
-
-
-def test_it_is_plain_data():
-    given = sw.constraints.TrackPermission("robot", 3.0, creep=0.1, tracks=("car0",))
-    data = json.loads(json.dumps(plain_data(given)))
-    assert constraint_from(data) == given and data["kind"] == "TrackPermission"

@@ -349,13 +349,6 @@ def test_a_second_filter_is_refused():
         sw.SlipLimiter(rover(), wheels=["front_left"])
 
 
-def test_made_again_from_its_spec():
-    env = rover(max_slip=0.1, friction=0.3, regularization=0.4, margin=0.01)
-    again = gym.make(env.spec)
-    assert isinstance(again, sw.SlipLimiter)
-    assert again.constraints[0] == env.constraints[0]
-
-
 def test_the_constants_read_from_the_model():
     env = sw.SlipLimiter(Trolley(damping=0.3), wheels=["left", "right"])
     constants = env.filter.bound[0].constants

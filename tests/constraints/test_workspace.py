@@ -5,7 +5,6 @@ import mujoco
 import numpy as np
 import pytest
 from asking import Asked
-from gymnasium.envs.registration import EnvSpec
 from judged_loops import DRIVERS, Judge, Scene, drive, flagged
 
 import safe_wrappers as sw
@@ -246,34 +245,6 @@ def test_conflicting_workspaces_are_infeasible_and_the_action_stays_sound():
 
 
 # Plain data, and what is refused ------------------------------------------------------------------------------
-
-
-def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limit = sw.constraints.Workspace(
-        [None, -0.5, None],
-        [0.5, None, None],
-        [
-            sw.constraints.Disc([0.1, 0.2], 0.05),
-            sw.constraints.Box([1.0, 0.0, 0.0], [0.1, 0.2, 0.3]),
-            sw.constraints.Discs("centres", 0.1),
-        ],
-        bodies=["fingertip"],
-        geoms=["link0"],
-        radius=0.01,
-        margin=0.02,
-        horizon=7,
-        max_decrease=0.3,
-    )
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
-    for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
-        again = gym.make(spec).constraints
-        assert again == [limit] and type(again[0]) is sw.constraints.Workspace
-        assert [type(o) for o in again[0].keep_out] == [
-            sw.constraints.Disc,
-            sw.constraints.Box,
-            sw.constraints.Discs,
-        ]
-    assert limit.promise == "best effort"
 
 
 FINGER = {"bodies": ["fingertip"]}

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
@@ -54,7 +54,6 @@ def curve_by_scipy(blend, sent, prior, new, n):
 
 
 @pytest.mark.parametrize("blend", BLENDS)
-@settings(max_examples=60, deadline=None)
 @given(scenario=streams())
 def test_a_curve_is_scipys_and_its_peaks_are_those_of_dense_samples(blend, scenario):
     sent, prior, new, n = scenario
@@ -82,7 +81,6 @@ def test_a_curve_is_scipys_and_its_peaks_are_those_of_dense_samples(blend, scena
 
 
 @pytest.mark.parametrize("blend", BLENDS)
-@settings(max_examples=60, deadline=None)
 @given(scenario=streams())
 def test_at_the_control_steps_it_is_what_is_sent(blend, scenario):
     sent, prior, new, n = scenario

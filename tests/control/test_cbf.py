@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.filtering.barriers import best_rate, nagumo_holds, power_decay
@@ -56,7 +56,6 @@ def test_batches_of_any_shape():
     assert normals.shape == (4, 5, 2) and offsets.shape == (4, 5)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 10))
 def test_decay_is_class_k(a, b, alpha):
     for decay in (
@@ -76,7 +75,6 @@ def test_an_unsafe_state_is_driven_back(power):
     assert power_decay(-0.3, 2.0, power) < 0.0  # h' >= positive
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.integers(0, 1000))
 def test_rows_say_the_same_as_the_condition(seed):
     rng = np.random.default_rng(seed)
@@ -87,7 +85,6 @@ def test_rows_say_the_same_as_the_condition(seed):
     assert offsets - normals @ u == pytest.approx(left, abs=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 1000))
 def test_best_rate_is_reached_at_a_corner(seed):
     rng = np.random.default_rng(seed)

@@ -68,7 +68,7 @@ def semidefinite(matrix, scale):
 # One step of time ------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seeds, sizes, st.floats(0.01, 3.0))
 def test_the_step_is_the_integral_by_quadrature(seed, n, time):
     a, q, *_ = random_system(seed, n)
@@ -105,7 +105,7 @@ def test_several_times_are_several_steps():
         np.testing.assert_array_equal(together.noise[index], alone.noise)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seeds, sizes, st.floats(0.0, 3.0), st.booleans())
 def test_a_drift_carries_as_integrated(seed, n, time, singular):
     a, *_ = random_system(seed, n)
@@ -133,7 +133,6 @@ def test_drifts_and_times_broadcast():
 # Blind ------------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(0, 10), st.floats(-0.99, 0.99), st.floats(0, 10), st.floats(0, 10), st.floats(1e-3, 1e3))
 def test_the_double_integrator_agrees_with_its_closed_form(p, correlation, v, intensity, time):
     start = np.array([[p, correlation * np.sqrt(p * v)], [correlation * np.sqrt(p * v), v]])
@@ -170,7 +169,6 @@ def test_the_regimes_of_growth():
     np.testing.assert_allclose(noise[1:] / noise[:-1], 8.0, rtol=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, sizes, times, times)
 def test_blind_over_one_time_and_then_another_is_blind_over_both(seed, n, first, second):
     a, q, start, *_ = random_system(seed, n)
@@ -179,7 +177,6 @@ def test_blind_over_one_time_and_then_another_is_blind_over_both(seed, n, first,
     np.testing.assert_allclose(split, both, rtol=1e-8, atol=1e-10 * np.abs(both).max())
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, sizes, times)
 def test_growth_is_symmetric_semidefinite_and_rises_with_the_noise_and_the_start(seed, n, time):
     a, q, start, *_ = random_system(seed, n)
@@ -210,7 +207,7 @@ def test_tracks_and_times_make_axes():
 # Seen -------------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seeds, st.integers(1, 3), st.floats(0.01, 4.0))
 def test_seen_and_blind_are_the_integrated_equations(seed, n, time):
     a, q, start, c, r = random_system(seed, n)
@@ -239,7 +236,7 @@ def test_rates_take_a_batch_of_covariances():
     np.testing.assert_allclose(kalman_bucy_gain(batch, c, r)[1], kalman_bucy_gain(2 * start, c, r))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seeds, sizes, times, times)
 @example(0, 2, 0.0, 0.125)
 def test_seen_over_one_time_and_then_another_is_seen_over_both(seed, n, first, second):
@@ -250,7 +247,7 @@ def test_seen_over_one_time_and_then_another_is_seen_over_both(seed, n, first, s
     np.testing.assert_allclose(split, both, rtol=1e-7, atol=1e-8 * np.abs(both).max())
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seeds, sizes, times)
 def test_measuring_never_makes_it_worse(seed, n, time):
     a, q, start, c, r = random_system(seed, n)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.backup import damped_axis as of
@@ -53,7 +53,6 @@ def braked(axis, x, v):
     raise AssertionError("did not come to rest")
 
 
-@settings(max_examples=150, deadline=None)
 @given(axes(), PLACES, SPEEDS, CONTROLS)
 def test_a_hold_is_its_physics_steps(axis, x, v, u):
     v = of.clipped(axis, v)
@@ -62,7 +61,6 @@ def test_a_hold_is_its_physics_steps(axis, x, v, u):
     assert of.extent(axis, x, v, u) == pytest.approx((min(xs), max(xs)), abs=1e-12)
 
 
-@settings(max_examples=150, deadline=None)
 @given(axes(), PLACES, SPEEDS)
 def test_braking_ends_where_it_says_and_never_turns_back(axis, x, v):
     xs, vs = braked(axis, x, v)
@@ -75,14 +73,12 @@ def test_braking_ends_where_it_says_and_never_turns_back(axis, x, v):
     assert ends == pytest.approx(path[: len(ends)], abs=1e-9)
 
 
-@settings(max_examples=150, deadline=None)
 @given(axes(), PLACES, SPEEDS)
 def test_after_one_hold_of_braking_the_rest_point_is_the_same(axis, x, v):
     end = of.step(axis, x, of.clipped(axis, v), of.brake(axis, v))
     assert of.rest(axis, *end) == pytest.approx(of.rest(axis, x, v), abs=1e-9)
 
 
-@settings(max_examples=200, deadline=None)
 @given(axes(), PLACES, SPEEDS, st.floats(0.0, 1.0))
 def test_the_control_to_rest_at_a_target_does(axis, x, v, share):
     v = of.clipped(axis, v)
@@ -92,7 +88,6 @@ def test_the_control_to_rest_at_a_target_does(axis, x, v, share):
     assert of.rest(axis, *of.step(axis, x, v, u)) == pytest.approx(target, abs=1e-9)
 
 
-@settings(max_examples=200, deadline=None)
 @given(axes(), PLACES, SPEEDS, CONTROLS, CONTROLS)
 def test_more_control_never_rests_or_reaches_less_far(axis, x, v, a, b):
     v, (a, b) = of.clipped(axis, v), sorted((a, b))
@@ -101,7 +96,6 @@ def test_more_control_never_rests_or_reaches_less_far(axis, x, v, a, b):
     assert low[0] <= high[0] + 1e-12 and low[1] <= high[1] + 1e-12
 
 
-@settings(max_examples=100, deadline=None)
 @given(axes(clip=False), PLACES, SPEEDS, st.floats(0.3, 8.0))
 def test_a_clip_never_leads_farther(axis, x, v, clip):
     clipped = of.damped_axis(axis.decay, axis.gain, axis.timestep, axis.substeps, axis.low, axis.high, clip)
@@ -109,7 +103,6 @@ def test_a_clip_never_leads_farther(axis, x, v, clip):
     assert min(x, free) - 1e-12 <= held <= max(x, free) + 1e-12
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(0.0, 5.0), st.integers(1, 8))
 def test_without_damping_a_finely_stepped_hold_is_the_held_formula(speed, holds):
     # A thousand steps a hold: the step's own share of the way, gain * timestep, is below the tolerance.

@@ -4,7 +4,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import brentq
@@ -60,7 +60,6 @@ def searched_distance(point, half):
     return -nearest if (point / half) @ (point / half) < 1.0 else nearest
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     arrays(np.float64, 2, elements=st.floats(0.01, 4.0)),
     arrays(np.float64, 2, elements=COORDINATES),
@@ -70,7 +69,6 @@ def test_the_distance_is_that_to_the_nearest_point_of_the_boundary(half, point):
     assert distance == pytest.approx(searched_distance(point, half), abs=1e-9)
 
 
-@settings(max_examples=150, deadline=None)
 @given(cases(), st.integers(0, 2**32 - 1))
 def test_no_point_of_the_set_is_nearer_and_no_point_outside_is_reached_sooner(case, seed):
     """Outside, any point of the set bounds the distance from above; inside, the ball of that depth stays inside."""
@@ -92,7 +90,6 @@ def test_no_point_of_the_set_is_nearer_and_no_point_outside_is_reached_sooner(ca
         assert (units @ point - supports).max() <= distance + LOST_WIDTH * max(half) + 1e-9
 
 
-@settings(max_examples=150, deadline=None)
 @given(cases(axes=st.floats(0.05, 5.0)))
 def test_inside_the_normal_leads_to_the_boundary_over_the_depth(case):
     point, shape, _half, _ = case
@@ -104,7 +101,6 @@ def test_inside_the_normal_leads_to_the_boundary_over_the_depth(case):
     assert level == pytest.approx(1.0, abs=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
 @given(cases(), st.floats(-3.0, 3.0))
 def test_turning_space_turns_the_normal(case, angle):
     point, shape, half, _ = case
@@ -116,7 +112,6 @@ def test_turning_space_turns_the_normal(case, angle):
         np.testing.assert_allclose(turned_normal, rotation @ normal, atol=1e-5)
 
 
-@settings(max_examples=100, deadline=None)
 @given(cases(), st.floats(1e-3, 1e3))
 def test_scaling_space_scales_the_distance(case, factor):
     point, shape, half, _ = case
@@ -125,7 +120,6 @@ def test_scaling_space_scales_the_distance(case, factor):
     assert after == pytest.approx(factor * before, abs=factor * (LOST_WIDTH * max(half) + 1e-12))
 
 
-@settings(max_examples=100, deadline=None)
 @given(cases(), arrays(np.float64, 3, elements=st.floats(-1e-4, 1e-4)))
 def test_a_step_changes_the_distance_by_its_part_along_the_normal(case, step):
     point, shape, half, _ = case

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.backup.damped_axis import damped_axis
@@ -48,7 +48,6 @@ speed = st.floats(-6.0, 6.0)
 
 
 @given(position=st.tuples(speed, speed), velocities=st.lists(st.tuples(speed, speed), min_size=1, max_size=4))
-@settings(deadline=None, max_examples=60)
 def test_every_way_is_the_manoeuvre_played(position, velocities):
     bank = EvasiveManeuvers(AXES, BANK, INSTANTS)
     velocity = np.array(velocities)

@@ -23,7 +23,6 @@ def deviation(start, a, q, direction, t):
     return np.sqrt(np.maximum(np.linalg.eigvalsh(rows @ grown @ rows.T)[..., -1], 0.0))
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(1e-3, 0.2), st.floats(-0.95, 0.95), st.floats(0, 2), st.floats(1e-3, 2), st.floats(0.7, 3))
 def test_the_double_integrator_crosses_where_its_closed_form_does(p, correlation, v, intensity, tolerance):
     start = np.array([[p**2, correlation * p * v], [correlation * p * v, v**2]])
@@ -57,7 +56,7 @@ def test_a_swing_that_stays_below_never_crosses():
     assert blind_time(start, OSCILLATOR, np.zeros((2, 2)), POSITION, 0.4000001, 2.0, 20.0) == math.inf
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6), st.integers(1, 4), st.integers(1, 2), st.floats(1.05, 3.0), st.booleans())
 def test_never_late_and_hardly_early(seed, n, directions, factor, noisy):
     rng = np.random.default_rng(seed)

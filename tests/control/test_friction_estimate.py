@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.vehicle.burckhardt import BURCKHARDT, peak
@@ -101,7 +101,6 @@ def test_a_wheel_without_a_measurement_stays_as_it_is():
     assert estimate.mean[1] != before[0][1]
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0.0, 2.0), st.floats(0.0, 1e3), st.floats(1e-3, 10.0)), max_size=40))
 def test_always_finite(measurements):
     estimate = FrictionEstimate(1)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
@@ -219,7 +219,6 @@ def polygon_distance(corners, point):
     return (-near if inside and abs(area) > 1e-12 else near), near
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     LENGTH,
     LENGTH,
@@ -259,7 +258,6 @@ def test_a_body_at_rest_is_a_point():
     assert path.radius == pytest.approx(0.0, abs=1e-12)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(0, 1.4), st.floats(-1.4, 1.4), st.floats(-3.1, 3.1))
 def test_uncertainty_only_adds_area(ahead, aside, heading):
     motion = Motion(

@@ -59,7 +59,7 @@ def integrated(v, m, k, a=0.0, latency=0.0, start=0.0):
 # The elastic part: a mass on a spring -----------------------------------------------------------------------
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(speeds, masses, stiffnesses)
 def test_the_peak_is_the_oscillators(v, m, k):
     time, depth = integrated(v, m, k)
@@ -68,7 +68,6 @@ def test_the_peak_is_the_oscillators(v, m, k):
     assert time_to_peak(m, k) == pytest.approx(time, rel=1e-8)
 
 
-@settings(max_examples=60, deadline=None)
 @given(speeds, masses, stiffnesses, brakes, st.floats(0.0, 1.6))
 def test_a_brake_that_comes_late_is_the_integrated_one(v, m, k, a, share):
     latency = share * time_to_peak(m, k)
@@ -78,7 +77,7 @@ def test_a_brake_that_comes_late_is_the_integrated_one(v, m, k, a, share):
     assert braked_peak_force(v, m, k, a, latency) == pytest.approx(k * depth, rel=1e-7)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(0.0, 5.0), masses, stiffnesses, st.floats(-100.0, -0.1), st.floats(0.0, 0.9))
 def test_a_push_that_goes_on_is_a_brake_below_zero(v, m, k, a, share):
     assume(v > 1e-3 or share == 0.0)
@@ -87,7 +86,6 @@ def test_a_push_that_goes_on_is_a_brake_below_zero(v, m, k, a, share):
     assert braked_deflection(v, m, k, a, latency) == pytest.approx(depth, rel=1e-6)
 
 
-@settings(max_examples=60, deadline=None)
 @given(speeds, masses, stiffnesses, st.floats(-100.0, 300.0), st.floats(0.0, 3.0), st.floats(0.0, 1.6))
 def test_a_contact_that_is_deflected_already_goes_on_from_there(v, m, k, a, depth, share):
     unbraked = v * np.sqrt(m / k)
@@ -107,7 +105,6 @@ def test_a_spring_that_holds_a_push_stays_where_it_is():
     assert braked_peak_force(0.0, m, k, -push / m, deflection=0.5 * push / k) == pytest.approx(1.5 * push)
 
 
-@settings(max_examples=50, deadline=None)
 @given(speeds, masses, stiffnesses, brakes)
 def test_a_brake_from_the_touch_on_solves_the_appendix_quadratic(v, m, k, a):
     x = braked_deflection(v, m, k, a)
@@ -120,7 +117,6 @@ def test_a_very_strong_brake_loses_no_digits():
     assert braked_deflection(1e-3, 1.0, 1e-2, 1e8) == pytest.approx(5e-15, rel=1e-9)
 
 
-@settings(max_examples=50, deadline=None)
 @given(speeds, masses, stiffnesses, st.floats(0.1, 300.0))
 def test_braking_that_starts_at_the_peak_or_later_is_too_late(v, m, k, a):
     quarter = float(time_to_peak(m, k))

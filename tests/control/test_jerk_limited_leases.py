@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import ruckig
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.watchdog.reachability import stopping_distance
@@ -28,7 +28,6 @@ def stop_of_ruckig(v, a, b, jerk):
     return trajectory.at_time(trajectory.duration)[0][0], trajectory.duration
 
 
-@settings(max_examples=300, deadline=None)
 @given(speeds, accelerations, brakes, jerks)
 @example(1.0, 0.0, 1.0, 1.0)  # the full braking is just reached
 @example(0.01, 10.0, 20.0, 0.5)
@@ -90,7 +89,6 @@ def test_a_lease_stops_at_the_margin_and_five_percent_more_hits(acceleration, to
     assert forgets > bare and brakes_at_once(forgets, clearance, *machine) < -0.01
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.floats(0.1, 20.0), speeds, accelerations, brakes, jerks, st.floats(0.0, 0.5))
 def test_from_every_moment_of_a_lease_ruckigs_stop_fits(clearance, v, a, b, jerk, delays):
     lease = float(longest_lease(clearance, v, b, delays, acceleration=a, jerk=jerk))
@@ -104,7 +102,6 @@ def test_from_every_moment_of_a_lease_ruckigs_stop_fits(clearance, v, a, b, jerk
     assert v * tau + 0.5 * a * tau**2 + stop_of_ruckig(v + a * tau, a, b, jerk)[0] > clearance
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(0.5, 20.0), st.floats(-3.0, 3.0), accelerations, brakes, jerks, st.floats(0.1, 4.0))
 def test_less_jerk_or_a_faster_top_shortens_the_lease(clearance, v, a, b, jerk, top):
     def lease(j, highest):
@@ -156,7 +153,6 @@ def test_batches_unknown_numbers_and_refusals():
         longest_lease(1.0, 0.5, 1.0, 0.1, jerk=-1.0)
 
 
-@settings(max_examples=300, deadline=None)
 @given(*[st.floats(allow_nan=True, allow_infinity=True)] * 3, *[st.floats(min_value=0.0)] * 6)
 def test_never_nan_whatever_comes(d, v, b, delays, loc, gap, a, top, jerk):
     assert not np.isnan(longest_lease(d, v, b, delays, loc, gap, a, top, jerk))

@@ -3,7 +3,7 @@
 import control as ct
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
@@ -25,7 +25,6 @@ def covariance(rng, *shape):
 # One update -------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(1, 4), st.integers(1, 3))
 def test_an_update_is_bayes_rule_on_the_joint_normal(seed, n, m):
     rng = np.random.default_rng(seed)
@@ -43,7 +42,6 @@ def test_an_update_is_bayes_rule_on_the_joint_normal(seed, n, m):
     np.testing.assert_allclose(updated.innovation_cov, marginal, rtol=1e-10, atol=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(1, 4), st.floats(-8, 8))
 def test_the_covariance_stays_symmetric_and_semidefinite(seed, n, decades):
     rng = np.random.default_rng(seed)

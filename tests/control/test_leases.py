@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.watchdog.lease_delays import LeaseDelays
@@ -30,7 +30,6 @@ def used(lease, speed, braking, delays, localisation, margin, acceleration, top=
     return max(way, Fraction(0)) + fixed
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     st.floats(0.0, 1e4, allow_subnormal=False),
     st.floats(-50.0, 50.0),
@@ -169,7 +168,6 @@ def test_what_would_lengthen_a_lease_by_mistake_is_refused(name):
         longest_lease(1.0, 1.0, 1.0, **given_)
 
 
-@settings(max_examples=300, deadline=None)
 @given(*[st.floats(allow_nan=True, allow_infinity=True)] * 3, *[st.floats(min_value=0.0)] * 5)
 def test_never_nan_and_never_long_by_overflow(d, v, b, delays, loc, gap, a, top):
     lease = float(longest_lease(d, v, b, delays, loc, gap, a, top))
@@ -189,7 +187,6 @@ def test_batches_are_element_by_element():
         assert together[i, j] == longest_lease(d[i, j], v[i, j], 1.3, 0.1, 0.02, 0.05, a[j], 1.5)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(0.5, 20), st.floats(0, 5), POSITIVE, SMALL, st.floats(0, 3), st.floats(0.01, 1))
 def test_more_of_anything_bad_shortens_the_lease(d, v, b, delays, a, more):
     lease = longest_lease(d, v, b, delays, acceleration=a)
@@ -204,7 +201,6 @@ def test_more_of_anything_bad_shortens_the_lease(d, v, b, delays, a, more):
         assert shorter <= lease + 1e-9 * abs(lease) or lease <= 0.0
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(-3, 30), POSITIVE)
 def test_stopping_distance_is_braking_to_rest(speed, braking):
     time = max(speed, 0.0) / braking
@@ -216,7 +212,6 @@ def test_stopping_distance_of_the_unknown_is_infinite(speed, braking):
     assert stopping_distance(speed, braking) == np.inf
 
 
-@settings(max_examples=300, deadline=None)
 @given(st.floats(-10, 100), st.floats(-1, 10), SMALL)
 @example(1.0, 5e-324, 0.1)
 def test_a_lease_of_room_is_used_up_exactly(room, closing, delays):

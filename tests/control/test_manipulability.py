@@ -57,7 +57,6 @@ def random_rotation(rng):
 # w ------------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100, deadline=None)
 @given(jacobians)
 def test_it_is_the_product_of_the_singular_values_and_never_below_zero_or_no_number(jacobian):
     w = manipulability(jacobian)
@@ -144,7 +143,6 @@ def test_joint_rates_of_norm_one_end_on_the_ellipsoid_and_its_axes_are_reached()
     assert np.prod(ellipsoid.lengths) == pytest.approx(manipulability(jacobian))
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_worst_rates_are_reached_by_a_twist_and_exceeded_by_none(seed):
     rng = np.random.default_rng(seed)
@@ -198,7 +196,7 @@ def chain(q, axes, anchors, slides):
     return np.concatenate([np.array(linear).T, np.array(angular).T])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7))
 def test_a_chain_s_derivative_and_the_gradient_are_their_differences(seed, n):
     rng = np.random.default_rng(seed)
@@ -233,7 +231,6 @@ def test_the_gradient_stays_a_number_where_w_is_zero():
 # Frames and tasks ---------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_w_of_a_whole_twist_is_the_same_in_every_frame_and_of_a_part_is_not(seed):
     rng = np.random.default_rng(seed)
@@ -269,7 +266,7 @@ def test_body_and_spatial_twists_of_a_turning_rod():
     )  # what is at the origin turns only
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 100.0))
 def test_the_length_of_rotations_is_a_factor_of_w_and_moves_no_singularity(seed, length):
     jacobian = np.random.default_rng(seed).normal(size=(6, 7))
@@ -280,7 +277,6 @@ def test_the_length_of_rotations_is_a_factor_of_w_and_moves_no_singularity(seed,
 # A validated threshold ----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.5, 5.0))
 def test_no_sample_above_the_threshold_needs_more_and_no_smaller_number_would_do(seed, limit):
     rng = np.random.default_rng(seed)
@@ -370,7 +366,6 @@ def test_nonsense_is_refused(call, message):
 
 
 @given(j=jacobians)
-@settings(deadline=None, max_examples=200)
 def test_one_by_reflections_is_the_determinant_or_the_product_of_singular_values(j):
     m, n = j.shape
     scale = max(float(np.prod(np.linalg.norm(j, axis=1))), 1e-300)  # Hadamard's bound

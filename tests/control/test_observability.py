@@ -5,7 +5,7 @@ from fractions import Fraction
 import control
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import subspace_angles
@@ -77,14 +77,12 @@ def same_space(one, other):
 # Linear
 
 
-@settings(max_examples=60, deadline=None)
 @given(integer_systems())
 def test_the_matrix_is_that_of_python_control(system):
     a, c = system
     np.testing.assert_array_equal(observability_matrix(a, c), control.obsv(a, c))
 
 
-@settings(max_examples=200, deadline=None)
 @given(integer_systems())
 def test_the_rank_is_the_exact_one_and_the_basis_is_in_the_kernel(system):
     a, c = system
@@ -100,7 +98,6 @@ def test_the_rank_is_the_exact_one_and_the_basis_is_in_the_kernel(system):
     assert found.singular_values.shape == (n,)
 
 
-@settings(max_examples=100, deadline=None)
 @given(integer_systems(), st.integers(0, 2**32 - 1))
 def test_other_coordinates_have_the_same_rank_and_the_same_kernel(system, seed):
     a, c = system
@@ -112,7 +109,6 @@ def test_other_coordinates_have_the_same_rank_and_the_same_kernel(system, seed):
     same_space(after.unobservable, mapped)
 
 
-@settings(max_examples=100, deadline=None)
 @given(integer_systems(), st.data())
 def test_units_do_not_decide(system, data):
     """Seconds or years, metres or micrometres, an amplifier behind a sensor."""
@@ -254,7 +250,6 @@ def test_a_direction_is_written_in_the_states_names(direction, text):
     assert described(direction, ("x", "y", "z")) == text
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.sets(st.integers(0, 5), min_size=1, max_size=5), st.integers(0, 2**32 - 1))
 def test_a_rotated_basis_of_single_states_is_shown_as_these_states(states, seed):
     chosen = sorted(states)
@@ -286,7 +281,6 @@ def ranging(velocity, names=("x", "y"), at=(3.0, 4.0), beacon=(0.0, 0.0), **opti
     )
 
 
-@settings(max_examples=50, deadline=None)
 @given(integer_systems())
 def test_of_a_linear_system_it_says_what_the_linear_test_says(system):
     a, c = system
@@ -319,7 +313,6 @@ def test_the_tangent_is_named_wherever_the_beacon_is():
     assert ranging((0.0, 0.0), at=(0.0, 1.0), beacon=(1.0, 0.0)).names == ("x + y",)
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.floats(0.1, 6.2), st.floats(0.5, 50.0), st.floats(0.05, 3.0), st.floats(0.2, 2.9))
 def test_any_motion_across_the_line_of_sight_will_do(bearing, distance, speed, across):
     """And the basis at rest is the tangent, whatever the scales."""
@@ -428,7 +421,6 @@ def test_a_weak_first_order_does_not_spoil_the_time_scale():
     assert found.rank_by_order[1:3] == (1, 2)
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(-2, 2), min_size=4, max_size=4), st.integers(-5, 6), st.integers(-3, 3))
 def test_units_do_not_decide_either(powers, second, gain):
     units, rate, gain = 10.0 ** np.array(powers, float), 10.0**second, 10.0**gain
@@ -445,7 +437,6 @@ def test_units_do_not_decide_either(powers, second, gain):
     same_space(found.unobservable, direction[:, None] / np.linalg.norm(direction))
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_other_coordinates_of_a_nonlinear_system(seed):
     t = transform(4, seed)

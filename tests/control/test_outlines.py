@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
@@ -19,7 +19,6 @@ def spread(points):
     return np.linalg.matrix_rank(points - points[0], tol=1e-9) == 2
 
 
-@settings(max_examples=60, deadline=None)
 @given(CLOUDS)
 def test_the_outline_is_the_convex_hull(points):
     """Its corners are points of the cloud, and it encloses the area that SciPy's hull does, counter-clockwise."""
@@ -32,7 +31,6 @@ def test_the_outline_is_the_convex_hull(points):
     assert max(distance_to_outline(outline, *point) for point in points) <= 1e-12
 
 
-@settings(max_examples=60, deadline=None)
 @given(CLOUDS, arrays(np.float64, (4, 2), elements=st.floats(-0.4, 0.4)))
 def test_distances_are_those_to_the_boundary_negative_inside(cloud, points):
     assume(spread(cloud))

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.teleop.energy_ledger import EnergyLedger
@@ -33,7 +33,6 @@ def size_of(f, v, b):
     return 1e-300 + float((f * f).sum() / b + b * (v * v).sum())
 
 
-@settings(max_examples=300, deadline=None)
 @given(ports(), IMPEDANCES)
 def test_waves_carry_the_ports_power(port, b):
     f, v = port
@@ -43,7 +42,6 @@ def test_waves_carry_the_ports_power(port, b):
     assert abs(0.5 * (u @ u) - 0.5 * (w @ w) - f @ v) <= 1e-14 * scale  # the appendix's own form
 
 
-@settings(max_examples=300, deadline=None)
 @given(ports(), IMPEDANCES)
 def test_every_way_through_the_transform_ends_at_the_same_port(port, b):
     f, v = port
@@ -294,7 +292,6 @@ def test_with_waves_the_same_sines_make_nothing(phase):
     assert ledger.created_j < 1e-12
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(1, 20), st.lists(ports(), min_size=1, max_size=60))
 def test_a_lossless_line_holds_what_is_in_flight(delay, given_ports):
     """Whatever is done at its two ends: net energy in is the energy of the waves in flight, at every tick."""

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.teleop.energy_ledger import EnergyLedger
@@ -23,7 +23,6 @@ def split(row):
     return np.array(row[:2]), np.array(row[2:])
 
 
-@settings(max_examples=150, deadline=None)
 @given(PAIRS, CAUSALITIES, st.floats(0.0, 1.0))
 def test_energy_stays_at_or_above_zero_with_the_smallest_damping(rows, causality, storage):
     controller = PassivityController(causality, storage)
@@ -174,7 +173,6 @@ def network(rng, count):
     return heard
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), PAIRS, CAUSALITIES, st.floats(0.0, 0.1))
 def test_two_ends_never_give_more_than_they_took(seed, rows, causality, storage):
     rng = np.random.default_rng(seed)

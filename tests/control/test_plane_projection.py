@@ -1,7 +1,7 @@
 """Projection in the plane against a QP solver, and against a grid where there is no answer."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from qpsolvers import solve_qp
 
@@ -19,7 +19,6 @@ def projected(u, rows, slack=1e-9):
     return table[:, :2], table[:, 2], out if found else None
 
 
-@settings(max_examples=200)
 @given(PAIRS, ROWS)
 def test_it_is_the_closest_point_that_a_solver_finds(u, rows):
     normals, offsets, answer = projected(u, rows)

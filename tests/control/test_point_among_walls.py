@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.backup import point_among_walls as of
@@ -62,7 +62,6 @@ def from_walls(point, p):
     )
 
 
-@settings(max_examples=100, deadline=None)
 @given(MOTIONS, st.sampled_from([1, 4]))
 def test_the_path_of_rectangles_contains_every_physics_step_of_braking(motion, substeps):
     point = among(True, substeps)
@@ -73,7 +72,6 @@ def test_the_path_of_rectangles_contains_every_physics_step_of_braking(motion, s
     assert all(inside(of.stop(point, motion), place) for place in steps)
 
 
-@settings(max_examples=100, deadline=None)
 @given(MOTIONS, st.sampled_from([1, 4]), st.booleans())
 def test_no_physics_step_of_braking_is_closer_than_the_distance(motion, substeps, clip_known):
     point = among(clip_known, substeps)
@@ -82,7 +80,6 @@ def test_no_physics_step_of_braking_is_closer_than_the_distance(motion, substeps
     assert min(from_walls(point, p) for p in steps) >= distance - 1e-9
 
 
-@settings(max_examples=100, deadline=None)
 @given(MOTIONS)
 def test_the_path_is_never_closer_than_its_rectangle_and_as_close_as_its_own_boxes(motion):
     known, unknown = among(True), among(False)
@@ -94,7 +91,6 @@ def test_the_path_is_never_closer_than_its_rectangle_and_as_close_as_its_own_box
     assert of.distance(known, motion, -9.0) == -9.0
 
 
-@settings(max_examples=150, deadline=None)
 @given(MOTIONS, st.sampled_from([1, 4]), st.booleans())
 def test_braking_for_one_hold_never_loses_distance_and_is_clear(motion, substeps, clip_known):
     point = among(clip_known, substeps)
@@ -106,7 +102,6 @@ def test_braking_for_one_hold_never_loses_distance_and_is_clear(motion, substeps
     assert of.clear(point, motion, *stop, distance - 1e-9)
 
 
-@settings(max_examples=200, deadline=None)
 @given(MOTIONS, CONTROLS, st.sampled_from([1, 4]), st.booleans(), st.floats(0.05, 0.2))
 def test_a_clear_control_stays_clear_and_leads_back_inside(motion, control, substeps, clip_known, room):
     point = among(clip_known, substeps)
@@ -117,7 +112,6 @@ def test_a_clear_control_stays_clear_and_leads_back_inside(motion, control, subs
     assert of.distance(point, of.clipped(point, steps[-1])) >= room - 1e-9
 
 
-@settings(max_examples=150, deadline=None)
 @given(MOTIONS, CONTROLS, st.floats(0.5, 6.0), st.floats(0.05, 0.2))
 def test_without_the_clip_s_level_every_clip_is_covered(motion, control, clip, room):
     # Down to 0.5 m/s: one hold of full force reverses at most 0.24 m/s.
@@ -128,7 +122,6 @@ def test_without_the_clip_s_level_every_clip_is_covered(motion, control, clip, r
     assert of.distance(point, end) >= room - 1e-9
 
 
-@settings(max_examples=100, deadline=None)
 @given(MOTIONS, CONTROLS)
 def test_only_reachable_walls_can_be_met(motion, control):
     point = among(True)

@@ -6,7 +6,7 @@ import daqp
 import numpy as np
 import pytest
 import qpsolvers
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
@@ -119,7 +119,6 @@ def test_every_installed_backend_gives_the_least_violation(solver):
 # Inactive: bit for bit ----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=1, max_size=5), st.integers(0, 4), st.integers(0, 2**31))
 def test_inactive_is_the_nominal_bit_for_bit(nominal, rows, seed):
     u = np.array(nominal)
@@ -172,7 +171,6 @@ def one_row(draw):
     return np.array(nominal), np.array([normal]), np.array([draw(FINITE)]), np.array(low), np.array(high)
 
 
-@settings(max_examples=300, deadline=None)
 @given(one_row())
 def test_one_row_and_box_is_exact(problem):
     u, normal, offset, low, high = problem
@@ -191,7 +189,6 @@ def test_one_row_and_box_is_exact(problem):
         assert kkt_residual(u, normal, offset, low, high, answer) < 1e-8 * max(1.0, answer.multipliers.max())
 
 
-@settings(max_examples=50, deadline=None)
 @given(one_row())
 def test_a_repeated_row_changes_nothing(problem):
     u, normal, offset, low, high = problem
@@ -252,7 +249,6 @@ def test_the_box_is_never_softened():
             assert answer.control[0] == pytest.approx(-1.0, abs=1e-6)
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 4), st.integers(1, 6), st.floats(-3, 1))
 def test_the_answer_is_always_finite_inside_the_box_and_honest(seed, size, rows, shift):
     rng = np.random.default_rng(seed)

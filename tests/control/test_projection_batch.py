@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
@@ -60,7 +60,6 @@ def compare(problems):
     return answer
 
 
-@settings(max_examples=300, deadline=None)
 @given(batches())
 def test_every_answer_is_that_of_project(problems):
     compare(problems)

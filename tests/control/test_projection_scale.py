@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from scipy.optimize import linprog, lsq_linear
 
@@ -50,7 +50,6 @@ def test_a_box_of_a_millionth_is_feasible():
     np.testing.assert_allclose(answer.control * 1e6, [0.46, 0.28], atol=1e-12)
 
 
-@settings(max_examples=100, deadline=None)
 @given(problems(), SCALES, st.booleans())
 def test_the_unit_of_the_control_changes_nothing(problem, scale, in_the_rows):
     u, normals, offsets, lower, upper = problem
@@ -96,7 +95,6 @@ def test_a_bound_that_is_far_away_lets_nothing_through(bound, rows):
     np.testing.assert_allclose(answer.control, [0.9 - 1e-6, 0.5 if rows == 2 else 0.8], rtol=0.0, atol=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=2))
 def test_components_in_units_of_their_own(seed, exponents):
     rng = np.random.default_rng(seed)
@@ -164,7 +162,6 @@ def apex(normals, offsets):
     return np.array([float((e * d - b * f) / determinant), float((a * f - e * c) / determinant)])
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(-9.5, -1.0), st.floats(0.0, 6.28), st.floats(0.05, 0.4), st.floats(-0.3, 0.3), SCALES)
 @example(-6.0, 0.7, 0.4, 0.1, 1.0)
 def test_the_apex_of_a_thin_wedge_is_found(exponent, turn, back, aside, scale):
@@ -207,7 +204,6 @@ def test_rows_that_contradict_each_other_by_less_than_an_answer_may_miss_them():
     )
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(1, 5), st.integers(0, 4), st.integers(0, 2**31), SCALES)
 def test_box_least_squares_in_any_unit(n, more, seed, scale):
     rng = np.random.default_rng(seed)

@@ -57,14 +57,12 @@ def most(time, v0, a0, a_max, v_max, jerk, at_rest=False, count=160, sign=1.0):
 # Rest to rest, idealised.
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.floats(-20, 20), POSITIVE, POSITIVE)
 def test_transit_time_is_ruckigs_without_a_limit_on_the_jerk(distance, acceleration, speed):
     expected = ruckig_time((0, 0, 0), (distance, 0, 0), acceleration, speed, np.inf)
     assert transit_time(distance, acceleration, speed) == pytest.approx(expected, abs=1e-6, rel=1e-9)
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.floats(0, 30), POSITIVE, POSITIVE)
 def test_reach_is_the_inverse_of_the_transit_time(time, acceleration, speed):
     assert transit_time(reachable_distance(time, acceleration, speed), acceleration, speed) == pytest.approx(
@@ -91,7 +89,6 @@ def test_bang_bang_gets_as_far_as_reach():
         assert v == pytest.approx(0.0, abs=1e-3)
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.floats(-5, 5), POSITIVE, POSITIVE, POSITIVE)
 def test_the_idealised_time_is_a_lower_bound(distance, acceleration, speed, jerk):
     limits = MotionLimits(acceleration, speed, jerk)
@@ -140,7 +137,6 @@ def inside(state, acceleration, speed, jerk):
     return p, v, a
 
 
-@settings(max_examples=150, deadline=None)
 @given(states, states, POSITIVE, POSITIVE, POSITIVE)
 def test_time_backwards_is_the_same_time(start, end, acceleration, speed, jerk):
     start, end = (inside(s, acceleration, speed, jerk) for s in (start, end))
@@ -193,7 +189,7 @@ def test_a_start_outside_the_limits_is_led_back_inside():
     assert time == pytest.approx(2.0 + 2.0)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.floats(0.2, 4.0), SHARE, SHARE, st.floats(0.5, 3), st.floats(0.5, 3), st.floats(0.5, 6))
 def test_jerk_limited_reach_is_the_optimum_of_a_linear_program(time, v, a, acceleration, speed, jerk):
     _, v, a = inside((0, v, a), acceleration, speed, jerk)
@@ -235,7 +231,6 @@ def test_no_time_to_stop_is_an_empty_reach():
 # The bound with a free end.
 
 
-@settings(max_examples=300, deadline=None)
 @given(st.floats(0, 5), st.floats(-3, 3), POSITIVE, POSITIVE)
 def test_without_a_jerk_limit_the_bound_is_bang_bang(time, v, acceleration, speed):
     lowest, highest = (float(x) for x in furthest(time, v, 0.0, speed, acceleration))
@@ -249,7 +244,7 @@ def test_without_a_jerk_limit_the_bound_is_bang_bang(time, v, acceleration, spee
     assert -lowest == pytest.approx(up(-v), rel=1e-9, abs=1e-12)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.floats(0.2, 3.0), SHARE, SHARE, st.floats(0.5, 3), st.floats(0.5, 3), st.floats(0.5, 6))
 def test_no_linear_program_gets_beyond_the_bound_and_without_a_speed_limit_it_gets_there(
     time, v, a, acceleration, speed, jerk
@@ -264,7 +259,6 @@ def test_no_linear_program_gets_beyond_the_bound_and_without_a_speed_limit_it_ge
             assert optimum == pytest.approx(bound, rel=0.02, abs=0.01)
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.floats(0.1, 4.0), st.floats(-3, 3), st.floats(-3, 3), POSITIVE, POSITIVE, POSITIVE)
 def test_the_bound_is_its_envelope_summed_up_in_fine_steps(time, v, a, acceleration, speed, jerk):
     lowest, highest = (float(x) for x in furthest(time, v, a, speed, acceleration, jerk))
@@ -278,7 +272,6 @@ def test_the_bound_is_its_envelope_summed_up_in_fine_steps(time, v, a, accelerat
         assert bound == pytest.approx(x_t.max(), abs=1e-5)
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.floats(0.1, 4.0), st.floats(0, 3), st.floats(0, 1), st.floats(0.1, 1))
 def test_rounding_never_refuses(time, v, a, jerk):
     # Limits too far to be met: the way is v t + a t^2 / 2 + j t^3 / 6, here in exact fractions.

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.numerics.rectangles import apart, closer, gaps, merged, nearest
@@ -29,7 +29,6 @@ def overlap(a, b):
     return max(a[0], b[0]) < min(a[1], b[1]) and max(a[2], b[2]) < min(a[3], b[3])
 
 
-@settings(max_examples=200, deadline=None)
 @given(RECTANGLES, RECTANGLES)
 def test_outside_it_is_the_euclidean_distance(a, b):
     if overlap(a, b):
@@ -43,7 +42,6 @@ def test_outside_it_is_the_euclidean_distance(a, b):
     assert min(from_point(s, b) for s in corner_points(a)) >= apart(a, b) - 1e-12
 
 
-@settings(max_examples=200, deadline=None)
 @given(RECTANGLES, RECTANGLES)
 def test_inside_it_is_the_shortest_way_out_along_an_axis(a, b):
     if not overlap(a, b):
@@ -59,7 +57,6 @@ def test_inside_it_is_the_shortest_way_out_along_an_axis(a, b):
     assert all(overlap(moved(x * depth * 0.999, y * depth * 0.999), b) for x, y in ways)
 
 
-@settings(max_examples=200, deadline=None)
 @given(RECTANGLES, st.lists(RECTANGLES, max_size=6), st.floats(0.0, 3.0))
 @example((0.0, 2.458, 0.0, 1.0), [(2.897, 3.0, 0.0, 1.0)], 0.43899999999999967)  # the sum is rounded, too
 def test_nearest_and_closer_agree_with_every_single_distance(around, among, limit):
@@ -73,7 +70,6 @@ def test_nearest_and_closer_agree_with_every_single_distance(around, among, limi
     assert found == -1 if best == limit else apart(around, among[found]) == best
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=25), st.floats(0.3, 2.0))
 def test_merged_covers_the_same_cells_and_nothing_else(cells, size):
     squares = [(i * size, (i + 1) * size, j * size, (j + 1) * size) for i, j in cells]

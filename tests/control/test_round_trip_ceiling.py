@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.watchdog.leases import longest_lease, round_trip_ceiling
@@ -13,7 +13,6 @@ from safe_wrappers.errors import ConfigurationError
 SHORT = st.floats(0.0, 1.0)
 
 
-@settings(max_examples=300, deadline=None)
 @given(st.floats(1e-3, 1e3), st.floats(1e-3, 50.0), st.floats(1e-2, 1e3), SHORT, SHORT, SHORT, SHORT, SHORT)
 def test_it_is_the_largest_that_keeps_the_inequality(d, v, b, video, human, act, loc, gap):
     ceiling = float(round_trip_ceiling(d, v, b, video, human, act, loc, gap))

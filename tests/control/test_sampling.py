@@ -3,14 +3,13 @@
 import control as ct
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.watchdog.sampling import hold_lag_s, margin_left, phase_lag
 from safe_wrappers.errors import ConfigurationError
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(0.01, 100), st.floats(0.01, 0.49))
 def test_a_hold_lags_by_half_its_interval(crossover, share_of_the_sampling_rate):
     hold = share_of_the_sampling_rate * 2 * np.pi / crossover

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
@@ -88,7 +88,6 @@ def seams(draw):
 
 
 @blends
-@settings(max_examples=150, deadline=None)
 @given(seams(), st.booleans())
 def test_the_shortest_blend_that_keeps_the_limit_by_brute_force(blend, drawn, boxed):
     sent, prior, new, fewest, step = drawn
@@ -115,7 +114,6 @@ def test_the_shortest_blend_that_keeps_the_limit_by_brute_force(blend, drawn, bo
 
 
 @blends
-@settings(max_examples=100, deadline=None)
 @given(seams())
 def test_held_back_only_where_the_blend_or_the_stream_itself_is_too_fast(blend, drawn):
     sent, prior, new, fewest, step = drawn
@@ -173,7 +171,6 @@ def test_a_limit_for_each_component(blend):
     assert uneven.steps == seam.steps  # the slow one decides
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 3), st.floats(1e-3, 3), st.booleans())
 def test_limit_rate_is_a_chase_at_limited_speed(seed, n, m, step, started):
     rng = np.random.default_rng(seed)

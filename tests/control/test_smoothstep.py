@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
@@ -38,7 +38,6 @@ def test_smoothstep_is_the_quintic_between_rests_and_clamped_outside():
     assert np.all(np.diff(smoothstep(np.linspace(0, 1, 100_001))) >= 0.0)
 
 
-@settings(max_examples=200, deadline=None)
 @given(COMMAND, COMMAND, st.floats(-0.5, 1.5))
 def test_a_blend_stays_between_its_commands_and_ends_on_them_bit_for_bit(prior, new, s):
     found = blend(prior, new, s)
@@ -49,7 +48,6 @@ def test_a_blend_stays_between_its_commands_and_ends_on_them_bit_for_bit(prior, 
     assert found == pytest.approx((1 - alpha) * prior + alpha * new, abs=1e-12)
 
 
-@settings(max_examples=100, deadline=None)
 @given(COMMAND, COMMAND, COMMAND, COMMAND, st.floats(0.05, 5), st.floats(0.01, 0.99))
 def test_the_rate_of_a_blend_is_its_numerical_derivative(prior, prior_rate, new, new_rate, tau, s):
     def command(t):
@@ -81,7 +79,6 @@ def worst_points(step, prior_rate, new_rate, limit):
     return np.concatenate([np.linspace(0, 1, 21), np.clip(near + np.linspace(-3e-4, 3e-4, 21), 0, 1)])
 
 
-@settings(max_examples=150, deadline=None)
 @given(COMMAND, COMMAND, LIMIT, SHARE, SHARE)
 def test_no_returned_blend_time_ever_breaks_the_limit(prior, new, limit, first, second):
     prior_rate, new_rate = first * limit, second * limit
@@ -142,7 +139,6 @@ def test_shortest_and_longest_equal_brute_force():
     assert min(kinds.values()) >= 20  # every kind was seen
 
 
-@settings(max_examples=100, deadline=None)
 @given(COMMAND, COMMAND, LIMIT)
 def test_latched_commands_give_the_latched_formula(prior, new, limit):
     latched = shortest_latched_blend(new - prior, limit)

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -151,7 +151,6 @@ def test_the_acceleration_has_a_tangential_and_a_centripetal_part():
     np.testing.assert_allclose(found, [-4.5, 1.0, 0.0])
 
 
-@settings(max_examples=50, deadline=None)
 @given(VECTORS, VECTORS, VECTORS, VECTORS)
 def test_the_inverse_undoes_the_lever_arm(value, turning, speeding, arm):
     there = lever_arm_acceleration(value, turning, speeding, arm)
@@ -174,7 +173,6 @@ def test_leading_axes_broadcast():
     np.testing.assert_allclose(back[4], one, atol=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
 @given(arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), VECTORS, VECTORS, VECTORS)
 def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
     body = rigid_transform(Rotation.from_rotvec(rotvec).as_matrix(), position)

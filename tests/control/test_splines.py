@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.interpolate import BPoly, CubicHermiteSpline
@@ -33,7 +33,6 @@ def segments(count, seed=0):
     return ends, span, quintic_coefficients(*ends, span)
 
 
-@settings(max_examples=100, deadline=None)
 @given(STATES, DURATION)
 def test_quintic_is_scipy_s_polynomial_from_derivatives(ends, span):
     oracle = BPoly.from_derivatives([0.0, span], [ends[:3], ends[3:]])
@@ -46,7 +45,6 @@ def test_quintic_is_scipy_s_polynomial_from_derivatives(ends, span):
         np.testing.assert_allclose(found, oracle(t, derivative), rtol=0, atol=1e-11 * scale)
 
 
-@settings(max_examples=100, deadline=None)
 @given(STATES, DURATION)
 def test_quintic_solves_the_boundary_value_matrix(ends, span):
     closed = quintic_coefficients(*ends, span)
@@ -58,7 +56,6 @@ def test_quintic_solves_the_boundary_value_matrix(ends, span):
     )
 
 
-@settings(max_examples=100, deadline=None)
 @given(STATES, DURATION)
 def test_the_reduced_system_its_inverse_and_its_determinant(ends, span):
     matrix, inverse = quintic_reduced_system(span)
@@ -171,7 +168,6 @@ def test_an_overshoot_lies_inside_although_the_ends_are_at_rest_and_equal():
 # cubic Hermite
 
 
-@settings(max_examples=100, deadline=None)
 @given(hnp.arrays(np.float64, 4, elements=st.floats(-10, 10)), DURATION)
 def test_hermite_is_scipy_s(ends, span):
     q0, v0, q1, v1 = ends

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.filtering.barriers import kinetic_inset, kinetic_row
@@ -11,7 +11,6 @@ from safe_wrappers.control.backup.stopping import held_limit, held_stop
 POSITIVE = st.floats(0.05, 5.0)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(-1, 10), st.floats(-3, 3), POSITIVE)
 def test_kinetic_inset_is_the_room_left_after_braking(clearance, speed, brake):
     if speed <= 0:
@@ -22,7 +21,6 @@ def test_kinetic_inset_is_the_room_left_after_braking(clearance, speed, brake):
     assert kinetic_inset(clearance, speed, brake) == pytest.approx(clearance - way, abs=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(0.1, 10), st.floats(0.05, 3), POSITIVE, st.floats(0.1, 5), st.floats(-5, 5))
 def test_kinetic_row_is_the_barrier_condition(clearance, speed, brake, gamma, accel):
     step = 1e-6
@@ -120,7 +118,6 @@ def test_the_margin_is_kept():
     assert 0.2 - 1e-9 <= closest < 0.21
 
 
-@settings(max_examples=300, deadline=None)
 @given(st.floats(0, 3), st.floats(-2, 3), POSITIVE, st.floats(0.005, 0.5))
 def test_braking_is_always_admissible_inside_the_set(clearance, speed, brake, hold):
     inset = clearance - held_stop(speed, brake, hold)
@@ -134,7 +131,6 @@ def test_braking_is_always_admissible_inside_the_set(clearance, speed, brake, ho
         assert inset_after >= -1e-9 * (1 + abs(speed))
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.floats(0, 3), st.floats(-2, 3), POSITIVE, st.floats(0.005, 0.5))
 def test_the_limit_is_the_largest(clearance, speed, brake, hold):
     # A little more acceleration than the limit leaves the set, at the end of the hold: nothing is given away.
@@ -145,7 +141,6 @@ def test_the_limit_is_the_largest(clearance, speed, brake, hold):
     assert after - held_stop(speed + more * hold, brake, hold) < 1e-12
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.floats(0, 5), st.floats(0, 3), POSITIVE, st.floats(0.005, 0.5))
 def test_held_braking_takes_little_more_than_continuous(clearance, speed, brake, hold):
     continuous = float(kinetic_inset(clearance, speed, brake))
@@ -153,7 +148,6 @@ def test_held_braking_takes_little_more_than_continuous(clearance, speed, brake,
     assert continuous - brake * hold**2 / 8 - 1e-9 <= sampled <= continuous + 1e-9
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(-1, -0.001), st.floats(-1, 2), POSITIVE, st.floats(0.01, 0.3))
 def test_outside_of_the_set_the_limit_is_finite_and_retreats(clearance, speed, brake, hold):
     limit = held_limit(clearance, speed, brake, hold)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.legged.balance import balance
@@ -74,7 +74,6 @@ def test_what_is_no_support_gives_no_number_and_harms_no_other(change):
     assert support_distances(instant, *both) == pytest.approx([0.1])
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(0, 40), st.booleans(), st.booleans())
 def test_as_one_by_one(seed, instants, contacts, coarse, rough):
     rng = np.random.default_rng(seed)

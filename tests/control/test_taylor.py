@@ -95,7 +95,7 @@ def test_in_two_variables_the_angle_and_the_length_are_those_of_the_logarithm():
         np.testing.assert_allclose(found[:, 1, 1], by_point.real, atol=1e-12)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))
 def test_a_linear_flow_is_the_matrix_exponential(n, seed):
     rng = np.random.default_rng(seed)

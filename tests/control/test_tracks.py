@@ -33,7 +33,7 @@ def test_a_double_integrator_has_the_appendix_s_closed_form():
 
 
 @given(times=st.lists(st.floats(1e-3, 5.0), min_size=1, max_size=5), seed=st.integers(0, 99))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_many_short_times_are_one_long_one_and_what_ahead_foretells(times, seed):
     stepwise = started(seed=seed)
     foretold = stepwise.ahead(np.cumsum(times).tolist())
@@ -98,7 +98,7 @@ def test_seeing_some_leaves_the_others_and_agrees_with_the_information_form():
 
 
 @given(seed=st.integers(0, 10_000), d=st.sampled_from([1, 2, 3]))
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_the_largest_deviation_is_no_less_than_in_any_direction(seed, d):
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(4, d, d)) * rng.uniform(0, 1, (4, 1, 1))

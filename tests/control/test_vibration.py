@@ -20,7 +20,6 @@ def left(rate, resonance, duration):
     return parts[0] ** 2 + parts[1] ** 2
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(0.002, 0.9), st.floats(5.0, 200.0), st.floats(1.0, 4.0))
 def test_the_shortest_smoothstep_leaves_no_more_in_its_resonance_and_in_faster_ones(share, resonance, faster):
     span = shortest_smoothstep(share, resonance)
@@ -29,7 +28,7 @@ def test_the_shortest_smoothstep_leaves_no_more_in_its_resonance_and_in_faster_o
     assert found <= share + 1e-9
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_modes_are_scipys_and_light_damping_moves_its_eigenvalues_as_they_say(seed):
     rng = np.random.default_rng(seed)

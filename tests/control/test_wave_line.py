@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.teleop.wave_line import WaveLine
@@ -52,7 +52,6 @@ def finished(rule, waves, late):
     return line, np.array(out)
 
 
-@settings(max_examples=120, deadline=None)
 @given(st.sampled_from(RULES), traffic(), st.booleans())
 def test_no_more_comes_out_than_has_arrived(rule, given_traffic, declare_lost):
     waves, late = given_traffic

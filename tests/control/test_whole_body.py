@@ -133,7 +133,7 @@ def in_full(problem, edges=4):
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     k=st.integers(0, 5),
@@ -255,7 +255,7 @@ def segment_point(a, b, z):
     return a + (b - a) * min(max(along, 0.0), 1.0)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 1000), k=st.integers(1, 3))
 def test_the_cone_is_at_least_as_good_as_any_pyramid_and_many_edges_come_close(seed, k):
     problem = robot(seed, k=k)
@@ -361,7 +361,7 @@ def test_what_no_control_does_is_infeasible_and_misses_least(solve):
     assert_says_the_truth(sinking, found)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 1000))
 def test_the_least_violation_is_the_least(seed):
     # Frictionless contacts: forces are pressures, and the oracle is a bounded least squares problem.

@@ -51,12 +51,12 @@ def test_costs_equal_substep_by_substep_judging(make_env, level):
     seen = {(0.0, 0.0): 0, (0.0, 1.0): 0, (1.0, 1.0): 0}
     fresh = mujoco.MjData(env.model)
     env.reset(seed=level)
-    for t in range(1500):
-        if t % 300 == 0:
+    for t in range(750):
+        if t % 150 == 0:
             env.reset()
         # Straight at hazards and vases in turn, so that edges are crossed often.
         targets = np.concatenate([env.hazard_positions, env.vase_positions])
-        action = chase(env, rng, targets[t // 60 % len(targets)])
+        action = chase(env, rng, targets[t // 30 % len(targets)])
         data = copy.copy(env.data)
         data.ctrl[:] = action
         substeps = []
@@ -203,22 +203,6 @@ def test_sleeping_vases_change_nothing(make_env):
             break
     assert hits == 8
     assert asleep.vase_positions[0, 0] > 0.51
-
-
-def test_same_seed_same_episode(env):
-    def episode():
-        rng = np.random.default_rng(0)
-        observations = [env.reset(seed=42)[0]]
-        for _ in range(120):
-            observations.append(env.step(chase(env.unwrapped, rng))[0])
-        return np.array(observations), env.unwrapped.goal_position
-
-    first, second = episode(), episode()
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
-    third = env.reset(seed=43)[0]
-    assert not np.array_equal(third, first[0][0])
-    assert not np.array_equal(env.reset()[0], third)  # unseeded: the next episode, not the same again
 
 
 def test_info_has_the_same_keys_and_types_always(env):

@@ -2,8 +2,6 @@
 
 import functools
 import pickle
-import subprocess
-import sys
 import warnings
 
 import gymnasium as gym
@@ -241,14 +239,7 @@ def test_every_frame_and_the_window_are_given_the_patrols(monkeypatch, mode):
         assert all((marker["size"][:2] == env.patrol_radius).all() for marker in viewer.drawn)
 
 
-def gl_works():
-    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 32, 32).render()"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
-
-
-def test_frames_are_point_mazes_but_for_the_patrols():
-    if not gl_works():
-        pytest.skip("no working GL here (libosmesa6 and MUJOCO_GL=osmesa, or MUJOCO_GL=egl, are enough)")
+def test_frames_are_point_mazes_but_for_the_patrols(gl):
     options = {"render_mode": "rgb_array", "width": 160, "height": 160}
     ours, theirs = gym.make(PATROLLED_MAZE_ID, **options), gym.make("PointMaze_UMaze-v3", **options)
     env, centres = ours.unwrapped, []

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -34,7 +34,6 @@ def test_after_two_secants_differences_are_made_anew_and_not_five_times():
     assert len(made) == 4 and not rows[12].offsets.size and not rows[13].offsets.size
 
 
-@settings(max_examples=60, deadline=None)
 @given(first=arrays(float, 2, elements=numbers), second=arrays(float, 2, elements=numbers))
 def test_a_secant_explains_the_change_and_leaves_other_directions_alone(first, second):
     step = second - first

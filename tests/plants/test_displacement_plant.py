@@ -55,11 +55,11 @@ def inputs(data):
 
 @every_env
 def test_every_substep_is_the_envs_own_to_the_last_bit(env_id):
-    env = gym.make(env_id, max_episode_steps=70)
+    env = gym.make(env_id, max_episode_steps=35)
     raw, plant = env.unwrapped, bound(env)
     seen = watched(raw)
     over, episode = True, 0
-    for k, action in enumerate(actions(0, 210)):
+    for k, action in enumerate(actions(0, 80)):
         if over:
             env.reset(seed=episode)
             episode += 1

@@ -55,7 +55,7 @@ class Record(BaseCallback):
         return np.stack([step[key] for step in self.steps])
 
 
-def learn(mode, n_envs=1, steps=200, algorithm=SAC, vec_env=DummyVecEnv, make=None, **settings):
+def learn(mode, n_envs=1, steps=120, algorithm=SAC, vec_env=DummyVecEnv, make=None, **settings):
     """A trained model with the buffer under test, and the record of its steps."""
     envs = vec_env([make or BUFFERS[mode]] * n_envs)
     noise = None if algorithm is SAC else NormalActionNoise(np.zeros(1), 0.6 * np.ones(1))

@@ -42,7 +42,7 @@ def test_a_free_body_is_named_part_by_part():
     assert values["hip_1, angle (rad)"] == data.qpos[7]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     heading=st.floats(-3.1, 3.1),
     ahead=st.floats(0.25, 0.6),

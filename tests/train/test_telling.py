@@ -15,7 +15,7 @@ PLANTED = {
 
 
 @pytest.mark.parametrize("planted", PLANTED)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(columns=st.permutations(range(6)))
 def test_the_planted_pair_is_found_wherever_it_is(planted, columns):
     a, b = columns[:2]

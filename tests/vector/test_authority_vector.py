@@ -5,15 +5,14 @@ import functools
 import numpy as np
 import pytest
 from authority_worlds import TASKS, CarriedOn
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_episodes import lengths
 from single_loops import assert_same_episodes, by_hand, script, unroll
-from vector_worlds import sub_envs
+from vector_worlds import KINDS, WAYS, sub_envs
 
 SEED, STEPS = 5, 30
-KINDS = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 ENDS = {"ends": [[7, -9, 5], [-6, 8, 8], [9, 4, -7]]}
 every_mode = pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 pytestmark = [
@@ -58,8 +57,7 @@ def test_the_episodes_by_hand_have_in_them_what_is_to_be_compared(task):
         assert {bool(s.info[flag]) for s in steps} == {True, False}, flag
 
 
-@every_mode
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "mode"), WAYS)
 @pytest.mark.parametrize("task", TASKS)
 def test_a_vector_env_is_its_single_envs(task, kind, mode):
     envs = KINDS[kind](sub_envs(TASKS[task]), autoreset_mode=mode)
@@ -76,7 +74,7 @@ def test_any_ends_and_any_actions(mode):
     envs = SyncVectorEnv(sub_envs(TASKS["cart"]), autoreset_mode=mode)
     shape = envs.single_action_space.shape
 
-    @settings(max_examples=10, deadline=None)
+    @settings(max_examples=10)
     @given(
         seed=st.integers(0, 2**20),
         ends=st.lists(lengths, min_size=3, max_size=3),

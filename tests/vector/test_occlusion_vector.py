@@ -5,8 +5,9 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from single_loops import assert_same_info
+from vector_worlds import KINDS, WAYS
 
 import safe_wrappers as sw
 
@@ -35,10 +36,9 @@ def episode(seed):
     return told
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
-@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
+@pytest.mark.parametrize(("kind", "mode"), WAYS)
 def test_first_episodes_are_the_single_envs(kind, mode):
-    envs = kind([partial(make, i) for i in range(2)], autoreset_mode=mode)
+    envs = KINDS[kind]([partial(make, i) for i in range(2)], autoreset_mode=mode)
     wanted = [episode(SEED + i) for i in range(2)]
     try:
         observations, infos = envs.reset(seed=SEED)

@@ -2,22 +2,19 @@
 example leaves behind (an episode half-way, commands in flight) must be gone at the next one's reset."""
 
 import pytest
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from hypothesis import given, settings
 from random_episodes import STEPS, plays, spoken
 from single_loops import assert_same_episodes, by_hand, unroll
-from vector_worlds import cart, sub_envs
+from vector_worlds import KINDS, WAYS, cart, sub_envs
 
-KINDS = {"sync": (SyncVectorEnv, 16), "async": (AsyncVectorEnv, 8)}
+EXAMPLES = {"sync": 16, "async": 8}
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "mode"), WAYS)
 def test_any_actions_and_any_ends(kind, mode):
-    make, examples = KINDS[kind]
-    envs = make(sub_envs(cart), autoreset_mode=mode)
+    envs = KINDS[kind](sub_envs(cart), autoreset_mode=mode)
 
-    @settings(max_examples=examples, deadline=None)
+    @settings(max_examples=EXAMPLES[kind])
     @given(play=plays)
     def check(play):
         actions, options = spoken(play["said"]), {"ends": play["ends"]}

@@ -117,7 +117,7 @@ def test_a_vec_env_is_its_single_envs(task, kind):
 def test_any_actions_and_any_ends(kind, examples):
     envs = KINDS[kind]([functools.partial(monitored_cart, i) for i in range(3)])
 
-    @settings(max_examples=examples, deadline=None)
+    @settings(max_examples=examples)
     @given(play=plays)
     def check(play):
         actions, options = spoken(play["said"]), {"ends": play["ends"]}

@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import safe_wrappers as sw
 from safe_wrappers.info import COST, COST_SUBSTEP
@@ -159,6 +160,11 @@ def rover(index=0):
 
 
 TASKS = {"cart": cart, "point_goal": point_goal, "reacher": reacher, "pendulum": pendulum, "rover": rover}
+
+
+KINDS = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
+WAYS = [*(("sync", mode) for mode in AutoresetMode), ("async", AutoresetMode.SAME_STEP)]
+"""Vector envs and their modes. Processes send what any env says: the mode that says most at once is enough."""
 
 
 def sub_envs(make, n=3):

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import ruckig
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
@@ -37,7 +37,6 @@ numbers = st.integers(-800, 800).map(lambda thousandths: thousandths / 1000.0)
 
 
 @given(numbers, numbers, st.floats(-0.4, 0.4), st.floats(-0.9, 0.9), st.floats(0.0, 0.5))
-@settings(max_examples=200, deadline=None)
 def test_what_a_motion_reaches_is_admitted_and_rest_needs_the_constrained_time(q, v, a, goal, late):
     v, a = 0.9 * v, a if abs(v) < 0.5 else 0.0  # a start that can keep the speed limit
     needed = quickest((q, v, a), (goal, 0.0, 0.0))

@@ -5,15 +5,13 @@ belongs to a wrapper of a later release and is left out here.
 """
 
 import copy
-import pickle
 import re
 import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from worlds import Cart, Raw, SpeedRow, cart_plant, drift, push, read, wall
+from worlds import Cart, Raw, SpeedRow, cart_plant, read, wall
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -875,80 +873,3 @@ def test_filter_time_is_an_attribute_and_not_in_info():
     infos = full_throttle(filtered, 10)
     assert filtered.filter_calls == 10 and filtered.filter_seconds > 0.0
     assert not any("second" in k or "time" in k for k in infos[0])
-
-
-# Vector envs --------------------------------------------------------------------------------------------------
-
-
-def fast_cart():
-    """A cart under its limit whose episodes are short; module level, so that workers can import it."""
-    constraint = sw.constraints.Clearance(
-        [sw.constraints.Plane([0.4], [-1.0])], braking=1.0, position=[0], velocity=[1]
-    )
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=0.1)
-    return gym.wrappers.TimeLimit(sw.CBFActionFilter(Cart(), [constraint], plant=plant), 12)
-
-
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
-def test_inside_vector_envs(kind, mode):
-    envs = kind([fast_cart, fast_cart], autoreset_mode=mode)
-    single = fast_cart()
-    try:
-        envs.reset(seed=[1, 2])
-        single.reset(seed=1)
-        ended = False
-        intervened = 0
-        for _ in range(30):
-            mask = None
-            if mode == AutoresetMode.DISABLED and ended:
-                mask = np.array([True, True])
-                envs.reset(options={"reset_mask": mask})
-                single.reset()
-                ended = False
-            skip = ended and mode == AutoresetMode.NEXT_STEP
-            _, _, _, truncated, infos = envs.step(np.ones((2, 1), np.float32))
-            if skip:
-                single.reset()
-                ended = False
-                continue
-            expected = single.step(np.ones(1, np.float32))
-            ended = bool(expected[3])
-            assert bool(truncated[0]) == ended
-            final = infos["final_info"] if ended and mode == AutoresetMode.SAME_STEP else infos
-            for key in (*BOOLS, *FLOATS):
-                assert final[key].dtype == (np.bool_ if key in BOOLS else np.float64), key
-                assert final[f"_{key}"].all(), key
-                assert final[key][0] == expected[4][key], key
-            for key in ("proposed_action", "executed_action"):
-                np.testing.assert_array_equal(final[key][0], expected[4][key])
-            intervened += int(final["cbf/intervened"].sum())
-            if ended and mode == AutoresetMode.SAME_STEP:
-                single.reset()
-                ended = False
-        assert intervened >= 4
-    finally:
-        envs.close()
-
-
-# Recording and pickling ---------------------------------------------------------------------------------------
-
-
-def test_a_pickled_filter_goes_on_where_it_was():
-    filtered = sw.protect(gym.make("SafePointGoal1-v0"))
-    filtered.reset(seed=0)
-    again = pickle.loads(pickle.dumps(filtered.constraints))
-    assert [type(c) for c in again] == [type(c) for c in filtered.constraints]
-
-
-def test_a_recorded_filter_on_point_goal_is_rebuilt_from_json():
-    filtered = sw.protect(gym.make("SafePointGoal2-v0"), margin=0.01)
-    rebuilt = gym.make(gym.envs.registration.EnvSpec.from_json(filtered.spec.to_json()))
-    assert isinstance(rebuilt, sw.CBFActionFilter)
-    filtered.reset(seed=1), rebuilt.reset(seed=1)
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        action = rng.uniform(-1, 1, 2).astype(np.float32)
-        mine, theirs = filtered.step(action)[4], rebuilt.step(action)[4]
-        assert mine["executed_action"].tobytes() == theirs["executed_action"].tobytes()
-        assert mine["cbf/margin"] == theirs["cbf/margin"]

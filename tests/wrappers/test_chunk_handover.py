@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from chunk_worlds import Line, Wander, counting_plant
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from slow_handover import BLENDS, Slow, measured
 
@@ -192,7 +192,6 @@ def play(scenario):
     return env, oracle, steps
 
 
-@settings(max_examples=250, deadline=None)
 @given(scenarios())
 def test_every_command_and_every_figure_is_the_slow_simulators(scenario):
     env, oracle, steps = play(scenario)
@@ -224,7 +223,6 @@ def test_every_command_and_every_figure_is_the_slow_simulators(scenario):
         assert reward == pytest.approx(sum(0.5 * (k + 1) for k in range(t - len(own), t)))
 
 
-@settings(max_examples=250, deadline=None)
 @given(scenarios(blends=BLENDS, limited=True))
 def test_no_two_neighbours_are_farther_apart_than_the_limit_allows(scenario):
     """Also where the simulator is not asked: ties, and numbers as coarse as the limit."""
@@ -236,7 +234,6 @@ def test_no_two_neighbours_are_farther_apart_than_the_limit_allows(scenario):
     assert np.isfinite(commands).all()
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     scenarios(blends=BLENDS, limited=True),
     st.sampled_from([1e2, 1e5, 1e8, 1e30, 3e38]),
@@ -252,7 +249,6 @@ def test_the_limit_holds_in_infinite_boxes_where_float32_is_coarser(scenario, sc
     assert np.abs(np.diff(commands, axis=0)).max(initial=0.0) <= limit * HOLD
 
 
-@settings(max_examples=100, deadline=None)
 @given(scenarios(size=1))
 def test_chunks_of_one_against_the_simulator(scenario):
     test_every_command_and_every_figure_is_the_slow_simulators.hypothesis.inner_test(scenario)

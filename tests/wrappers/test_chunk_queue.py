@@ -6,7 +6,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.wrappers.handover.queue import ChunkQueue
@@ -66,7 +66,6 @@ def test_the_fallback_is_not_asked_while_there_are_commands():
     run(q, 3, never)
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 4), st.integers(0, 6), st.integers(1, 6)), min_size=1, max_size=8),
     st.randoms(use_true_random=False),
@@ -182,7 +181,6 @@ def test_a_refused_chunk_may_be_asked_for_again():
     assert controls(run(q, 1, admit=lambda commands: True)) == [201]
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 3), st.integers(1, 3))
 def test_the_ensemble_by_its_formula(seed, decay, m):
     rng = np.random.default_rng(seed)

@@ -43,7 +43,7 @@ pulses = st.lists(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 50), speed=st.floats(0.0, 3.1), controls=pulses)
 def test_no_control_sequence_costs_without_a_flag(seed, speed, controls):
     env = recipe("HalfCheetah")
@@ -59,7 +59,7 @@ def test_no_control_sequence_costs_without_a_flag(seed, speed, controls):
                 np.testing.assert_array_equal(info["executed_action"], np.array(control, np.float32))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 50), average=st.sampled_from(["step", "substep"]), controls=pulses)
 def test_nor_without_a_margin(seed, average, controls):
     # Without a margin only what the executed action loses in rounding to float32 lies between the limit and a cost.

@@ -1,10 +1,6 @@
-import pickle
-
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils.env_checker import check_env
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -58,20 +54,6 @@ def test_a_recorder_outside_counts_it_as_the_task_s_own():
     summary = infos[-1][keys.EPISODE_SUMMARY]
     assert summary["violations"] == summary["cost"] == infos[-1]["interventions/cost"] == hits
     assert "cost_substep" not in summary and np.isnan(infos[-1]["interventions/cost_substep"])
-
-
-@pytest.mark.parametrize("fn", [tip_speed, f"{__name__}:tip_speed"])
-def test_it_is_rebuilt_from_its_spec_and_from_json(fn):
-    env = pendulum(fn)
-    assert env.spec.additional_wrappers[-1].kwargs == {"fn": f"{__name__}:tip_speed"}
-    for again in (
-        gym.make(env.spec),
-        gym.make(EnvSpec.from_json(env.spec.to_json())),
-        pickle.loads(pickle.dumps(env)),
-    ):
-        assert again.fn is tip_speed
-        assert [s[4] for s in drive(again)] == [s[4] for s in drive(env)]
-    check_env(pendulum(fn), skip_render_check=True)
 
 
 def test_what_cannot_be_imported_is_still_rebuilt_by_gym_make():

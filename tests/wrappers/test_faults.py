@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from braked_cart import BrakedCart, cart_plant, lease, read_cart, stop
 from gymnasium.utils.env_checker import check_env
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
@@ -127,7 +127,6 @@ def test_repeated_commands_keep_their_stamp(numbers, share):
         assert active[t] == (number < share)
 
 
-@settings(deadline=None)
 @given(delays=st.lists(st.floats(0.0, 0.7), min_size=1, max_size=30))
 def test_jitter_brings_the_newest_that_is_there_and_never_an_older_one(delays):
     ear = Ear(BrakedCart())

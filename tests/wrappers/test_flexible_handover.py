@@ -42,7 +42,7 @@ def shortest(share, resonance):
     return spans[np.argmax(smoothstep_share(resonance * spans) <= share)]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 5))
 def test_held_chunks_are_a_sum_of_whole_smoothsteps_however_often_a_seam_comes(seed, horizon):
     rng = np.random.default_rng(seed)

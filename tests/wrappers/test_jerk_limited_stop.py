@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import ruckig
 from braked_cart import cart_plant
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
@@ -136,7 +136,6 @@ def admission(state, axes=1, **more):
     return Admission(Nowhere(), LIMITS | more, lambda env: state, axes)
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     st.floats(0.0, 1.0),
     st.floats(0.0, 2.5),

@@ -137,7 +137,7 @@ def follow(seed, steps=60):
     return counts
 
 
-@settings(max_examples=120, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_every_step_is_what_the_book_says_and_nothing_is_hit(seed):
     follow(seed)

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from chunk_worlds import Line
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
@@ -29,7 +29,6 @@ def flat(*levels, entries=12):
     return [np.full((entries, 1), level) for level in levels]
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
     st.floats(1.0, 40.0),

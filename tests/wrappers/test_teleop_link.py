@@ -38,7 +38,7 @@ def traffic(made, ticks=400):
     return sent, came, order
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     delay=st.integers(0, 30),
     jitter=st.integers(0, 30),

@@ -79,11 +79,6 @@ def test_entries_of_a_chunk_are_executed_bit_for_bit():
     assert len(inner.sent) == 4
 
 
-def test_it_is_recorded():
-    env = sw.ChunkHandover(gym.make("Reacher-v5"), 3, 4, steps_per_entry=2, blend="replace")
-    assert gym.make(env.spec).action_space == env.action_space
-
-
 @pytest.mark.parametrize(
     ("sizes", "words"),
     [

@@ -1,0 +1,105 @@
+"""Every exported constraint and obstacle is plain data: what it was given survives JSON, every argument of it."""
+
+import json
+import math
+from dataclasses import MISSING, fields
+
+import gymnasium as gym
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+import safe_wrappers as sw
+from safe_wrappers import constraints as of
+from safe_wrappers.constraints.obstacles import obstacle_from
+from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.serialize import constraint_from, plain_data
+
+OBSTACLES = [
+    of.Box([1.0, 0.0, 0.0], [0.1, 0.2, 0.3]),
+    of.Disc([0.1, 0.2], 0.05),
+    of.Discs("centres", 0.1, "velocities"),
+    of.Plane([0.0, 0.25], [0.0, -1.0]),
+    of.Sphere([0.12, 0.05, 0.01], 0.03),
+    of.TrackedDiscs(0.3, 2.0, 0.5, "car_tracks"),
+]
+DISC, DISCS, SQUARE = OBSTACLES[1], OBSTACLES[2], [[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]
+CONSTRAINTS = [
+    of.Clearance(OBSTACLES[3:4], 24.0, bodies=["tool"], radius=0.015, margin=0.1, state_error=0.01),
+    of.Clearance(OBSTACLES[3:4], 24.0, sites=["tip"], geoms=["link0"]),
+    of.Clearance([DISC], 2.0, position=[0, 1], velocity=[2, 3]),
+    of.CoastingClearance([DISC], [of.Discs("vases", 0.1)], SQUARE, "car", "model", 0.01, 20, 0.1, 0.5, True),
+    of.ContactFeasibility(0.6, 0.02, ["torso"], 0.01),
+    of.EscapeClearance("robot", [OBSTACLES[5], DISCS, OBSTACLES[3]], 0.2, 0.1, 2.0),
+    of.HeadingDriveClearance([of.Discs("hazards", 0.2)], "robot", 0.004, 0.01, 0.1, False, True),
+    of.ImpactSpeedLimit(["body1"], ["sideE"], None, "hands and fingers", True, 1e4, 20.0, 3.0, 1.0, 4),
+    of.ImpactSpeedLimit(["fingertip"], ["sideE"], force_limit=100.0, stiffness=1e4),
+    of.JointPositionLimit([-1.0, -math.inf], 2.0, ["joint1", "joint0"], 0.1, 7, 0.5),
+    of.JointSpeedLimit([4.0, 3.0], ["joint1", "joint0"], 0.1, 2, 0.5),
+    of.SingularityMargin(
+        0.003, body="fingertip", directions="xy", joints=["joint0", "joint1"], margin=0.1, max_decrease=2.0
+    ),
+    of.SingularityMargin(
+        geom="tip", rotations="z", length=0.2, frame="own", task_speed=0.1, rate_limit=6.0, horizon=7
+    ),
+    of.SingularityMargin(0.003, site="grip"),
+    of.SpeedLimit(1.5, "torso", "-x", "substep", 0.1, 4, 0.7, 0.6, True),
+    of.Stance(0.6, "exact", 6, 0.2, 0.02, 0.1),
+    of.SupportMargin(0.02, 0.01),
+    of.TrackPermission("robot", 3.0, 0.1, ("car0",)),
+    of.Traction(["left", "right"], 0.1, 0.3, 0.4, 0.01),
+    of.Upright("trunk", 0.4, 1.5, 0.5, 0.05, 6, 0.2),
+    of.WallClearance(0.02, 4.0),
+    of.Workspace(
+        [None, -0.5, None], [0.5, None, None], [DISC, *OBSTACLES[:3:2]], ["tip"], radius=0.01, margin=0.02
+    ),
+    of.Workspace(high=[1.0, 1.0, 1.0], sites=["grip"], geoms=["link0"], horizon=7, max_decrease=0.3),
+]
+HOLD_FUNCTIONS = {"Barrier", "PredictiveShield"}
+"""So that `gym.make(env.spec)` has them again, and JSON not."""
+given = pytest.mark.parametrize("given", CONSTRAINTS + OBSTACLES, ids=repr)
+
+
+def again(data):
+    return (
+        constraint_from if data["kind"] not in {type(one).__name__ for one in OBSTACLES} else obstacle_from
+    )(data)
+
+
+def test_every_exported_one_is_here_and_says_what_it_promises():
+    named = {type(one).__name__ for one in CONSTRAINTS + OBSTACLES} | HOLD_FUNCTIONS
+    assert named | {"BoundBackupClearance"} == set(of.__all__)  # a base class
+    proved = {type(one).__name__ for one in CONSTRAINTS if one.promise == "proved"}
+    assert proved == {"CoastingClearance", "HeadingDriveClearance", "WallClearance"}
+    assert {one.promise for one in CONSTRAINTS} == {"proved", "best effort"}
+
+
+def test_every_argument_is_given_another_value_than_its_own_somewhere():
+    for kind in {type(one) for one in CONSTRAINTS + OBSTACLES}:
+        for field in fields(kind):
+            if (
+                field.init and field.default is not MISSING and field.name != "validated"
+            ):  # it finds that itself
+                values = [getattr(one, field.name) for one in CONSTRAINTS + OBSTACLES if type(one) is kind]
+                assert any(value != field.default for value in values), (kind.__name__, field.name)
+
+
+@given
+def test_it_survives_json(given):
+    rebuilt = again(json.loads(json.dumps(plain_data(given))))
+    assert rebuilt == given and type(rebuilt) is type(given)
+    with pytest.raises(UnknownNameError, match="no_such"):
+        again(plain_data(given) | {"no_such": 1})
+
+
+def test_so_does_a_filter_with_a_list_of_them():
+    limits = [
+        of.JointPositionLimit(-1.0, 1.0, ["joint1"], margin=0.01, horizon=5),
+        of.Workspace([-0.15, None, None], None, [DISC], bodies=["fingertip"], margin=0.003, horizon=3),
+        of.SingularityMargin(body="fingertip", directions="xy", task_speed=0.1, rate_limit=5.0, horizon=3),
+    ]
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
+    for spec in (env.spec, EnvSpec.from_json(env.spec.to_json())):
+        rebuilt = gym.make(spec)
+        assert rebuilt.constraints == limits
+        assert list(map(type, rebuilt.constraints)) == list(map(type, limits))
+        assert rebuilt.constraints[2].validated == env.constraints[2].validated is not None

@@ -1,0 +1,48 @@
+"""What is compiled gives the same bits in plain Python, over all that the tests named here go through."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from safe_wrappers.control.numerics.compiled import IS_COMPILED
+
+FOLDERS = [str(Path(__file__).parent / name) for name in ("control", "constraints", "plants")]
+CALLS = {
+    "test_active_set": ("answers", [600]),
+    "test_approach_rows": ("random_looks", [200]),
+    "test_drive_among_discs": ("random_scenes", [400]),
+    "test_euler_forecast": ("forecast_digest", []),
+    "test_point_decision": ("random_scenes", [200]),
+}
+"""Module -> its function that returns a digest, and the arguments."""
+
+
+def found(module):
+    name, arguments = CALLS[module]
+    return json.loads(json.dumps(getattr(importlib.import_module(module), name)(*arguments)))
+
+
+@pytest.fixture(scope="module")
+def in_plain_python():
+    code = "import json, test_plain_python as t; print(json.dumps([t.IS_COMPILED, {m: t.found(m) for m in t.CALLS}]))"
+    path = os.pathsep.join([str(Path(__file__).parent), *FOLDERS, *sys.path])
+    environment = os.environ | {"SAFE_WRAPPERS_COMPILED": "0", "PYTHONPATH": path}
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    compiled, digests = json.loads(said.stdout.splitlines()[-1])
+    assert not compiled
+    return digests
+
+
+@pytest.mark.parametrize("module", CALLS)
+def test_plain_python_gives_the_same_bits(module, in_plain_python, monkeypatch):
+    assert IS_COMPILED or os.environ.get("SAFE_WRAPPERS_COMPILED") == "0"
+    for folder in FOLDERS:
+        monkeypatch.syspath_prepend(folder)
+    assert found(module) == in_plain_python[module]
