@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, numbers_of, settings_from
+from safe_wrappers.checks import Array, non_negative, numbers_of, settings_from
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
 from safe_wrappers.deprecation import deprecated_parameters
@@ -23,7 +23,7 @@ from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_mode
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, outside, receiver_inside
 from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.handover.smoothstep import smoothstep
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -20,7 +20,7 @@ from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.command_gate import CommandGate
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array, whole_steps
 from safe_wrappers.wrappers.lease.admission import Admission, Measured
 from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, StoppingBudget, budget_from

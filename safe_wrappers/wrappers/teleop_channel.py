@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import settings_from
+from safe_wrappers.checks import Array, settings_from
 from safe_wrappers.control.teleop.wave_line import Rule
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -20,7 +20,7 @@ from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.command_gate import CommandGate
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, Reset, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, action_array
 from safe_wrappers.wrappers.teleop.coding import Coding, Down, Passivity, Up, coding_from
 from safe_wrappers.wrappers.teleop.link import Line, Link, link_from

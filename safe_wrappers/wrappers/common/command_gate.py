@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import Array
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, outside
 
 

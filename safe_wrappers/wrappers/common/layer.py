@@ -8,7 +8,6 @@ from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import numbers_of
 from safe_wrappers.errors import ActionError, UnsupportedEnvError
@@ -18,7 +17,6 @@ from safe_wrappers.serialize import recorded
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.episode_guard import EpisodeGuard
 
-Array = NDArray[np.float64]
 Env = gym.Env[Any, Any]
 Reset = tuple[Any, dict[str, Any]]
 """What `reset` returns: observation and info."""
