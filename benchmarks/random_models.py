@@ -10,7 +10,8 @@ the last bit (to 0.001 where bodies may sleep, which MuJoCo's state does not tel
 and in the action space, and f + g u is MuJoCo's acceleration where no constraint is active. It is *refused* if the
 library says so and names the part of the model. Everything else is a *defect*: another exception, a crash, more than
 two minutes, a number that is wrong. Models run in batches, each in a process of its own, so that a crash is seen and
-has a seed. A defect that was found is tried again when the command is.
+has a seed; a crash of MuJoCo alone, before the library is asked, counts as refused by MuJoCo. A defect that was found
+is tried again when the command is.
 """
 
 import argparse
@@ -25,7 +26,7 @@ import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ STEPS = 3
 BATCH = 500
 LONGEST_S = 120.0
 """Of one model, the first one's imports and compilation included."""
+_SIMULATED = "simulated"
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _HINGE_OR_SLIDE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _READ = (
@@ -97,8 +99,11 @@ class DefectError(Exception):
     """What the library did is wrong."""
 
 
-def trial(seed: int) -> tuple[str, str]:
-    """What became of a model: "mujoco", "supported", "refused" or "defect", and why."""
+def trial(seed: int, simulated: Callable[[], None] = lambda: None) -> tuple[str, str]:
+    """What became of a model: "mujoco", "supported", "refused" or "defect", and why.
+
+    `simulated` is called once MuJoCo alone has compiled and simulated it.
+    """
     drawn = RandomModel(seed)
     rng = random.Random(f"trial {seed}")
     frame_skip, dtype = rng.choice((1, 2, 4, 5)), rng.choice((np.float32, np.float64))
@@ -108,6 +113,7 @@ def trial(seed: int) -> tuple[str, str]:
         _simulate(twin, seed)
     except (ValueError, mujoco.FatalError) as error:
         return "mujoco", str(error)
+    simulated()
     try:
         return _closed_loop(machine, twin, seed, rng)
     except SafeWrappersError as error:
@@ -280,13 +286,13 @@ def child(first: int, last: int) -> None:
     warnings.filterwarnings("error", category=RuntimeWarning, module="safe_wrappers")
     for seed in range(first, last):
         print(seed, flush=True)
-        print(json.dumps(trial(seed)), flush=True)
+        print(json.dumps(trial(seed, lambda: print(_SIMULATED, flush=True))), flush=True)
 
 
 def outcomes(first: int, last: int) -> Iterator[tuple[int, str, str]]:
     """Seed, outcome and reason of each seed, in processes that may crash or hang."""
     while first < last:
-        seed, why = first, "exit"
+        seed, ours, why = first, False, "exit"
         with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes its log into the working directory
             command = [sys.executable, "-m", "benchmarks.random_models", "--child", str(first), str(last)]
             where = os.environ | {"PYTHONPATH": str(RESULTS.parents[1]), "MUJOCO_GL": "disabled"}
@@ -296,7 +302,9 @@ def outcomes(first: int, last: int) -> Iterator[tuple[int, str, str]]:
             assert process.stdout is not None
             for line in _lines_in_time(process):
                 if line.strip().isdigit():
-                    seed = int(line)
+                    seed, ours = int(line), False
+                elif line.strip() == _SIMULATED:
+                    ours = True
                 else:
                     outcome, why = json.loads(line)
                     yield seed, outcome, why
@@ -304,8 +312,9 @@ def outcomes(first: int, last: int) -> Iterator[tuple[int, str, str]]:
             process.kill()
             code = process.wait()
         if first < last:
-            how = f"more than {LONGEST_S:g} s" if code == -9 else f"the interpreter ended with {code}"
-            yield seed, "defect", how
+            late = code == -9
+            how = f"more than {LONGEST_S:g} s" if late else f"the interpreter ended with {code}"
+            yield seed, "defect" if ours or late else "mujoco", how
             first = seed + 1
 
 

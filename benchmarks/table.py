@@ -46,11 +46,15 @@ class Task:
         return f"{self.env_id.removesuffix('-v0')}_sac{self.more}"
 
 
+SLOWER = ("action_repeat=8", "hyperparameters.gamma=0.97")
+"""An action for eight control steps: half the decisions, and half the updates."""
 TASKS = (
     Task("SafePointGoal1-v0", "goal_sac", 5),
     Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000",), "_1m"),
     Task("SafePointGoal2-v0", "goal_sac", 3),
     Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=250000",), "_1m"),
+    Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=50000", *SLOWER), "_8"),
+    Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=125000", *SLOWER), "_8_1m"),
     Task("SafeCarGoal1-v0", "goal_sac", 3),
     Task("SafeCarGoal2-v0", "goal_sac", 3),
     Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5),
@@ -61,7 +65,18 @@ TASKS = (
     Task("SafeHumanoidVelocity-v0", "velocity_sac", 3),
 )
 METRICS = ("return", "cost", "violations", "stuck", "infeasible", "intervention_rate")
-COLUMNS = ("task", "algorithm", "control_steps", "arm", "seed", "condition", "episodes", "steps", *METRICS)
+COLUMNS = (
+    "task",
+    "algorithm",
+    "control_steps",
+    "action_repeat",
+    "arm",
+    "seed",
+    "condition",
+    "episodes",
+    "steps",
+    *METRICS,
+)
 
 
 def experiment_of(task: Task, output: str) -> ExperimentConfig:
@@ -80,6 +95,7 @@ def rows_of(task: Task, experiment: ExperimentConfig) -> list[dict[str, Any]]:
             continue
         steps = arm.total_steps * arm.action_repeat
         about = {"task": task.env_id, "algorithm": arm.algorithm, "control_steps": steps}
+        about["action_repeat"] = arm.action_repeat
         found.append(about | {key: row.get(key, "") for key in COLUMNS if key not in about})
     return found
 
@@ -95,12 +111,13 @@ def cell(rows: Iterable[dict[str, Any]], metric: str) -> str:
 def markdown(rows: list[dict[str, Any]]) -> str:
     """The table that the docs show."""
     lines = [
-        "| task | control steps x seeds | trained | training: violations, all seeds | filter off: return; cost "
-        "| filter on: return; cost | stuck | infeasible |",
-        "|---|---|---|---|---|---|---|---|",
+        "| task | control steps x seeds | steps per action | trained | training: violations, all seeds "
+        "| filter off: return; cost | filter on: return; cost | stuck | infeasible |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
-    for task, steps in dict.fromkeys((row["task"], row["control_steps"]) for row in rows):
-        of_task = [row for row in rows if (row["task"], row["control_steps"]) == (task, steps)]
+    told = ("task", "control_steps", "action_repeat")
+    for task, steps, repeat in dict.fromkeys(tuple(row[key] for key in told) for row in rows):
+        of_task = [row for row in rows if tuple(row[key] for key in told) == (task, steps, repeat)]
         for arm in dict.fromkeys(row["arm"] for row in of_task):
             same = [row for row in of_task if row["arm"] == arm]
             training, off, on = (
@@ -117,6 +134,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             columns = [
                 task.removesuffix("-v0"),
                 f"{int(steps):,} x {len(on)}",
+                str(repeat),
                 arm,
                 number(sum(float(row["violations"]) for row in training)),
                 f"{cell(off, 'return')}; {cell(off, 'cost')}",

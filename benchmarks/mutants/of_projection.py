@@ -35,7 +35,7 @@ PROJECTION = Target(
         Mutant("rows[WEIGHT, i] = softened[WEIGHT, i]", "rows[WEIGHT, i] = 0.0"),
         Mutant("Projection(control, Status.FAILED, math.inf,", "Projection(control, Status.FAILED, 0.0,"),
         Mutant("if not np.isfinite(x).all() or bool((g @ x - h > allowed).any()):", "if False:"),
-        Mutant("- x).max()) <= _OPTIMALITY_TOLERANCE:", "- x).max()) <= 1e9:"),
+        Mutant("- x).max()) <= OPTIMALITY_TOLERANCE:", "- x).max()) <= 1e9:"),
         Mutant("    if solver != OWN:  # its failure", "    if False:  # its failure"),
         Mutant("multipliers[asking] = answer[1] * unit / norm", "multipliers[asking] = answer[1]"),
         Mutant(

@@ -48,7 +48,8 @@ def test_a_seed_is_always_the_same_model():
 
 
 STUB = """#!/bin/sh
-if [ "$4" = 0 ]; then echo 0; echo '["supported", ""]'; echo 1; kill -SEGV $$; fi
+if [ "$4" = 0 ]; then echo 0; echo '["supported", ""]'; echo 1; echo simulated; kill -SEGV $$; fi
+if [ "$4" = 3 ]; then echo 3; kill -SEGV $$; fi
 echo "$4"; echo '["refused", "actuator '"'hip3'"' has a delay of 0.02 s. Use AnalyticPlant"]'
 """
 
@@ -62,6 +63,7 @@ def test_a_crash_has_a_seed_and_ends_nothing(tmp_path, monkeypatch):
     assert first == (0, "supported", "")
     assert crash == (1, "defect", f"the interpreter ended with {-11}")
     assert last[:2] == (2, "refused") and kind_of(last[2]) == "actuator '...' has a delay of N s."
+    assert list(outcomes(3, 4)) == [(3, "mujoco", f"the interpreter ended with {-11}")]  # without the library
     monkeypatch.setattr(random_models, "BATCH", 3)
     run(3, tmp_path)
     assert "| defect | 1 |" in (tmp_path / "random_models.md").read_text()

@@ -10,7 +10,8 @@ BARE = dict.fromkeys(table.COLUMNS, "")
 
 
 def row(arm, seed, condition, **values):
-    about = {"task": "T-v0", "control_steps": "400", "arm": arm, "seed": seed, "condition": condition}
+    about = {"task": "T-v0", "control_steps": "400", "action_repeat": "4", "arm": arm, "seed": seed}
+    about["condition"] = condition
     return BARE | about | {"steps": "1000", "violations": "0"} | {k: str(v) for k, v in values.items()}
 
 
@@ -33,7 +34,7 @@ def test_cells_are_sums_of_violations_means_of_returns_and_shares_of_steps():
     ]
     line = table.markdown(rows).splitlines()[2]
     assert line == (
-        "| T | 400 x 2 | filtered | 7 | 21 [20, 22]; 6 [5, 7] | 12 [10, 14]; 0 [0, 0] | 0.5 % | 0 % |"
+        "| T | 400 x 2 | 4 | filtered | 7 | 21 [20, 22]; 6 [5, 7] | 12 [10, 14]; 0 [0, 0] | 0.5 % | 0 % |"
     )
 
 
@@ -44,7 +45,8 @@ def test_what_was_not_counted_is_a_dash():
         row("unfiltered", 0, "filter_on", **{"return": 10, "cost": 0, "infeasible": 1}),
     ]
     assert (
-        table.markdown(rows).splitlines()[2] == "| T | 400 x 1 | unfiltered | 3 | 20; 5 | 10; 0 | - | 0.1 % |"
+        table.markdown(rows).splitlines()[2]
+        == "| T | 400 x 1 | 4 | unfiltered | 3 | 20; 5 | 10; 0 | - | 0.1 % |"
     )
 
 
