@@ -51,6 +51,7 @@ SLOWER = ("action_repeat=8", "hyperparameters.gamma=0.97")
 TASKS = (
     Task("SafePointGoal1-v0", "goal_sac", 5),
     Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000",), "_1m"),
+    Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=50000", *SLOWER), "_8"),
     Task("SafePointGoal2-v0", "goal_sac", 3),
     Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=250000",), "_1m"),
     Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=50000", *SLOWER), "_8"),
