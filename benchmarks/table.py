@@ -5,8 +5,8 @@
     python -m benchmarks.table --collect
 
 Trains and evaluates what is missing: days on two cores; a killed command goes on where it was. Then writes
-`benchmarks/results/table.csv`, a row per run and condition, and `table.md`, which the docs show. `--collect` makes it
-of what is there.
+`benchmarks/results/table.csv`, a row per run and condition, and `table.md`, which the docs show. A row stays until
+its run is found anew, so that several machines fill one table. `--collect` makes it of what is there.
 """
 
 import argparse
@@ -77,7 +77,11 @@ COLUMNS = (
     "episodes",
     "steps",
     *METRICS,
+    "versions",
 )
+KEY = ("task", "control_steps", "action_repeat", "arm", "seed", "condition")
+ARMS = ("unfiltered", "filtered", "lagrangian")
+CONDITIONS = ("training", "filter_off", "filter_on")
 
 
 def experiment_of(task: Task, output: str) -> ExperimentConfig:
@@ -96,9 +100,38 @@ def rows_of(task: Task, experiment: ExperimentConfig) -> list[dict[str, Any]]:
             continue
         steps = arm.total_steps * arm.action_repeat
         about = {"task": task.env_id, "algorithm": arm.algorithm, "control_steps": steps}
-        about["action_repeat"] = arm.action_repeat
+        about |= {"action_repeat": arm.action_repeat, "versions": made_with()}
         found.append(about | {key: row.get(key, "") for key in COLUMNS if key not in about})
     return found
+
+
+def made_with() -> str:
+    """The versions of a row that is written now."""
+    return ", ".join(f"{name} {version(name)}" for name in VERSIONS)
+
+
+def merged(kept: list[dict[str, Any]], found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What is found takes the place of what was kept; in the order of the tasks, arms and conditions."""
+    rows = {tuple(str(row[key]) for key in KEY): row for row in [*kept, *found]}
+    tasks = list(dict.fromkeys(task.env_id for task in TASKS))
+
+    def place(key: tuple[str, ...]) -> tuple[int, ...]:
+        task, steps, repeat, arm, seed, condition = key
+        return (
+            tasks.index(task),
+            int(repeat),
+            int(steps),
+            ARMS.index(arm),
+            CONDITIONS.index(condition),
+            int(seed),
+        )
+
+    return [rows[key] for key in sorted(rows, key=place)]
+
+
+def read_table() -> list[dict[str, Any]]:
+    with RESULTS.open() as file:
+        return list(csv.DictReader(file))
 
 
 def cell(rows: Iterable[dict[str, Any]], metric: str) -> str:
@@ -122,8 +155,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         for arm in dict.fromkeys(row["arm"] for row in of_task):
             same = [row for row in of_task if row["arm"] == arm]
             training, off, on = (
-                [row for row in same if row["condition"] == condition]
-                for condition in ("training", "filter_off", "filter_on")
+                [row for row in same if row["condition"] == condition] for condition in CONDITIONS
             )
             made = sum(int(row["steps"]) for row in on)
             shares = [
@@ -143,7 +175,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
                 *shares,
             ]
             lines.append("| " + " | ".join(columns) + " |")
-    versions = ", ".join(f"{name} {version(name)}" for name in VERSIONS)
+    versions = "; or ".join(dict.fromkeys(row["versions"] for row in rows))
     return "\n".join([*lines, "", f"Made with {versions}.", ""])
 
 
@@ -151,7 +183,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     names = [task.name for task in TASKS]
     parser.add_argument("--only", nargs="+", choices=names, default=names, help="experiments")
-    parser.add_argument("--arms", nargs="+", choices=("unfiltered", "filtered", "lagrangian"))
+    parser.add_argument("--arms", nargs="+", choices=ARMS)
     parser.add_argument("--seeds", nargs="+", type=int)
     parser.add_argument("--workers", type=int, help="runs at a time (default: one per core)")
     parser.add_argument("--output", default="runs", help="where the experiments lie")
@@ -170,9 +202,8 @@ def main() -> None:
             train_experiment(part, Console())
             evaluate_experiment(part, Console())
         rows += rows_of(task, whole)
-    write_rows(RESULTS, COLUMNS, rows)
-    with RESULTS.open() as file:
-        RESULTS.with_suffix(".md").write_text(table := markdown(list(csv.DictReader(file))))
+    write_rows(RESULTS, COLUMNS, merged(read_table(), rows))
+    RESULTS.with_suffix(".md").write_text(table := markdown(read_table()))
     print(table)
 
 

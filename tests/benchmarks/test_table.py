@@ -1,7 +1,5 @@
 """The table of returns: its experiments can be made, and its cells say what the rows say."""
 
-import csv
-
 import pytest
 
 from benchmarks import table
@@ -51,7 +49,25 @@ def test_what_was_not_counted_is_a_dash():
 
 
 def test_the_shown_table_is_made_of_the_rows_beside_it():
-    with table.RESULTS.open() as file:
-        made = table.markdown(list(csv.DictReader(file)))
-    shown = table.RESULTS.with_suffix(".md").read_text()
-    assert shown.splitlines()[:-1] == made.splitlines()[:-1]  # the last line names versions
+    assert table.RESULTS.with_suffix(".md").read_text() == table.markdown(table.read_table())
+
+
+def test_a_row_found_anew_takes_the_place_of_the_one_kept_and_the_others_stay_in_order():
+    def of(env_id, arm, seed, condition, value):
+        return row(arm, seed, condition, **{"return": value}) | {"task": env_id}
+
+    kept = [
+        of("SafeCarGoal1-v0", "filtered", "0", "training", 1),
+        of("SafePointGoal1-v0", "filtered", "1", "filter_on", 2),
+        of("SafePointGoal1-v0", "filtered", "0", "filter_on", 3),
+    ]
+    found = [
+        of("SafeCarGoal1-v0", "filtered", 0, "training", 4),
+        of("SafeCarGoal1-v0", "unfiltered", 0, "filter_off", 5),
+    ]
+    assert [float(row["return"]) for row in table.merged(kept, found)] == [3, 2, 5, 4]
+
+
+def test_the_published_rows_are_in_order():
+    rows = table.read_table()
+    assert table.merged(rows, []) == rows and all(row["versions"] for row in rows)
