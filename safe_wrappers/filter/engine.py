@@ -10,6 +10,7 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
+from safe_wrappers.filter.projection import load_compiled
 from safe_wrappers.filter.search import Decision, SafeActionSearch
 from safe_wrappers.plants.plant import Plant
 
@@ -63,6 +64,7 @@ class SafetyFilter:
                 twice = f"{kind} is in the list {kinds.count(kind)} times"
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
         falling_back = Fallback(fallback, self.bound)
+        load_compiled()
         self._search = search(plant, self.bound, falling_back, solver, low, high, dtype)
         self._low, self._high = low, high
         self._narrower = not plant.bounds_are_action_space

@@ -7,6 +7,7 @@ checked. Named solvers see problems of several rows only, and their answers are 
 """
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,15 @@ def _finite_rows_only(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver
     if bool((np.abs(u) < LARGEST).all() and (np.abs(control) < LARGEST).all()):
         control = project_unchecked(u, a[fine], b[fine], lo, hi, solver).control
     return Projection(control, Status.FAILED, math.inf, np.zeros(b.size), 0)
+
+
+@cache
+def load_compiled() -> None:
+    """Load the compiled projection, or compile it (10 to 15 s, once per machine), so that no control step waits."""
+    one = np.ones(1)
+    row = one.reshape(1, 1), -0.5 * one, -one, one
+    project_unchecked(one, *row, OWN)
+    keeps_rows(one, *row)
 
 
 def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upper: Array) -> bool:
