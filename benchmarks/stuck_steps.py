@@ -4,7 +4,8 @@
     python -m benchmarks.stuck_steps
 
 Drives the trained policies of that experiment with the filter on, over the same episodes with `StuckEscape` reporting
-alone, drawing actions at random, and choosing among them by the policy's own critic; and with the policy's own noise.
+alone, drawing actions at random, and choosing among them by the policy's own critic; and with the policy's own noise,
+always and only while it is stuck.
 """
 
 import argparse
@@ -30,7 +31,8 @@ ESCAPE = {"progress": 0.1}
 """Two seconds with less than 0.1 m gained: standing, or going around in circles."""
 FIRST_SEED = 2_000_000
 TRAINED = ("unfiltered", "filtered")
-MODES = {"reported": 0.0, "random": 1.0, "critic": 2.0, "stochastic policy": 0.0}
+NOISE, NOISE_IF_STUCK = "stochastic policy", "stochastic while stuck"
+MODES = {"reported": 0.0, "random": 1.0, "critic": 2.0, NOISE_IF_STUCK: 0.0, NOISE: 0.0}
 """How long an escape lasts, s."""
 
 
@@ -38,7 +40,7 @@ def drive(
     arm: ArmConfig, used: FilterConfig, policy: TrainedPolicy, mode: str, episodes: int
 ) -> dict[str, float]:
     """Return per episode, steps, and those that were stuck, escaping and in violation."""
-    policy.deterministic = mode != "stochastic policy"
+    policy.deterministic = mode != NOISE
     torch.manual_seed(0)
     env = make_stack(arm.env, used)
     if mode == "critic":
@@ -50,11 +52,15 @@ def drive(
         observation, _ = env.reset(seed=FIRST_SEED + episode)
         policy.begin()
         over, total = False, 0.0
+        if mode == NOISE_IF_STUCK:
+            policy.deterministic = True
         while not over:
             observation, reward, terminated, truncated, info = env.step(policy(observation))
             over, total = terminated or truncated, total + float(reward)
             found["steps"] += 1
             found["stuck"] += info["cbf/stuck"]
+            if mode == NOISE_IF_STUCK:
+                policy.deterministic = not info["cbf/stuck"]
             found["escaping"] += info["cbf/escaping"]
             found["violations"] += info["cost_substep"] > 0
         returns.append(total)
