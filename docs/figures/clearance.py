@@ -63,9 +63,7 @@ def draw() -> Figure:
     inset.plot(speed, held, color=ON, label="held for 0.25 s")
     inset.plot(speed, held + speed * DELAY, color=OTHER, label="and 0.2 s of delay")
     inset.fill_between(speed, 0.0, held, color=FORBIDDEN, alpha=0.12, lw=0)
-    inset.set_ylim(0.0, 1.6)
-    inset.set_xlabel("approach speed (m/s)")
-    inset.set_ylabel("stopping distance (m)")
+    inset.set(ylim=(0.0, 1.6), xlabel="approach speed (m/s)", ylabel="stopping distance (m)")
     inset.legend(loc="upper left")
     raw = PointMass()
     plant = sw.AnalyticPlant(
@@ -86,8 +84,5 @@ def draw() -> Figure:
     chart.plot(*drive(sw.CBFActionFilter(raw, [disc], plant=plant)).T, color=ON)
     chart.add_patch(Circle(CENTER, RADIUS, color=FORBIDDEN, alpha=0.35, lw=0))
     chart.add_patch(Circle(CENTER, RADIUS + 0.1, fill=False, color=FORBIDDEN, lw=0.8, ls=":"))
-    chart.set_aspect("equal")
-    chart.set_xlim(-0.1, 4.2)
-    chart.set_xlabel("x (m)")
-    chart.set_ylabel("y (m)")
+    chart.set(aspect="equal", xlim=(-0.1, 4.2), xlabel="x (m)", ylabel="y (m)")
     return figure

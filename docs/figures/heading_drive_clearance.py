@@ -56,8 +56,7 @@ def draw() -> Figure:
         ax.plot(0.0, 0.0, "s", color=INK, ms=5)
         ax.add_patch(Circle((0.72, 0.12), 0.2, color=FORBIDDEN, alpha=0.35, lw=0))
         bare(ax)
-        ax.set_xlim(-0.1, 1.0)
-        ax.set_ylim(-0.58, 0.34)
+        ax.set(xlim=(-0.1, 1.0), ylim=(-0.58, 0.34))
     return figure
 
 

@@ -41,13 +41,9 @@ def draw() -> Figure:
     right.text(1.2, -0.1, "row and bounds\ntogether", color=ON, va="center")
     arrow(right, nominal, normal, offset)
     for ax in (left, right):
-        ax.set_xlim(-1.25, 1.35 if ax is left else 2.35)
-        ax.set_ylim(-1.25, 1.25)
-        ax.set_aspect("equal")
-        ax.set_xlabel("$u_1$")
+        ax.set(xlim=(-1.25, 1.35 if ax is left else 2.35), ylim=(-1.25, 1.25), aspect="equal", xlabel="$u_1$")
         ax.set_ylabel("$u_2$", rotation=0)
-        ax.set_xticks([-1, 0, 1])
-        ax.set_yticks([-1, 0, 1])
+        ax.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
     return figure
 
 

@@ -111,8 +111,7 @@ def _in_an_episode(
     stairs = {(arm, event): (edges, scale * _shares(logs[arm], event, edges)) for arm, event in shown}
 
     def label(axes: Axes) -> None:
-        axes.set_xlabel("step in the episode")
-        axes.set_xlim(0, last + 1)
+        axes.set(xlabel="step in the episode", xlim=(0, last + 1))
 
     return _timeline(name, title, unit, reading, stairs, arms, label)
 
