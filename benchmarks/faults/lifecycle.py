@@ -51,8 +51,7 @@ def _second(act: str) -> Cell:
         inside.wait(20.0)
         error: Exception | None = None
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(action="ignore"):
                 if act == "reset":
                     session.env.reset(seed=0)
                 else:

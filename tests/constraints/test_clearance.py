@@ -216,8 +216,7 @@ def test_spheres_and_boxes_around_an_arm():
                 worst = min(worst, *(o.nearest(p, None).distance[0] for o in clear.obstacles))
         return worst
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         kept = deepest(sw.CBFActionFilter(gym.make("Reacher-v5"), [clear]), True)
     bare = deepest(gym.make("Reacher-v5"), False)
     assert bare < -0.01

@@ -203,8 +203,7 @@ def test_a_broken_limit_shows_in_the_margin(average):
     filtered.reset(seed=0)
     filtered.step(np.array([10.0]))  # 1 m/s at its end, 0.55 m/s on average
     speed = {"step": 0.55, "substep": 1.0}[average]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", sw.UnsafeStateWarning)
+    with warnings.catch_warnings(action="ignore", category=sw.UnsafeStateWarning):
         info = filtered.step(np.array([0.0]))[4]
     assert info["cbf/margin"] == pytest.approx(0.8 - speed, abs=1e-9)
     assert info["cbf/unsafe"] == (speed > 0.8)

@@ -165,15 +165,13 @@ def test_a_wheel_that_is_braked_locked_is_let_go():
 def test_a_policy_that_is_not_finite_is_braked_for_within_the_limit():
     env = rover()
     env.reset(seed=0, options={"layout": OPEN | {"ground": "wet", "speed": 3.0}})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         infos = [env.step(np.full(5, np.nan, dtype=np.float32))[4] for _ in range(60)]
     assert all(info["cbf/fallback"] for info in infos)
     assert max(info["slip_max"] for info in infos) < 0.17
     assert abs(env.unwrapped.forward_speed) < 0.2
     for _ in range(50):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             env.step(np.full(5, np.nan, dtype=np.float32))
     assert abs(env.unwrapped.forward_speed) < 0.02
 

@@ -439,8 +439,7 @@ def test_infos_keep_their_shape_and_share_nothing():
     env = start(rover())
     rng = np.random.default_rng(0)
     infos = [env.reset(seed=0)[1]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for k in range(100):
             action = rng.uniform(-2, 2, 5).astype(np.float32)
             if k % 17 == 0:

@@ -96,8 +96,7 @@ def test_momentum_is_what_mujoco_says_of_the_state_after_the_step(env_id):
     raw = env.unwrapped
     env.reset(seed=0)
     data, largest = mujoco.MjData(raw.model), np.zeros(2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the rover's tyres
+    with warnings.catch_warnings(action="ignore"):  # of the rover's tyres
         for action in actions(env, 20):
             info = env.step(action)[4]
             data.qpos[:], data.qvel[:] = raw.data.qpos, raw.data.qvel
@@ -440,8 +439,7 @@ def test_no_number_that_is_none_is_reported(bad):
         setattr(meddling, place, bad)
         env = sw.BalanceMonitor(meddling)
         env.reset(seed=0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             infos = [env.step(env.action_space.low)[4] for _ in range(27)]
         for info in infos[24:26]:  # and MuJoCo's reset in the step after it
             assert np.isfinite([*values(info), *info[MOMENTA[0]], *info[MOMENTA[1]]]).all()

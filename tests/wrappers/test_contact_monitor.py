@@ -186,8 +186,7 @@ def test_numbers_that_are_none_are_reported_as_none():
     meddling.at, meddling.contact = (25,), np.nan
     env = sw.ContactMonitor(meddling)
     env.reset(seed=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         info = [env.step(env.action_space.low)[4] for _ in range(25)][-1]
     assert np.isnan([info[k] for k in FLOATS]).all()
 
@@ -239,8 +238,7 @@ def test_a_chunk_is_partial_if_any_of_its_steps_was():
 def test_which_of_our_tasks_are_seen_whole(env_id, whole):
     env = sw.ContactMonitor(gym.make(env_id))
     env.reset(seed=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         partial = [env.step(a)[4][keys.CONTACT_PARTIAL] for a in actions(env, 20)]
     assert all(partial) if not whole else not any(partial)
 
