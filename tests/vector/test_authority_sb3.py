@@ -1,5 +1,6 @@
 """Faults, handover, lease and filter under Stable-Baselines3's vector envs: as in single loops, bit for bit."""
 
+import contextlib
 import functools
 
 import numpy as np
@@ -53,12 +54,9 @@ def without_time(all_episodes):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("task", TASKS)
 def test_a_vec_env_is_its_single_envs(task, kind):
-    envs = KINDS[kind]([functools.partial(monitored, task, i) for i in range(3)])
-    try:
+    with contextlib.closing(KINDS[kind]([functools.partial(monitored, task, i) for i in range(3)])) as envs:
         actions = script(envs.action_space)
         episodes = unroll(envs, actions)
-    finally:
-        envs.close()
     make = CarriedOn(functools.partial(monitored, task))
     wanted = without_time([by_hand(make, actions, i, seed=SEED + i, steps=STEPS) for i in range(3)])
     for i in range(3):

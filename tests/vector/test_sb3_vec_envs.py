@@ -1,5 +1,6 @@
 """SB3's Dummy and Subproc vector envs are the single envs, bit for bit, infos and all."""
 
+import contextlib
 import functools
 import multiprocessing
 
@@ -91,13 +92,10 @@ def assert_same(got, wanted, kind, name=""):
 @pytest.mark.parametrize("task", TASKS)
 def test_a_vec_env_is_its_single_envs(task, kind):
     make = TASKS[task]
-    envs = KINDS[kind]([functools.partial(make, i) for i in range(3)])
-    try:
+    with contextlib.closing(KINDS[kind]([functools.partial(make, i) for i in range(3)])) as envs:
         actions = script(envs.action_space, drive=0.9 if task == "point_goal" else None)
         episodes = unroll(envs, actions, seed=5, steps=26)
         calls = envs.get_attr("filter_calls")
-    finally:
-        envs.close()
     for i, got in enumerate(episodes):
         wanted = by_hand(make, actions, i, seed=5 + i, steps=26)
         assert assert_same(got, wanted, kind, f"sub-env {i}, ") >= 2
@@ -126,16 +124,13 @@ def test_any_actions_and_any_ends(kind, examples):
             wanted = by_hand(monitored_cart, actions, i, seed=play["seed"] + i, steps=STEPS, options=options)
             assert_same(got, wanted, kind, f"sub-env {i}, ")
 
-    try:
+    with contextlib.closing(envs):
         check()
-    finally:
-        envs.close()
 
 
 @every_kind
 def test_methods_and_attributes_by_sub_env(kind):
-    envs = KINDS[kind]([functools.partial(plain_stack, i) for i in range(2)])
-    try:
+    with contextlib.closing(KINDS[kind]([functools.partial(plain_stack, i) for i in range(2)])) as envs:
         envs.seed(0)
         envs.reset()
         for _ in range(6):
@@ -151,8 +146,6 @@ def test_methods_and_attributes_by_sub_env(kind):
         assert envs.env_is_wrapped(sw.CBFActionFilter) == [True, True]
         assert envs.env_is_wrapped(sw.RecordInterventions) == [True, True]
         assert envs.env_is_wrapped(Monitor) == [True, True]
-    finally:
-        envs.close()
 
 
 def test_closing_leaves_no_process():
@@ -209,8 +202,7 @@ def test_not_a_number_in_one_sub_env_is_its_own_affair():
 @pytest.mark.parametrize("kind", KINDS)
 def test_infos_are_the_readers_own(kind):
     # What a callback does to an info reaches neither the filter nor the next step's info.
-    envs = KINDS[kind]([functools.partial(cart_filter, i) for i in range(2)])
-    try:
+    with contextlib.closing(KINDS[kind]([functools.partial(cart_filter, i) for i in range(2)])) as envs:
         envs.set_options({"start": [-1.0, 0.0]})
         envs.reset()
         infos = envs.step(np.full((2, 1), 0.5, np.float32))[3]
@@ -219,8 +211,6 @@ def test_infos_are_the_readers_own(kind):
             info["executed_action"][:] = 9.0
             info["cbf/margin"] = -1.0
         infos = envs.step(np.full((2, 1), np.nan, np.float32))[3]
-    finally:
-        envs.close()
     for info, before in zip(infos, kept, strict=True):
         assert info["executed_action"] == 0.5  # held
         assert info["cbf/margin"] > 0.0 and before["cbf/margin"] > 0.0
@@ -231,10 +221,8 @@ def test_infos_are_the_readers_own(kind):
 def test_the_same_in_a_process_that_starts_from_nothing(start_method):
     make = TASKS["point_goal"]
     envs = SubprocVecEnv([functools.partial(make, i) for i in range(2)], start_method=start_method)
-    try:
+    with contextlib.closing(envs):
         actions = script(envs.action_space, drive=0.9)
         episodes = unroll(envs, actions, seed=1, steps=20)
-    finally:
-        envs.close()
     for i, got in enumerate(episodes):
         assert assert_same(got, by_hand(make, actions, i, seed=1 + i, steps=20), "subproc") >= 2
