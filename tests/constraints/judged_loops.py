@@ -1,24 +1,14 @@
 """Closed loops judged at every physics substep by an integration of their own, and the drivers that attack them."""
 
-import gymnasium as gym
 import mujoco
 import numpy as np
+import scenes
 
 
-class Scene(gym.Env):
-    """Any MJCF as an env. It resets to the model's own pose; `start` is (qpos, qvel)."""
+class Scene(scenes.Scene):
+    """It resets to the model's own pose; `start` is (qpos, qvel)."""
 
-    def __init__(self, xml, frame_skip=5):
-        self.model = mujoco.MjModel.from_xml_string(xml)
-        self.data = mujoco.MjData(self.model)
-        self.frame_skip = frame_skip
-        self.dt = frame_skip * self.model.opt.timestep
-        limited = self.model.actuator_ctrllimited.astype(bool)
-        low = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
-        high = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
-        self.action_space = gym.spaces.Box(low, high, dtype=np.float64)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
-        self.start = None
+    start = None
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asking import Asked
+from asking import Asked, bound
 from judged_loops import DRIVERS, Judge, drive, flagged, sliders
 
 import safe_wrappers as sw
@@ -122,8 +122,7 @@ def test_from_outside_it_goes_inwards(start):
 
 
 def value(env, limit, qpos=None):
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     limit = Asked(limit, plant)
     if qpos is not None:
         env.unwrapped.data.qpos[: len(qpos)] = qpos

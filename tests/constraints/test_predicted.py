@@ -5,7 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from asking import Asked
+from asking import Asked, bound
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from judged_loops import Judge, flagged, sliders
@@ -45,8 +45,7 @@ def slider_path(x, v, u, horizon, strength):
 
 def looking(scene, limit, qpos, qvel):
     """The limit, bound to a plant that has seen this state."""
-    plant = sw.MujocoPlant()
-    plant.bind(scene)
+    plant = bound(scene)
     scene.data.qpos[:], scene.data.qvel[:] = qpos, qvel
     plant.observe()
     return Asked(limit, plant)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked
+from asking import asked
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from judged_loops import Scene, flagged, sliders
@@ -23,10 +23,8 @@ averages = pytest.mark.parametrize("average", ["step", "substep"])
 
 def watching(env, **options):
     """A limit that follows an env by itself, and its plant."""
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    plant.observe()
-    return Asked(sw.constraints.SpeedLimit(**{"limit": 50.0, "horizon": 1, **options}), plant), plant
+    found = asked(env, sw.constraints.SpeedLimit(**{"limit": 50.0, "horizon": 1, **options}))
+    return found, found.plant
 
 
 # The speed that is meant --------------------------------------------------------------------------------------
