@@ -200,9 +200,7 @@ def kept_up(policies: Path, episodes: int, limit: int) -> list[str]:
 
 def main() -> None:
     """Train what is missing, print the table and write it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--limit", type=int, default=500, help="steps per episode at most")
     parser.add_argument("--policies", type=Path, default=Path("runs/balance"), help="where they lie")

@@ -196,9 +196,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Print the table and write it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--robots", nargs="+", default=["Ant", "Humanoid"], choices=["Ant", "Humanoid"])
     parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=POLICIES)
     parser.add_argument("--problems", type=int, default=500, help="per robot and policy")

@@ -6,21 +6,13 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from vehicles import Trolley
+from vehicles import FULL, OPEN, Trolley, rover
 
 import safe_wrappers as sw
 from safe_wrappers.appendix.vehicle.burckhardt import peak
 from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-
-FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)
-OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}
-
-
-def rover(**options):
-    env = gym.make("SafeRover-v0", max_episode_steps=100_000)
-    return sw.SlipLimiter(env, wheels=env.unwrapped.wheels, **options)
 
 
 def drive(env, action, steps, **layout):

@@ -11,20 +11,12 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from scipy.integrate import solve_ivp
-from vehicles import MOTORS, WHEEL, Trolley
+from vehicles import FULL, MOTORS, OPEN, WHEEL, Trolley, rover
 
 import safe_wrappers as sw
 from safe_wrappers.constraints import traction as traction_module
 from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.errors import ConfigurationError
-
-FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)
-OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}
-
-
-def rover(**options):
-    env = gym.make("SafeRover-v0", max_episode_steps=100_000)
-    return sw.SlipLimiter(env, wheels=env.unwrapped.wheels, **options)
 
 
 def start(env, **layout):
