@@ -146,8 +146,6 @@ def slip_of(v, w):
 class QuarterCar(gym.Env):
     """Its tyre follows Burckhardt's published curve, which is not the shape that the estimate believes in."""
 
-    metadata = {"render_modes": []}  # noqa: RUF012
-
     def __init__(self, ground, speed, substeps=50):
         self.model = mujoco.MjModel.from_xml_string(QUARTER)
         self.data = mujoco.MjData(self.model)

@@ -45,8 +45,6 @@ def rover(**options):
 class Trolley(gym.Env[Any, Any]):
     """Two driven wheels behind, a frictionless caster in front; MuJoCo's own friction carries it."""
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
-
     def __init__(self, friction=0.7, height=0.1, wheel=WHEEL, actuators=MOTORS, damping=0.01, substeps=5):
         text = TROLLEY.format(
             height=height,

@@ -21,7 +21,6 @@ STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 class Legs(Scene):
     """A trunk on two driven legs beside other things that move; the action is the control."""
 
-    metadata = {"render_modes": []}  # noqa: RUF012
     XML = """<mujoco><option timestep="0.002" integrator="{integrator}" cone="{cone}"/>
     <default><geom condim="{condim}" friction="0.6 0.01 0.002"/></default>
     <worldbody>
