@@ -34,9 +34,8 @@ from benchmarks.tracked import CROSSING, crossing
 from safe_wrappers.appendix.estimation.consistency import chi_square_band, normalised_error_squared
 from safe_wrappers.appendix.estimation.covariance import double_integrator_covariance
 from safe_wrappers.appendix.estimation.sigma_coverage import chebyshev_tail, gaussian_tail
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsafeStateWarning
-
-Array = NDArray[np.float64]
 
 RESULTS = Path(__file__).parent / "results"
 ENV_ID = "OccludedCrossing-v0"

@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.appendix.estimation.sigma_coverage import gaussian_tail
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
 from safe_wrappers.control.estimation.turning_tracks import TurningTracks
-
-Array = NDArray[np.float64]
 
 RESULTS = Path(__file__).parent / "results"
 TURNING = Motion(np.diag([0.01, 0.01]), np.inf, np.zeros(2), 0.05)

@@ -6,13 +6,11 @@ import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, panels
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.stopping import held_stop
-
-Array = NDArray[np.float64]
 
 BRAKE, HOLD, DELAY = 2.0, 0.25, 0.2
 CENTER, RADIUS = (2.0, 0.12), 0.5

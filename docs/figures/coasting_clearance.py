@@ -8,12 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, OFF, ON, SAFE, bare, panels
-
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 HAZARD = [0.92, 0.03]
 LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.9, 0.15], "hazards": [HAZARD], "vases": []}

@@ -8,13 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import Motion, stopping_path
-
-Array = NDArray[np.float64]
 
 HEADING, SPEED = 0.7, 1.3
 

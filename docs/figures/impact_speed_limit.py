@@ -6,12 +6,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, OFF, ON, OTHER, panels
-
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 LIMIT, STIFFNESS, MASS, PUSH = 140.0, 25e3, 6.0, 150.0
 GAP, START, STEPS = 0.08, 0.3, 28

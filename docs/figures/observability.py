@@ -4,13 +4,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from numpy.typing import NDArray
 
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, SAFE, panels
 from safe_wrappers.appendix.estimation.covariance import blind_covariance
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.kalman import update
-
-Array = NDArray[np.float64]
 
 RATE = 0.5
 """1/s."""

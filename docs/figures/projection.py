@@ -4,12 +4,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, SAFE, panels
-
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 LOW, HIGH = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
 _POLICY = {"marker": "o", "color": OFF, "ms": 7}

@@ -5,14 +5,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
 from ..goal.layout import layout_option, numbers
 from ..traffic import CAR_MEAN_SPEED, CAR_SPEED_STD
-
-Array = NDArray[np.float64]
 
 CROSSING_LAYOUT_KEYS: Final = ("agent", "goal", "cars", "pillars")
 """What the crossing's ``reset(options={"layout": {...}})`` understands."""
