@@ -9,10 +9,11 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
 
-def log_probability(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], NDArray[np.float64]]:
+def log_probability(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], Array]:
     """How probable an on-policy learner's policy makes actions: for `PredictiveShield(value=)`.
 
     Args:
@@ -32,7 +33,7 @@ def log_probability(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], NDArr
         )
     scaling = model.get_vec_normalize_env()
 
-    def value(observation: Any, actions: NDArray[Any]) -> NDArray[np.float64]:
+    def value(observation: Any, actions: NDArray[Any]) -> Array:
         if scaling is not None:
             observation = scaling.normalize_obs(observation)
         one, _ = policy.obs_to_tensor(observation)
@@ -40,7 +41,7 @@ def log_probability(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], NDArr
         if isinstance(model.action_space, gym.spaces.Discrete):
             given = given[:, 0]
         with torch.no_grad():
-            logs: NDArray[np.float64] = policy.get_distribution(one).log_prob(given).double().cpu().numpy()
+            logs: Array = policy.get_distribution(one).log_prob(given).double().cpu().numpy()
         return logs
 
     return value
