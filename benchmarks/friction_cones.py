@@ -30,7 +30,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.drivers import held
-from benchmarks.tables import markdown
+from benchmarks.tables import RESULTS, markdown
 from benchmarks.whole_body import learned
 from safe_wrappers.control.legged.whole_body import (
     WholeBodySolution,
@@ -42,7 +42,6 @@ from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import SafeWrappersError
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
-RESULTS = Path(__file__).parent / "results"
 SHARE, SETTLE_S = 0.7, 0.05
 LONGEST = 200
 """Control steps of an episode at most."""
