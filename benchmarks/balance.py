@@ -22,9 +22,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import safe_wrappers as sw
+from benchmarks.tables import RESULTS
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
-RESULTS = Path(__file__).parent / "results"
 SEED, ENVS = 0, 4
 
 

@@ -8,10 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from benchmarks.faults.episodes import plain
-from benchmarks.faults.outcomes import OF_OURS, Found, Outcome
+from benchmarks.faults.outcomes import OF_OURS, Cell, Found, Outcome
 from benchmarks.faults.stacks import BEFORE, BrokenEnvError, Row, Session, same
-
-Cell = Callable[[Session], Found]
 
 
 def _raises(where: str) -> Cell:
