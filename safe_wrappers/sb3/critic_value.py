@@ -8,11 +8,10 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
 
-def critic_value(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], Array]:
+def critic_value(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], NDArray[np.float64]]:
     """What the critic of SAC, TD3, DDPG, TQC or DQN expects: for `StuckEscape(value=)`, `PredictiveShield(value=)`.
 
     The smallest of its networks' answers (of TQC the mean over quantiles of each), as the actor's own loss has it.
@@ -36,14 +35,14 @@ def critic_value(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], Array]:
     scaling, policy = model.get_vec_normalize_env(), model.policy
     start = int(getattr(model.action_space, "start", 0))
 
-    def value(observation: Any, actions: NDArray[Any]) -> Array:
+    def value(observation: Any, actions: NDArray[Any]) -> NDArray[np.float64]:
         if scaling is not None:
             observation = scaling.normalize_obs(observation)
         one, _ = policy.obs_to_tensor(observation)
         if q_net is not None:
             with torch.no_grad():
                 of_each = q_net(one)[0].double().cpu().numpy()
-            chosen: Array = of_each[np.asarray(actions)[:, 0].astype(int) - start]
+            chosen: NDArray[np.float64] = of_each[np.asarray(actions)[:, 0].astype(int) - start]
             return chosen
         given: Any
         if isinstance(one, dict):
@@ -55,7 +54,7 @@ def critic_value(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], Array]:
             answers = critic(given, scaled)
         # A column per network; TQC's answers have shape (k, networks, quantiles).
         answers = torch.cat(answers, dim=1) if isinstance(answers, tuple) else answers.mean(dim=2)
-        lowest: Array = answers.min(dim=1).values.double().cpu().numpy()
+        lowest: NDArray[np.float64] = answers.min(dim=1).values.double().cpu().numpy()
         return lowest
 
     return value

@@ -9,11 +9,10 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
 
-def log_probability(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], Array]:
+def log_probability(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], NDArray[np.float64]]:
     """How probable an on-policy learner's policy makes actions: for `PredictiveShield(value=)`.
 
     Args:
@@ -33,7 +32,7 @@ def log_probability(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], Array
         )
     scaling = model.get_vec_normalize_env()
 
-    def value(observation: Any, actions: NDArray[Any]) -> Array:
+    def value(observation: Any, actions: NDArray[Any]) -> NDArray[np.float64]:
         if scaling is not None:
             observation = scaling.normalize_obs(observation)
         one, _ = policy.obs_to_tensor(observation)
@@ -41,7 +40,7 @@ def log_probability(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], Array
         if isinstance(model.action_space, gym.spaces.Discrete):
             given = given[:, 0]
         with torch.no_grad():
-            logs: Array = policy.get_distribution(one).log_prob(given).double().cpu().numpy()
+            logs: NDArray[np.float64] = policy.get_distribution(one).log_prob(given).double().cpu().numpy()
         return logs
 
     return value

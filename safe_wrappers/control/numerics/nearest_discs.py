@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled, hypot
 
 NUMBERS = 4
@@ -19,8 +19,8 @@ def squashed(value: float, scale: float) -> float:
 
 @compiled
 def nearest_discs(
-    discs: Array, x: float, y: float, heading: float, vx: float, vy: float, count: int
-) -> Array:
+    discs: NDArray[np.float64], x: float, y: float, heading: float, vx: float, vy: float, count: int
+) -> NDArray[np.float64]:
     """The nearest discs as seen from a frame, the nearest first.
 
     Args:

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, numbers_of
+from safe_wrappers.checks import numbers_of
 from safe_wrappers.deprecation import deprecated_attribute, deprecated_method
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
@@ -53,11 +53,11 @@ class CommandReceiver:
             raise ActionError(f"observed_s is a time in seconds, or None for nothing; got {observed_s!r}")
         self._observed_s = observed_s
 
-    def admits(self, end: Array, steps: int) -> bool:
+    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
         """Whether a chunk may be executed that ends with this command, shape (m,), so many control steps from now."""
         return True
 
-    def admits_chunk(self, commands: Array) -> bool:
+    def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
         """Whether a chunk may be executed, shape (h, m): the commands of the next h control steps."""
         return self.admits(commands[-1], len(commands))
 

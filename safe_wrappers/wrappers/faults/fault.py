@@ -6,9 +6,10 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, numbers_of
+from safe_wrappers.checks import numbers_of
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import check_timing, wrappers_of
 from safe_wrappers.stack import Layer
@@ -98,10 +99,10 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
     def now_s(self) -> float:
         return super().now_s if self._inside is None else self._inside.now_s
 
-    def admits(self, end: Array, steps: int) -> bool:
+    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
         return self._inside is None or self._inside.admits(end, steps)
 
-    def admits_chunk(self, commands: Array) -> bool:
+    def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
         return self._inside is None or self._inside.admits_chunk(commands)
 
     def _refuse_what_is_no_action(self, action: Any) -> None:
