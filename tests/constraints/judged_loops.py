@@ -1,8 +1,11 @@
 """Closed loops judged at every physics substep by an integration of their own, and the drivers that attack them."""
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import scenes
+
+import safe_wrappers as sw
 
 
 class Scene(scenes.Scene):
@@ -139,3 +142,16 @@ def drive(env, room, driver, steps, seeds=(0,)):
                 env.reset()
                 before = judge.at(judge.raw.data)
     return seen
+
+
+def check_inactive(env_id, limit, largest, steps):
+    """Actions of up to `largest` pass bit for bit: the env does what it does without the filter."""
+    bare, filtered = gym.make(env_id), sw.CBFActionFilter(gym.make(env_id), [limit])
+    rng = np.random.default_rng(0)
+    a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
+    for _ in range(steps):
+        assert a.tobytes() == b.tobytes()
+        action = rng.uniform(-largest, largest, bare.action_space.shape).astype(np.float32)
+        a, reward, *_ = bare.step(action)
+        b, same, _, _, info = filtered.step(action)
+        assert reward == same and not info["cbf/intervened"] and not info["cbf/refused"].any()
