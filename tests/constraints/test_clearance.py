@@ -68,7 +68,7 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
     clear = sw.constraints.Clearance([DISCS[0]], braking=1.5, **{kind: [name]})
     clear = Asked(clear, plant)
     rng = np.random.default_rng(0)
-    asked = 0
+    compared = 0
     for _ in range(200):
         env.set_state(np.array([0.55 - offset, 0.1]) + rng.uniform(-0.1, 0.1, 2), rng.uniform(-1, 1, 2))
         plant.observe()
@@ -87,11 +87,11 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
         rows = clear.rows()
         if not len(rows.offsets):
             continue
-        asked += 1
+        compared += 1
         limit = held_limit(distance(0.0), approach, 1.5, plant.control_dt)
         if limit > -1e6:
             assert rows.offsets[0] - rows.normals[0] @ u == pytest.approx(limit - acceleration, abs=1e-4)
-    assert asked > 20
+    assert compared > 20
 
 
 def drivers():
