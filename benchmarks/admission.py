@@ -25,24 +25,21 @@ import argparse
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import ruckig
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, markdown, total
+from benchmarks.tables import RESULTS, keep, markdown, total
+from safe_wrappers.checks import Array
 from safe_wrappers.control.watchdog.reachability import admits
 
-RESULTS = Path(__file__).parent / "results"
 FINE = 2000
 """Steps of the oracle's drive; its error is below 0.001 % of the way."""
 SUBSTEPS = 4
 """Pieces of constant jerk per control step of a random motion."""
-Array = NDArray[np.float64]
 
 
 @dataclass

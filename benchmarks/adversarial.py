@@ -15,7 +15,6 @@ import itertools
 import multiprocessing
 import warnings
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -23,10 +22,9 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import car_drivers, drivers
-from benchmarks.tables import keep, markdown, total
+from benchmarks.tables import RESULTS, keep, markdown, total
 from safe_wrappers.errors import UnsafeStateWarning
 
-RESULTS = Path(__file__).parent / "results"
 DRIVERS = {"point": drivers.DRIVERS, "car": car_drivers.DRIVERS}
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "point": {

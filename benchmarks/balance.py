@@ -22,9 +22,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import safe_wrappers as sw
+from benchmarks.tables import RESULTS
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
-RESULTS = Path(__file__).parent / "results"
 SEED, ENVS = 0, 4
 
 
@@ -200,9 +200,7 @@ def kept_up(policies: Path, episodes: int, limit: int) -> list[str]:
 
 def main() -> None:
     """Train what is missing, print the table and write it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--limit", type=int, default=500, help="steps per episode at most")
     parser.add_argument("--policies", type=Path, default=Path("runs/balance"), help="where they lie")

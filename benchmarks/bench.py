@@ -107,9 +107,7 @@ def line(what: str, over: str, row: Row, old: Row | None) -> str:
 
 def main() -> None:
     """Measure, print, and write the results if every row was asked for."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("words", nargs="*", help="only rows whose name holds one of these")
     parser.add_argument("--steps", type=int, default=1500, help="of each env")
     arguments = parser.parse_args()

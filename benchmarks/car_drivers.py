@@ -8,14 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.drivers import Action, Driver, held
+from safe_wrappers.checks import Array
 
 _FULL = 0.02
 
 
-def towards(env: Any, target: NDArray[np.float64], strength: float = _FULL) -> Action:
+def towards(env: Any, target: Array, strength: float = _FULL) -> Action:
     """Turn towards a point while driving, knowing nothing of what stands in the way."""
     offset = target - env.agent_position
     bearing = math.remainder(math.atan2(offset[1], offset[0]) - env.agent_heading, math.tau)
@@ -38,7 +38,7 @@ def vase_seeking(env: Any, rng: np.random.Generator) -> Driver:
     return _seeking(env, rng, lambda: np.asarray(env.vase_positions))
 
 
-def _seeking(env: Any, rng: np.random.Generator, where: Callable[[], NDArray[np.float64]]) -> Driver:
+def _seeking(env: Any, rng: np.random.Generator, where: Callable[[], Array]) -> Driver:
     state: dict[str, Any] = {"step": 0, "pick": 0, "sense": 1.0, "strength": _FULL}
 
     def act() -> Action:

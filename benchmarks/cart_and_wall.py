@@ -13,9 +13,8 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 PHYSICS_S = 0.002
 SUBSTEPS = 10

@@ -20,7 +20,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
@@ -28,9 +27,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import safe_wrappers as sw
 from benchmarks.seam_bounds import bounds_of
+from safe_wrappers.checks import Array
 
 RUNS = Path(__file__).parents[1] / "runs" / "seams"
-Array = NDArray[np.float64]
 
 DEGREE = 3
 """Of the spline."""

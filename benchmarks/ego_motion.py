@@ -16,10 +16,9 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.crossing_drivers import DRIVERS
-from benchmarks.tables import keep, markdown
+from benchmarks.tables import RESULTS, keep, markdown
 from benchmarks.tracked import CROSSING, crossing
 
-RESULTS = Path(__file__).parent / "results"
 NOISE = {"accelerometer_std": 0.02, "gyro_std": 0.002}
 STEPS = 500
 """Of an episode: 20 s."""

@@ -42,10 +42,10 @@ from benchmarks.endurance_report import collected, table
 from benchmarks.mujoco_drivers import Maker, corner_seeking
 from benchmarks.scaling import resident_kb
 from benchmarks.searching_drivers import SEARCHES, SearchingDriver
+from benchmarks.tables import RESULTS
 from benchmarks.trained_adversary import EXAMPLES, FLAGS, Tally
 from safe_wrappers.errors import UnsafeStateWarning
 
-RESULTS = Path(__file__).parent / "results"
 ENVS = (
     "SafePointGoal1-v0",
     "SafePointGoal2-v0",

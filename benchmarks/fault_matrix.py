@@ -12,7 +12,7 @@ import argparse
 import csv
 import sys
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from pathlib import Path
 
 from benchmarks.faults.decisions import decisions
@@ -20,14 +20,13 @@ from benchmarks.faults.episodes import plain
 from benchmarks.faults.inputs import inputs
 from benchmarks.faults.lifecycle import lifecycle
 from benchmarks.faults.machine import machine
-from benchmarks.faults.outcomes import DEFECTS, Found, Outcome
-from benchmarks.faults.stacks import Row, Session, rows
+from benchmarks.faults.outcomes import DEFECTS, Cell, Found, Outcome
+from benchmarks.faults.stacks import Row, rows
 from benchmarks.faults.table import markdown
 
 RESULTS = Path(__file__).parent / "results" / "fault_matrix.csv"
 COLUMNS = ("kind", "row", "example", "fault", "variant", "outcome", "note")
 GROUPS = {"The action": inputs, "The decision": decisions, "The machine": machine, "The env": lifecycle}
-Cell = Callable[[Session], Found]
 
 
 def cells(row: Row, groups: tuple[str, ...] = tuple(GROUPS)) -> dict[tuple[str, str], Cell]:

@@ -27,10 +27,9 @@ import safe_wrappers as sw
 from benchmarks import chunks
 from benchmarks.fetch_drivers import drivers, obstacles
 from benchmarks.fetch_judge import FetchJudge
-from benchmarks.tables import markdown, total
+from benchmarks.tables import RESULTS, markdown, total
 from safe_wrappers.errors import UnsafeStateWarning
 
-RESULTS = Path(__file__).parent / "results"
 ENVS = ("FetchReach-v4", "FetchPush-v4", "FetchSlide-v4", "FetchPickAndPlace-v4")
 EPISODES = (50, 1000)
 _FLAGS = ("intervened", "infeasible", "fallback", "unsafe")

@@ -30,7 +30,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.drivers import held
-from benchmarks.tables import markdown
+from benchmarks.tables import RESULTS, markdown
 from benchmarks.whole_body import learned
 from safe_wrappers.control.legged.whole_body import (
     WholeBodySolution,
@@ -42,7 +42,6 @@ from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import SafeWrappersError
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
-RESULTS = Path(__file__).parent / "results"
 SHARE, SETTLE_S = 0.7, 0.05
 LONGEST = 200
 """Control steps of an episode at most."""
@@ -196,9 +195,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Print the table and write it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--robots", nargs="+", default=["Ant", "Humanoid"], choices=["Ant", "Humanoid"])
     parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=POLICIES)
     parser.add_argument("--problems", type=int, default=500, help="per robot and policy")

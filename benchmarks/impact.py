@@ -19,7 +19,6 @@ import json
 import multiprocessing
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -28,10 +27,9 @@ from scipy.integrate import solve_ivp
 
 import safe_wrappers as sw
 from benchmarks.arm_and_wall import REACH_M, SUBSTEPS, TIP_M, ArmAndWall, arm_model, normal_force, springy
-from benchmarks.tables import markdown
+from benchmarks.tables import RESULTS, markdown
 from safe_wrappers.control.contact.impact import effective_mass, peak_force
 
-RESULTS = Path(__file__).parent / "results"
 MASSES = (0.5, 2.0, 10.0, 40.0)
 STIFFNESSES = (5e3, 25e3, 75e3, 150e3)
 SPEEDS = (0.1, 0.3, 1.0)

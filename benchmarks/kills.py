@@ -40,6 +40,7 @@ from unittest import mock
 import numpy as np
 import torch
 
+from benchmarks.tables import RESULTS
 from safe_wrappers.train import cli, experiment
 from safe_wrappers.train.config import ArmConfig, ExperimentConfig, parse_experiment, read_config
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
@@ -51,7 +52,6 @@ from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.videos import record
 
 CONFIG = Path(__file__).with_suffix(".yaml")
-RESULTS = Path(__file__).parent / "results"
 PHASES = ("start", "training", "checkpoint", "policy", "evaluation", "report")
 """A checkpoint's is that of its writing; the policy's from the last checkpoint to the note that a run is finished."""
 KILLS_A_ROUND = 6

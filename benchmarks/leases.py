@@ -18,7 +18,6 @@ import json
 import math
 import multiprocessing
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -26,11 +25,10 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.cart_and_wall import HOLD_S, PHYSICS_S, CartAndWall, Drive
-from benchmarks.tables import markdown
+from benchmarks.tables import RESULTS, markdown
 from safe_wrappers.control.watchdog.leases import longest_lease
 from safe_wrappers.wrappers.faults import Outages
 
-RESULTS = Path(__file__).parent / "results"
 BLOCK = 500
 """Episodes per row of the results."""
 LONGEST_EPISODE_S = 20.0

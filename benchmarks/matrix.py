@@ -134,9 +134,7 @@ def table(rows: Sequence[dict[str, str]]) -> str:
 
 def main() -> int:
     """Runs what has not passed yet; the exit status is 1 if something fails."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument(
         "--quick", action="store_true", help="parts of the tests, for the combinations without others"
     )

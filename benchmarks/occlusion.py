@@ -29,16 +29,14 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks.crossing_drivers import DRIVERS
-from benchmarks.tables import markdown, total
+from benchmarks.tables import RESULTS, markdown, total
 from benchmarks.tracked import CROSSING, crossing
 from safe_wrappers.appendix.estimation.consistency import chi_square_band, normalised_error_squared
 from safe_wrappers.appendix.estimation.covariance import double_integrator_covariance
 from safe_wrappers.appendix.estimation.sigma_coverage import chebyshev_tail, gaussian_tail
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsafeStateWarning
 
-Array = NDArray[np.float64]
-
-RESULTS = Path(__file__).parent / "results"
 ENV_ID = "OccludedCrossing-v0"
 STATE = [0, 2]
 """Of a track: position and velocity along the lane; across it a car does not move, and that is known."""

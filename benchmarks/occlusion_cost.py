@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks.crossing_drivers import DRIVERS
-from benchmarks.timing import paired_us
+from benchmarks.timing import paired_us, stepping
 from benchmarks.tracked import CROSSING, crossing
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 
@@ -41,22 +41,6 @@ def make(count: int) -> sw.OcclusionPenalty:
 def spread(count: int) -> NDArray[np.float64]:
     """Points on the road, shape (count, 2), m."""
     return np.stack([np.linspace(-3.5, 3.5, count), 0.8 * (-1.0) ** np.arange(count)], axis=1)
-
-
-def stepping(env: gym.Env[Any, Any]) -> Callable[[], None]:
-    """A function that makes one step, over and over, the same for every env."""
-    env.reset(seed=0)
-    space: Any = env.action_space
-    actions = np.random.default_rng(0).uniform(space.low, space.high, (256, *space.shape)).astype(space.dtype)
-    turn = 0
-
-    def step() -> None:
-        nonlocal turn
-        turn += 1
-        if env.step(actions[turn % len(actions)])[3]:
-            env.reset(seed=0)
-
-    return step
 
 
 def tracking_us(rounds: int = 40, batch: int = 50) -> dict[str, float]:

@@ -20,11 +20,10 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.patrol_drivers import patrol_seeking
-from benchmarks.tables import markdown
+from benchmarks.tables import RESULTS, markdown
 from benchmarks.tracked import PATROLLED, PATROLS_AT_ONCE, PATROLS_TURNING, PATROLS_TURNING_AT_ONCE, patrolled
 from safe_wrappers.errors import UnsafeStateWarning
 
-RESULTS = Path(__file__).parent / "results"
 SIGMAS = 3.0
 AHEAD_S = 0.5
 EPISODE_STEPS = 1000

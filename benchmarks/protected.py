@@ -25,10 +25,9 @@ import numpy as np
 from benchmarks import chunks
 from benchmarks.cases import CASES, HARD, PROTECTED, Case
 from benchmarks.descriptions import constrained, promised, reserve
-from benchmarks.tables import markdown, total
+from benchmarks.tables import RESULTS, markdown, total
 from safe_wrappers.errors import UnsafeStateWarning
 
-RESULTS = Path(__file__).parent / "results"
 CHUNK = 10_000
 """Steps of one job: what is lost when a run is killed."""
 TIMED = 1_000

@@ -37,9 +37,9 @@ from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
 from benchmarks.random_mjcf import RandomModel
+from benchmarks.tables import RESULTS
 from safe_wrappers.errors import SafeWrappersError
 
-RESULTS = Path(__file__).parent / "results"
 STEPS = 3
 BATCH = 500
 LONGEST_S = 120.0

@@ -18,14 +18,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.tables import keep, markdown
+from benchmarks.tables import RESULTS, keep, markdown
 from safe_wrappers.train.config import parse_experiment, read_config
 from safe_wrappers.train.experiment import training_jobs
 from safe_wrappers.train.processes.job import Job, Progress
 from safe_wrappers.train.processes.parallel import run_jobs
 
 ROOT = Path(__file__).parents[1]
-RESULTS = Path(__file__).parent / "results"
 CPUS, RUNS = 2, 4
 ALONE, LOCAL, RAY = "one after another", "two processes", "two Ray nodes"
 

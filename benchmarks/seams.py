@@ -37,18 +37,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks.chunk_policy import RUNS, TASKS, Policy, Task, policy
 from benchmarks.seam_bounds import Bounds, bounds_of
-from benchmarks.tables import markdown
+from benchmarks.tables import RESULTS, markdown
 from safe_wrappers.appendix.handover.flexible_joint import manifold
+from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.control.handover.smoothstep import smoothstep
-
-RESULTS = Path(__file__).parent / "results"
-Array = NDArray[np.float64]
 
 DELAYS = (0, 2, 5)
 """Control steps."""

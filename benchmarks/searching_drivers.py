@@ -9,11 +9,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.plants.simulator.copies import EnvCopier
 
-Array = NDArray[np.float64]
 Score = Callable[[Array], float]
 Search = Callable[[Score, Array, np.random.Generator], Array]
 

@@ -27,7 +27,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -36,11 +35,10 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.arms import ARMS, Arm, Truth, watch
-from benchmarks.tables import keep, markdown
+from benchmarks.tables import RESULTS, keep, markdown
 from safe_wrappers.control.filtering.manipulability import manipulability
 from safe_wrappers.errors import UnsafeStateWarning
 
-RESULTS = Path(__file__).parent / "results"
 SPEED = {"Reacher": 0.1, "Fetch": 0.15}
 """Along the paths, m/s."""
 DAMPING = 0.03

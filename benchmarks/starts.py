@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases import PROTECTED, Case
-from benchmarks.tables import keep, markdown
+from benchmarks.tables import RESULTS, keep, markdown
 from safe_wrappers.errors import UnsafeStateWarning
-
-RESULTS = Path(__file__).parent / "results"
 
 
 def measure(case: Case, resets: int, seed: int = 0) -> dict[str, Any]:

@@ -3,7 +3,9 @@
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+RESULTS: Final = Path(__file__).parent / "results"
 
 
 def markdown(head: str, rows: Iterable[Iterable[object]]) -> str:

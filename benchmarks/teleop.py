@@ -26,22 +26,18 @@ import argparse
 import math
 import multiprocessing
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks import chunks
-from benchmarks.tables import markdown, total
+from benchmarks.tables import RESULTS, markdown, total
+from safe_wrappers.checks import Array
 from safe_wrappers.envs.teleop_contact import TELEOP_ACCELERATION, TELEOP_BRAKING, TELEOP_TOP_SPEED
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 
-Array = NDArray[np.float64]
-
-RESULTS = Path(__file__).parent / "results"
 DELAYS_S = (0.0, 0.025, 0.05, 0.1, 0.2, 0.3)
 """Of each direction."""
 JITTER = 0.3

@@ -28,9 +28,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, markdown, total
+from benchmarks.tables import RESULTS, keep, markdown, total
 
-RESULTS = Path(__file__).parent / "results"
 CONFIG = Path(__file__).parents[1] / "configs" / "saferover_ppo.yaml"
 SLIPPING, YAW_EXCURSION = 0.2, 0.5
 EPISODE_STEPS = 300

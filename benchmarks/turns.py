@@ -6,19 +6,16 @@
 noises that the tracks are told of. The other track is told of all but the turn.
 """
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from benchmarks.tables import RESULTS
 from safe_wrappers.appendix.estimation.sigma_coverage import gaussian_tail
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
 from safe_wrappers.control.estimation.turning_tracks import TurningTracks
 
-Array = NDArray[np.float64]
-
-RESULTS = Path(__file__).parent / "results"
 TURNING = Motion(np.diag([0.01, 0.01]), np.inf, np.zeros(2), 0.05)
 TARGETS = 5000
 STEP_S, SEEN_S, POSITION_STD = 0.02, 2.0, 0.02

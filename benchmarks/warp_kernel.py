@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks.warp_source import CONSTANTS, ROOTS, TABLES, Translator
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup import drive_decision as among
-
-Array = NDArray[np.float64]
 
 _DETOUR_STEPS: Final = 50  # as in `BoundHeadingDriveClearance`
 _HEADER: Final = '''

@@ -19,15 +19,13 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks.drivers import DRIVERS
 from benchmarks.warp_kernel import Scene, States, WorldFilter, scene
 from benchmarks.warp_source import CONSTANTS
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup import drive_decision as among
-
-Array = NDArray[np.float64]
 
 ENV_ID: Final = "SafePointGoal1-v0"
 _JITTER: Final = 1e-5  # of a borderline state, in units of the state

@@ -33,12 +33,12 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
+from benchmarks.tables import RESULTS
 from safe_wrappers.appendix.legged.balance import support_margin, zmp_of_forces
 from safe_wrappers.control.legged.support import common_plane, support_polygon
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.replay import Replay
 
-RESULTS = Path(__file__).parent / "results"
 CONFIG = Path(__file__).parents[1] / "configs" / "velocity_experts.yaml"
 SHARE, TOLERANCE, INSET_M, STOP_RAD = 0.7, 0.01, 0.01, 0.1
 _ROUNDING = 1e-6
@@ -295,9 +295,7 @@ def line(row: Row) -> str:
 
 def main() -> None:
     """Print the table and write it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--robots", nargs="+", default=["Ant", "Humanoid"], choices=["Ant", "Humanoid"])
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     parser.add_argument("--episodes", type=int, default=10)

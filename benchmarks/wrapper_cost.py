@@ -11,10 +11,9 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.timing import paired_us
+from benchmarks.timing import paired_us, stepping
 from safe_wrappers.wrappers.faults import Outages
 
 Wrap = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
@@ -77,19 +76,8 @@ ROWS: list[tuple[str, str, Wrap]] = [
 
 def driver(env: gym.Env[Any, Any]) -> tuple[Callable[[], None], int]:
     """A function that makes one step with random actions, over and over, and its control steps."""
-    env.reset(seed=0)
     space: Any = env.action_space
-    actions = np.random.default_rng(0).uniform(space.low, space.high, (256, *space.shape)).astype(space.dtype)
-    turn = 0
-
-    def step() -> None:
-        nonlocal turn
-        turn += 1
-        _, _, terminated, truncated, _ = env.step(actions[turn % len(actions)])
-        if terminated or truncated:
-            env.reset()
-
-    return step, HORIZON if len(space.shape) > 1 else 1
+    return stepping(env), HORIZON if len(space.shape) > 1 else 1
 
 
 def measure(env_id: str, wrap: Wrap, rounds: int = 40, batch: int = BATCH) -> tuple[float, float]:

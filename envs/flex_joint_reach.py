@@ -11,12 +11,11 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP, IS_SUCCESS
 
 from .flexible_arm import MOTORS, SPRINGS, FlexibleArm
-
-Array = NDArray[np.float64]
 
 VIBRATION_ENERGY: Final = "vibration_energy"
 """float64, J: the largest boundary-layer energy at the ends of this control step's physics substeps."""

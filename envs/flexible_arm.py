@@ -6,9 +6,8 @@ from typing import Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 MOTORS: Final = slice(0, None, 2)
 """The motors' coordinates; the model's are motor 0, spring 0, motor 1, spring 1."""

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED
 
@@ -127,7 +128,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
     # What a constraint may read: from qpos, never a substep behind as xpos is after mj_step ----------------
 
     @property
-    def agent_position(self) -> NDArray[np.float64]:
+    def agent_position(self) -> Array:
         """Robot's centre, shape (2,), m."""
         return np.array(self.data.qpos[:2])
 
@@ -137,17 +138,17 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         return self.robot.heading(self.data.qpos)
 
     @property
-    def goal_position(self) -> NDArray[np.float64]:
+    def goal_position(self) -> Array:
         """Goal's centre, shape (2,), m."""
         return np.array(self._targets[0])
 
     @property
-    def hazard_positions(self) -> NDArray[np.float64]:
+    def hazard_positions(self) -> Array:
         """Centres of the hazards in the scenario, shape (n, 2), m."""
         return np.array(self._hazards)
 
     @property
-    def vase_positions(self) -> NDArray[np.float64]:
+    def vase_positions(self) -> Array:
         """Centres of the vases in the scenario now, shape (n, 2), m."""
         return np.array(self.data.qpos[self._vases_qpos].reshape(-1, 7)[: self._n_vases, :2])
 
@@ -160,7 +161,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+    ) -> tuple[Array, dict[str, Any]]:
         """Start an episode; ``options["layout"]`` fixes parts of the scenario.
 
         Raises:
@@ -171,12 +172,12 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         observation, info = super().reset(seed=seed, options=options)
         return observation, info
 
-    def reset_model(self) -> NDArray[np.float64]:
+    def reset_model(self) -> Array:
         """Sample what the options left open, place everything, return the observation."""
         self._apply(sample_layout(self.np_random, self.level, self._given))
         return self.observe()
 
-    def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
+    def set_state(self, qpos: Array, qvel: Array) -> None:
         """Set positions and velocities (shapes (nq,), (nv,)) and judge the state anew."""
         super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         self._judge_now()
@@ -184,7 +185,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
     # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
     def step(  # type: ignore[override]
         self, action: NDArray[np.floating[Any]]
-    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Hold an action for one control step (`dt` seconds, ten physics substeps).
 
         Raises:
@@ -221,7 +222,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
 
     # Physics and judging -----------------------------------------------------------------------------------
 
-    def _step_mujoco_simulation(self, ctrl: NDArray[np.float64], n_frames: int) -> None:
+    def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:
         """Step substep by substep, keeping what the judge needs of each; judge them together at the end."""
         model, data, qpos = self.model, self.data, self.data.qpos
         data.ctrl[:] = ctrl
@@ -253,7 +254,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         self._vase_hit = judge_vases and (self._any_vase_moves() or self._any_vase_touched())
         self._violated = self._in_hazard or self._vase_hit
 
-    def _inside_hazard(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def _inside_hazard(self, points: Array) -> NDArray[np.bool_]:
         """Whether each point, shape (n, 2), lies in some hazard's disc; shape (n,)."""
         gaps = points[:, None] - self._hazards
         inside: NDArray[np.bool_] = (np.einsum("ijk,ijk->ij", gaps, gaps) <= HAZARD_RADIUS**2).any(axis=1)
@@ -306,7 +307,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         vases[: self._n_vases, :2] = layout.vases
         self.set_state(qpos, np.zeros(self.model.nv))
 
-    def place_goal(self, goal: NDArray[np.float64]) -> None:
+    def place_goal(self, goal: Array) -> None:
         """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
         self._targets[0] = goal
         self.data.mocap_pos[0] = goal[0], goal[1], _GOAL_Z
@@ -315,7 +316,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         goal, qpos = self._targets[0], self.data.qpos
         return math.hypot(goal[0] - qpos[0], goal[1] - qpos[1])
 
-    def observe(self) -> NDArray[np.float64]:
+    def observe(self) -> Array:
         """Observation of the state as it is now: also right after `set_state`."""
         targets = self._targets
         targets[len(targets) - self._n_vases :] = self.vase_positions

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ActionError, SafeWrappersError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP, GOALS_REACHED
@@ -42,7 +43,6 @@ __all__ = [
     "OccludedCrossingEnv",
 ]
 
-Array = NDArray[np.float64]
 
 CAR_BODIES: Final = tuple(f"car{i}" for i in range(CARS))
 """The cars' bodies and joints, in the order of every array of six: the first three drive towards +x."""

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
@@ -23,7 +24,6 @@ except ImportError as error:
         "PatrolledPointMaze is built on gymnasium-robotics' PointMaze: pip install gymnasium-robotics"
     ) from error
 
-Array = NDArray[np.float64]
 
 BALL_RADIUS: Final = 0.1
 PATROL_RADIUS: Final = 0.15

@@ -12,6 +12,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from safe_wrappers.appendix.vehicle.traction_curves import MagicFormula
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ActionError, SafeWrappersError, UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED, SPIN_OUT
 
@@ -21,8 +22,6 @@ from .ground import Ground
 from .rover.layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout, start_state
 from .rover.scene import Scene
 from .rover.tyres import Tyres, rolled_over
-
-Array = NDArray[np.float64]
 
 WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
 """The wheels' joints, bodies and geoms, in the order of every array of four."""

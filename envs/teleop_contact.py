@@ -12,10 +12,9 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP
-
-Array = NDArray[np.float64]
 
 COST_FORCE: Final = "cost_force"
 """float64: 1 if the wall or the clamp pushed with more than `FORCE_LIMIT` in this step, else 0."""

@@ -4,11 +4,9 @@ from collections import deque
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
 
 REACTION_S: Final = (0.15, 0.25)
 """Range of human reaction times, s, from which one is drawn."""

@@ -4,9 +4,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 CAR_MEAN_SPEED: Final = 1.0
 """m/s, along the lane."""

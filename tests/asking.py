@@ -1,5 +1,32 @@
 """A constraint on a plant, asked at whatever state the plant has observed."""
 
+import safe_wrappers as sw
+
+
+def bound(env, **options):
+    """A MujocoPlant, bound to an env."""
+    plant = sw.MujocoPlant(**options)
+    plant.bind(env)
+    return plant
+
+
+def asked(env, constraint, plant=None):
+    """A constraint on a plant that has observed the env's present state."""
+    plant = plant or sw.MujocoPlant()
+    plant.bind(env)
+    plant.observe()
+    return Asked(constraint, plant)
+
+
+def settled(env, constraint, control, steps=60):
+    """A constraint on a plant that observes the env after the control has acted for some steps."""
+    plant = bound(env)
+    env.reset()
+    for _ in range(steps):
+        env.step(control)
+    plant.observe()
+    return Asked(constraint, plant)
+
 
 class Asked:
     """A bound constraint that observes by itself when the plant has, with the memory of an episode.

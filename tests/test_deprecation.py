@@ -32,8 +32,7 @@ class Cart:
 
 def warned(make):
     """What is made, and the only warning."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         made = make()
     (warning,) = [w for w in caught if w.category is DeprecationWarning]
     assert warning.filename == __file__
@@ -64,8 +63,7 @@ def test_old_parameters_work_with_one_warning(make, is_now, says):
 
 
 def test_todays_parameters_give_no_warning_and_are_the_signature():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert Cart("a", Wheel(1.0), paint="blue").is_now == ("a", Wheel(1.0), "blue")
     assert list(inspect.signature(Cart).parameters) == ["name", "wheel", "paint"]
     assert deprecated_names(Cart) == ("colour", "radius", "width") and deprecated_names(Wheel) == ()

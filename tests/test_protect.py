@@ -94,8 +94,7 @@ def test_known_envs_get_their_recipe_and_run(env_id):
 @newest
 def test_a_protected_env_passes_gymnasiums_checks(env_id):
     env = sw.protect(make(env_id))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         expected = (
             "A Box observation space|is different from the unwrapped|symmetric and normalized|out of date"
         )

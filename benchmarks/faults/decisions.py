@@ -11,12 +11,11 @@ import daqp
 import numpy as np
 
 from benchmarks.faults.episodes import plain
-from benchmarks.faults.outcomes import Found, Outcome, flags, judged, reached_wrongly
+from benchmarks.faults.outcomes import Cell, Found, Outcome, flags, judged, reached_wrongly
 from benchmarks.faults.stacks import BEFORE, Answer, Row, Session, same
 from safe_wrappers.filter import projection
 from safe_wrappers.filter.constraint import HalfSpaces
 
-Cell = Callable[[Session], Found]
 _HANG_S = 0.02
 _CHANGED = {"cbf/intervened": True}
 """A changed action says nothing of the fault."""

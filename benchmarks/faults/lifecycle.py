@@ -8,10 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from benchmarks.faults.episodes import plain
-from benchmarks.faults.outcomes import OF_OURS, Found, Outcome
+from benchmarks.faults.outcomes import OF_OURS, Cell, Found, Outcome
 from benchmarks.faults.stacks import BEFORE, BrokenEnvError, Row, Session, same
-
-Cell = Callable[[Session], Found]
 
 
 def _raises(where: str) -> Cell:
@@ -51,8 +49,7 @@ def _second(act: str) -> Cell:
         inside.wait(20.0)
         error: Exception | None = None
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(action="ignore"):
                 if act == "reset":
                     session.env.reset(seed=0)
                 else:

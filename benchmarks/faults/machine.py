@@ -10,12 +10,11 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.faults.outcomes import Found, Outcome, flags, judged, reached_wrongly
+from benchmarks.faults.outcomes import Cell, Found, Outcome, flags, judged, reached_wrongly
 from benchmarks.faults.stacks import BEFORE, Answer, Row, Session
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, filter_inside
 from safe_wrappers.wrappers.common.receiver import CommandReceiver
 
-Cell = Callable[[Session], Found]
 _PARTS = {
     "mass": ("body_mass", "body_inertia"),
     "damping": ("dof_damping",),

@@ -55,6 +55,10 @@ class Found(NamedTuple):
     note: str = ""
 
 
+Cell = Callable[[Session], Found]
+"""What a cell of the matrix does with a new session."""
+
+
 OF_OURS = (SafeWrappersError, gym.error.ResetNeeded)
 _FLAGS = (
     "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/clipped", "cbf/intervened",

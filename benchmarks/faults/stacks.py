@@ -109,8 +109,7 @@ class Row:
             bottoms.append(Bottom(env))
             return bottoms[-1]
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return Session(self.build(around, **more), bottoms)
 
     def bare(self) -> "Session":
@@ -143,8 +142,7 @@ class Session:
 
     def begin(self, steps: int = BEFORE) -> "Session":
         """Reset, and make the first steps of the episode."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             self.env.reset(seed=0)
             for action in self.actions[:steps]:
                 self.env.step(action)
@@ -154,8 +152,7 @@ class Session:
         """One step, whatever comes of it."""
         before = [len(bottom.given) for bottom in self.bottoms]
         answer = Answer()
-        with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as warned:
             try:
                 answer.returned = self.env.step(action)
             except Exception as error:
@@ -171,8 +168,7 @@ class Session:
 
     def episode(self) -> Any:
         """Everything an agent sees of an episode from the first seed."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return trace(self.env, steps=LONG)
 
     def raw(self) -> Any:

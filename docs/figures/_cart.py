@@ -6,11 +6,9 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
-
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 _FINE = 20
 """Points per control step at which the motion is kept."""

@@ -5,9 +5,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 
 def bang_bang(size: float, often: float, seed: int = 0) -> Callable[[Any], Any]:

@@ -37,8 +37,6 @@ def draw() -> Figure:
     times = 0.02 * np.arange(REPEAT * DECISIONS)
     ax.step(times, np.repeat(proposed, REPEAT), where="post", color=OFF, label="proposed, four steps each")
     ax.step(times, seen.drives, where="post", color=ON, label="executed")
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("drive")
-    ax.set_ylim(-0.2, 1.4)
+    ax.set(xlabel="time (s)", ylabel="drive", ylim=(-0.2, 1.4))
     ax.legend(loc="upper right", ncols=2)
     return figure

@@ -47,8 +47,7 @@ def draw() -> Figure:
             rows, columns = np.divmod(places, 8)
             nudge = 0.5 + rng.uniform(-0.2, 0.2, 2)
             ax.plot(columns + nudge[0], 8 - rows - nudge[1], color=ON if shielded else OFF, lw=1.0, alpha=0.8)
-        ax.set_title(f"{'shielded' if shielded else 'unshielded'}: {falls} of {WALKS} fall")
-        ax.set_xlim(0, 8)
+        ax.set(title=f"{'shielded' if shielded else 'unshielded'}: {falls} of {WALKS} fall", xlim=(0, 8))
         ax.set_ylim(0, 8)
         bare(ax)
     return figure

@@ -30,8 +30,7 @@ def draw() -> Figure:
     left.text(0.05, TOLERANCE + 0.08, "tolerance", color=FORBIDDEN)
     left.axvline(expiry, color=INK, lw=1.0, ls=":")
     left.text(expiry - 0.05, -1.75, f"permission\nexpires at {expiry:.2f} s", ha="right")
-    left.set_xlim(0.0, LONGEST_S + 0.35)
-    left.set_ylabel("error of the position (m)")
+    left.set(xlim=(0.0, LONGEST_S + 0.35), ylabel="error of the position (m)")
     times = np.linspace(0.0, 8.0, 201)
     parts = (
         ("velocity, $\\sigma_v t$", np.sqrt(P0[1, 1]) * times, OTHER),

@@ -6,13 +6,11 @@ import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, panels
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.stopping import held_stop
-
-Array = NDArray[np.float64]
 
 BRAKE, HOLD, DELAY = 2.0, 0.25, 0.2
 CENTER, RADIUS = (2.0, 0.12), 0.5
@@ -63,9 +61,7 @@ def draw() -> Figure:
     inset.plot(speed, held, color=ON, label="held for 0.25 s")
     inset.plot(speed, held + speed * DELAY, color=OTHER, label="and 0.2 s of delay")
     inset.fill_between(speed, 0.0, held, color=FORBIDDEN, alpha=0.12, lw=0)
-    inset.set_ylim(0.0, 1.6)
-    inset.set_xlabel("approach speed (m/s)")
-    inset.set_ylabel("stopping distance (m)")
+    inset.set(ylim=(0.0, 1.6), xlabel="approach speed (m/s)", ylabel="stopping distance (m)")
     inset.legend(loc="upper left")
     raw = PointMass()
     plant = sw.AnalyticPlant(
@@ -86,8 +82,5 @@ def draw() -> Figure:
     chart.plot(*drive(sw.CBFActionFilter(raw, [disc], plant=plant)).T, color=ON)
     chart.add_patch(Circle(CENTER, RADIUS, color=FORBIDDEN, alpha=0.35, lw=0))
     chart.add_patch(Circle(CENTER, RADIUS + 0.1, fill=False, color=FORBIDDEN, lw=0.8, ls=":"))
-    chart.set_aspect("equal")
-    chart.set_xlim(-0.1, 4.2)
-    chart.set_xlabel("x (m)")
-    chart.set_ylabel("y (m)")
+    chart.set(aspect="equal", xlim=(-0.1, 4.2), xlabel="x (m)", ylabel="y (m)")
     return figure

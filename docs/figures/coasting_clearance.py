@@ -8,12 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, OFF, ON, SAFE, bare, panels
-
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 HAZARD = [0.92, 0.03]
 LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.9, 0.15], "hazards": [HAZARD], "vases": []}
@@ -66,8 +64,7 @@ def draw() -> Figure:
         close.text(here[0] - 0.005, here[1] + 2.6 * offset, name, color=color, ha="right", va="center")
     close.plot(here[0], here[1], "s", color=INK, ms=5)
     bare(close)
-    close.set_xlim(here[0] - 0.11, here[0] + 0.16)
-    close.set_ylim(-0.08, 0.08)
+    close.set(xlim=(here[0] - 0.11, here[0] + 0.16), ylim=(-0.08, 0.08))
     _hazard(chart)
     chart.plot(*drive(gym.make("SafeCarGoal1-v0")).T, color=OFF)
     chart.plot(*drive(sw.protect(gym.make("SafeCarGoal1-v0"))).T, color=ON)

@@ -42,11 +42,7 @@ def draw() -> Figure:
         *(second + np.array([-0.09, 0.03])), "then B:\nbreaks A", color=FORBIDDEN, ha="right", va="bottom"
     )
     ax.text(*(both + np.array([0.12, -0.12])), "A and B in\none projection", color=ON, va="top")
-    ax.set_xlim(-1.3, 1.4)
-    ax.set_ylim(-1.3, 1.15)
-    ax.set_aspect("equal")
-    ax.set_xlabel("$u_1$")
+    ax.set(xlim=(-1.3, 1.4), ylim=(-1.3, 1.15), aspect="equal", xlabel="$u_1$")
     ax.set_ylabel("$u_2$", rotation=0)
-    ax.set_xticks([-1, 0, 1])
-    ax.set_yticks([-1, 0, 1])
+    ax.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
     return figure

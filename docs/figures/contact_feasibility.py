@@ -25,11 +25,9 @@ def draw() -> Figure:
         press = np.array([0.0, 2.5])
         ax.plot(press, SHARE * press, color=FORBIDDEN, lw=1.2)
         ax.plot(press, press, color=GRID, lw=1.0, ls="--")
-        ax.set_title(title)
-        ax.set_xlabel("pressure (shares of the weight)")
+        ax.set(title=title, xlabel="pressure (shares of the weight)")
     left.set_ylabel("sideways force\n(shares of the weight)")
     left.text(1.5, 1.75, "the model's friction", color=INK, rotation=44, ha="center", va="center")
     left.text(1.75, 1.02, "0.7 of it", color=FORBIDDEN, rotation=35, ha="center", va="center")
-    left.set_xlim(0.0, 2.2)
-    left.set_ylim(0.0, 2.0)
+    left.set(xlim=(0.0, 2.2), ylim=(0.0, 2.0))
     return figure

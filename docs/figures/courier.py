@@ -37,12 +37,9 @@ def _figure() -> Figure:
     for x, y, radius in task.pillars:
         chart.add_patch(Circle((x, y), radius, color=FORBIDDEN, alpha=0.35, lw=0))
         chart.add_patch(Circle((x, y), radius + task.radius, fill=False, color=FORBIDDEN, lw=0.8, ls=":"))
-    chart.set_aspect("equal")
-    chart.set_xlabel("x (m)")
-    chart.set_ylabel("y (m)")
+    chart.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
     speed.axhline(task.top_speed, color=FORBIDDEN, lw=1.2)
-    speed.set_xlabel("time (s)")
-    speed.set_ylabel("speed (m/s)")
+    speed.set(xlabel="time (s)", ylabel="speed (m/s)")
     speed.legend(loc="upper right")
     return figure
 

@@ -19,8 +19,7 @@ def draw() -> Figure:
         ax.plot(loop.t, WALL - loop.x, color=color, label=name)
     ax.axhline(0.0, color=FORBIDDEN, lw=1.2)
     ax.text(0.05, -0.03, "wall", color=FORBIDDEN, va="top")
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("distance to the wall (m)")
+    ax.set(xlabel="time (s)", ylabel="distance to the wall (m)")
     ax.legend(loc="upper right")
     ax.set_ylim(-0.7, 2.05)
     return figure

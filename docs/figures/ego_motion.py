@@ -36,8 +36,7 @@ def draw() -> Figure:
     ):
         for lever_arm, color, label in ((False, OFF, "arm left out"), (True, ON, "arm compensated")):
             ax.plot(times, run(lever_arm, fix_every_s), color=color, label=label)
-        ax.set_title(title)
-        ax.set_xlabel("time (s)")
+        ax.set(title=title, xlabel="time (s)")
     axes[0].set_ylabel("error of own position (m)")
     axes[0].legend(loc="upper left")
     return figure

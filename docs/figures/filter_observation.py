@@ -32,15 +32,11 @@ def draw() -> Figure:
         chart.plot(*np.transpose([place, place + way]), color=ON, lw=1.5)
     chart.plot(*place, "o", color=INK, ms=6)
     chart.plot(*np.transpose([place, place + 0.15 * turn[:, 0]]), color=INK, lw=2.5)
-    chart.set_aspect("equal")
-    chart.set_xlabel("x (m)")
-    chart.set_ylabel("y (m)")
+    chart.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
     edges = np.degrees(np.linspace(0.0, 2.0 * np.pi, BINS + 1))
     bearing.stairs(lidar, edges, color=OFF, label="hazard lidar, 16 bins")
     angles = np.degrees(np.arctan2(shown[:, 1], shown[:, 0])) % 360.0
     bearing.vlines(angles, 0.0, 1.0 - shown[:, 2], color=ON, lw=2.5, label="the filter's: 1 - clearance")
-    bearing.set_xlabel("bearing from the heading (degrees)")
-    bearing.set_ylabel("reading")
-    bearing.set_ylim(0.0, 1.3)
+    bearing.set(xlabel="bearing from the heading (degrees)", ylabel="reading", ylim=(0.0, 1.3))
     bearing.legend(loc="upper right")
     return figure

@@ -61,8 +61,6 @@ def draw() -> Figure:
     chart.plot(*path[0], "s", color=INK, ms=5)
     bare(chart)
     distance.axhline(0.0, color=FORBIDDEN, lw=1.2)
-    distance.set_ylim(-22, 110)
-    distance.set_xlabel("time (s)")
-    distance.set_ylabel("distance to the nearest hazard (cm)")
+    distance.set(ylim=(-22, 110), xlabel="time (s)", ylabel="distance to the nearest hazard (cm)")
     distance.legend(loc="upper right")
     return figure

@@ -80,11 +80,8 @@ def draw() -> Figure:
     for edges, color in ((4, OTHER), (8, SAFE)):
         corner = math.tau / edges * np.arange(edges + 1)
         left.plot(SHARE * np.cos(corner), SHARE * np.sin(corner), color=color, lw=1.1)
-    left.set_xlim(-REACH, REACH)
-    left.set_ylim(-REACH, REACH)
-    left.set_aspect("equal")
-    left.set_xlabel("sideways over normal force, x")
-    left.set_ylabel("the same, y")
+    left.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal")
+    left.set(xlabel="sideways over normal force, x", ylabel="the same, y")
     left.legend(loc="upper left", handletextpad=0.2)
 
     changed = [i for i, a in enumerate(exact) if a.status == "solved"]

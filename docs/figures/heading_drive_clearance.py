@@ -8,13 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import Motion, stopping_path
-
-Array = NDArray[np.float64]
 
 HEADING, SPEED = 0.7, 1.3
 
@@ -56,8 +54,7 @@ def draw() -> Figure:
         ax.plot(0.0, 0.0, "s", color=INK, ms=5)
         ax.add_patch(Circle((0.72, 0.12), 0.2, color=FORBIDDEN, alpha=0.35, lw=0))
         bare(ax)
-        ax.set_xlim(-0.1, 1.0)
-        ax.set_ylim(-0.58, 0.34)
+        ax.set(xlim=(-0.1, 1.0), ylim=(-0.58, 0.34))
     return figure
 
 

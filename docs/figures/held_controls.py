@@ -43,11 +43,8 @@ def draw() -> Figure:
         distance.plot(loop.t[::20], 1000 * (WALL - loop.x[::20]), "o", color=color, ms=3.5)
         commands.step(np.arange(len(loop.u)) * dt, loop.u, where="post", color=color)
     distance.axhline(0.0, color=FORBIDDEN, lw=1.2)
-    distance.set_ylim(-150, 400)
-    distance.set_xlabel("time (s)")
-    distance.set_ylabel("distance to the wall (mm)")
+    distance.set(ylim=(-150, 400), xlabel="time (s)", ylabel="distance to the wall (mm)")
     distance.legend(loc="upper right")
     commands.axhline(0.0, color=GRID, lw=0.8)
-    commands.set_xlabel("time (s)")
-    commands.set_ylabel("executed acceleration (m/s²)")
+    commands.set(xlabel="time (s)", ylabel="executed acceleration (m/s²)")
     return figure

@@ -6,12 +6,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, OFF, ON, OTHER, panels
-
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 LIMIT, STIFFNESS, MASS, PUSH = 140.0, 25e3, 6.0, 150.0
 GAP, START, STEPS = 0.08, 0.3, 28
@@ -88,11 +86,9 @@ def draw() -> Figure:
         force.plot(1e-3 * np.arange(len(fine)), pressing, style, color=color, label=name)
     way.axhline(LIMIT / np.sqrt(STIFFNESS * MASS), color=FORBIDDEN, lw=1.2)
     way.invert_xaxis()
-    way.set_xlabel("distance to the wall (mm)")
-    way.set_ylabel("approach speed (m/s)")
+    way.set(xlabel="distance to the wall (mm)", ylabel="approach speed (m/s)")
     force.axhline(LIMIT, color=FORBIDDEN, lw=1.2)
-    force.set_xlabel("time (s)")
-    force.set_ylabel("contact force (N)")
+    force.set(xlabel="time (s)", ylabel="contact force (N)")
     force.legend(loc="upper right")
     force.set_ylim(0.0, 1.5 * force.get_ylim()[1])
     return figure

@@ -27,9 +27,7 @@ def draw() -> Figure:
     for side in (-RANGE, RANGE):
         time.axhline(side, color=FORBIDDEN, lw=1.2)
         plane.axvline(side, color=FORBIDDEN, lw=1.2)
-    time.set_xlabel("time (s)")
-    time.set_ylabel("joint position (rad)")
+    time.set(xlabel="time (s)", ylabel="joint position (rad)")
     time.legend(loc="upper right")
-    plane.set_xlabel("joint position (rad)")
-    plane.set_ylabel("joint speed (rad/s)")
+    plane.set(xlabel="joint position (rad)", ylabel="joint speed (rad/s)")
     return figure

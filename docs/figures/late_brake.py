@@ -20,8 +20,7 @@ def draw() -> Figure:
         ax.plot(1e3 * latency, 100.0 * left, color=color, label=f"{braking:g} m/s²")
     ax.axvline(1e3 * peak_s, color=FORBIDDEN, lw=1.2)
     ax.annotate("time to peak", (1e3 * peak_s, 25.0), (4, 0), textcoords="offset points", color=FORBIDDEN)
-    ax.set_ylim(0.0, 110.0)
-    ax.set_xlabel("from the first touch to the brake's action (ms)")
+    ax.set(ylim=(0.0, 110.0), xlabel="from the first touch to the brake's action (ms)")
     ax.set_ylabel("peak force left (%)")
     ax.legend(loc="lower right", title="deceleration")
     return figure

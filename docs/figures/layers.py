@@ -114,7 +114,6 @@ def draw() -> Figure:
     ax.text(-0.02, middle, "observation, reward, info", color=OTHER, rotation=90, ha="center", va="center")
     first, last = (layers.index(ANY_ORDER[k]) + 1 for k in (0, -1))
     ax.plot([5.13, 5.13], [-first + 0.33, -last - 0.33], color=GRID, lw=1.2)
-    ax.set_xlim(-0.2, 10.7)
-    ax.set_ylim(bottom - 0.5, 0.5)
+    ax.set(xlim=(-0.2, 10.7), ylim=(bottom - 0.5, 0.5))
     ax.axis("off")
     return figure

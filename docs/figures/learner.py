@@ -93,9 +93,7 @@ def draw() -> Figure:
             ax.plot(action, -row, "o", color=OFF if action > LIMIT + 0.01 else ON, ms=8)
             ax.text(action + 0.04, -row + 0.12, f"reward {reward:.1f}", color=INK, va="bottom")
     ax.set_yticks([-row for row in range(len(learners))], list(learners))
-    ax.set_ylim(-len(learners) + 0.6, 0.7)
-    ax.set_xlim(-0.4, 1.15)
-    ax.set_xlabel("action")
+    ax.set(ylim=(-len(learners) + 0.6, 0.7), xlim=(-0.4, 1.15), xlabel="action")
     ax.tick_params(axis="y", length=0)
     ax.spines["left"].set_visible(False)
     return figure

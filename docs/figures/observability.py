@@ -4,13 +4,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from numpy.typing import NDArray
 
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, SAFE, panels
 from safe_wrappers.appendix.estimation.covariance import blind_covariance
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.kalman import update
-
-Array = NDArray[np.float64]
 
 RATE = 0.5
 """1/s."""
@@ -33,9 +31,7 @@ def draw() -> Figure:
         start = 0.05**2 * np.eye(len(a))
         grown = blind_covariance(start, a, np.diag(q), times)[:, 0, 0]
         left.plot(times, np.sqrt(grown), color=color, label=label)
-    left.set_ylim(0.0, 2.6)
-    left.set_xlabel("time unseen (s)")
-    left.set_ylabel(r"$\sigma$")
+    left.set(ylim=(0.0, 2.6), xlabel="time unseen (s)", ylabel=r"$\sigma$")
     left.legend(loc="upper left")
     start = np.array([2.0, 1.5])
     for moves, color, label in ((0.0, OFF, "standing"), (1.0, ON, "moving")):
@@ -49,11 +45,7 @@ def draw() -> Figure:
     right.plot(0.0, 0.0, "^", color=INK)
     right.text(0.15, -0.05, "beacon", va="center")
     right.plot([0.0, start[0]], [0.0, start[1]], color=INK, lw=0.8, ls=":")
-    right.set_aspect("equal")
-    right.set_xlim(-0.3, 3.6)
-    right.set_ylim(-0.4, 3.0)
-    right.set_xlabel("x (m)")
-    right.set_ylabel("y (m)")
+    right.set(aspect="equal", xlim=(-0.3, 3.6), ylim=(-0.4, 3.0), xlabel="x (m)", ylabel="y (m)")
     right.legend(loc="upper left")
     return figure
 

@@ -53,8 +53,7 @@ def draw() -> Figure:
         (1.8, -0.8, "seen", ON),
     ):
         ax.text(x, y, text, color=color, va="center")
-    ax.set_xlim(-4.4, 4.4)
-    ax.set_ylim(-3.6, 3.6)
+    ax.set(xlim=(-4.4, 4.4), ylim=(-3.6, 3.6))
     bare(ax)
     return figure
 

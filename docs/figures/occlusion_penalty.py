@@ -56,8 +56,7 @@ def draw() -> Figure:
             ax.fill_between(
                 times, low, high, where=mask, color=color, alpha=alpha, lw=0, step="mid", label=label
             )
-        ax.set_ylim(-TOP, TOP + 0.14)
-        ax.set_ylabel(f"{name}: error (m)")
+        ax.set(ylim=(-TOP, TOP + 0.14), ylabel=f"{name}: error (m)")
     axes[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5)
     axes[-1].set_xlabel("time (s)")
     axes[-1].set_xlim(0.0, times[-1])

@@ -32,11 +32,8 @@ def _phases(ax: Axes) -> None:
         ax.plot(degrees, [_made(int(d), impedance) for d in delays], color=color, label=name)
     for impedance, label in ((-1j, "any, with waves"), (1j, None), (1.0, None)):
         ax.plot(degrees, [_made_of_waves(int(d), impedance) for d in delays], color=ON, label=label)
-    ax.set_xticks([0, 45, 90, 135, 180])
-    ax.set_xlabel("phase of the delay, one way (degrees)")
-    ax.set_ylabel("mean power it makes")
-    ax.set_yticks([0])
-    ax.set_ylim(-0.62, 1.65)
+    ax.set(xticks=[0, 45, 90, 135, 180], xlabel="phase of the delay, one way (degrees)")
+    ax.set(ylabel="mean power it makes", yticks=[0], ylim=(-0.62, 1.65))
     ax.text(90.0, -0.45, "passive", ha="center", color=INK)
     ax.text(2.0, 0.75, "active", color=INK)
     ax.legend(loc="upper left", ncols=2, fontsize=8)
@@ -92,6 +89,5 @@ def _lines(ax: Axes) -> None:
         label = "a wave line, by any rule" if rule == rules[0] else None
         ax.plot(times, 1e3 * np.array(out), color=ON, lw=1.2, label=label)
     ax.grid(axis="y", lw=0.4, color=GRID)
-    ax.set_xlabel("time (ms)")
-    ax.set_ylabel("energy put out (mJ)")
+    ax.set(xlabel="time (ms)", ylabel="energy put out (mJ)")
     ax.legend(loc="upper left", fontsize=8)

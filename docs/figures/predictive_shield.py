@@ -25,8 +25,6 @@ def draw() -> Figure:
             speeds.append(float(observation[2]))
         ax.plot(0.05 * np.arange(STEPS), speeds, color=color, label=name)
     ax.axhline(LIMIT, color=FORBIDDEN, lw=1.2)
-    ax.set_ylim(0.0, 9.0)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("speed (rad/s)")
+    ax.set(ylim=(0.0, 9.0), xlabel="time (s)", ylabel="speed (rad/s)")
     ax.legend(loc="lower left")
     return figure

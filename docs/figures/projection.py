@@ -4,12 +4,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, SAFE, panels
-
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
 
 LOW, HIGH = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
 _POLICY = {"marker": "o", "color": OFF, "ms": 7}
@@ -41,13 +39,9 @@ def draw() -> Figure:
     right.text(1.2, -0.1, "row and bounds\ntogether", color=ON, va="center")
     arrow(right, nominal, normal, offset)
     for ax in (left, right):
-        ax.set_xlim(-1.25, 1.35 if ax is left else 2.35)
-        ax.set_ylim(-1.25, 1.25)
-        ax.set_aspect("equal")
-        ax.set_xlabel("$u_1$")
+        ax.set(xlim=(-1.25, 1.35 if ax is left else 2.35), ylim=(-1.25, 1.25), aspect="equal", xlabel="$u_1$")
         ax.set_ylabel("$u_2$", rotation=0)
-        ax.set_xticks([-1, 0, 1])
-        ax.set_yticks([-1, 0, 1])
+        ax.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
     return figure
 
 

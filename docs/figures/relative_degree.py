@@ -45,11 +45,7 @@ def draw() -> Figure:
         commands.step(np.arange(len(loop.u)) * 0.1, loop.u, where="post", color=color)
     plane.text(2.5, 1.85, "checks the next\nposition only", color=OFF)
     plane.text(0.68, 0.55, "counts the\nbraking distance", color=ON)
-    plane.set_xlim(-0.2, 3.4)
-    plane.set_ylim(0.0, 2.3)
-    plane.set_xlabel("position (m)")
-    plane.set_ylabel("speed (m/s)")
+    plane.set(xlim=(-0.2, 3.4), ylim=(0.0, 2.3), xlabel="position (m)", ylabel="speed (m/s)")
     commands.axhline(0.0, color=GRID, lw=0.8)
-    commands.set_xlabel("time (s)")
-    commands.set_ylabel("executed acceleration (m/s²)")
+    commands.set(xlabel="time (s)", ylabel="executed acceleration (m/s²)")
     return figure

@@ -42,9 +42,7 @@ def draw() -> Figure:
                 arrowprops={"arrowstyle": "->", "color": OTHER, "lw": 0.9},
             )
             plane.plot(sent[1], sent[0] / most, "o", color=ON, ms=3)
-    plane.set_xlabel("turn")
-    plane.set_ylabel("drive, as a share of what acts")
-    plane.set_aspect("equal")
+    plane.set(xlabel="turn", ylabel="drive, as a share of what acts", aspect="equal")
     mapped, filtered = [], []
     for drive in grid:
         action = np.array([most * drive, 0.0], np.float32)
@@ -53,7 +51,6 @@ def draw() -> Figure:
     drives.plot(grid, grid, color=GRID, lw=1.0, ls="--")
     drives.plot(grid, filtered, color=OFF, label="filter alone")
     drives.plot(grid, mapped, color=ON, label="with the map")
-    drives.set_xlabel("drive of the policy, straight on")
-    drives.set_ylabel("executed drive")
+    drives.set(xlabel="drive of the policy, straight on", ylabel="executed drive")
     drives.legend(loc="upper left")
     return figure

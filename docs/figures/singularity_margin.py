@@ -59,10 +59,7 @@ def draw() -> Figure:
     ways.plot(*reference(0.0), "s", color=INK, ms=4)
     ways.text(0.196, 0.062, "reach", color=FORBIDDEN, ha="right", va="bottom")
     bare(ways)
-    ways.set_xlim(0.11, 0.225)
-    ways.set_ylim(-0.075, 0.075)
-    speeds.set_xlabel("time (s)")
-    speeds.set_ylabel("largest joint rate (rad/s)")
-    speeds.set_ylim(bottom=0.0)
+    ways.set(xlim=(0.11, 0.225), ylim=(-0.075, 0.075))
+    speeds.set(xlabel="time (s)", ylabel="largest joint rate (rad/s)", ylim=(0.0, None))
     speeds.legend(loc="upper left")
     return figure

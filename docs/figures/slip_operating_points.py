@@ -28,9 +28,6 @@ def draw() -> Figure:
             points = np.concatenate(slips[FIRST - 1 :: EVERY])
             label = name if ground == GROUNDS[0] else None
             ax.plot(points, curve.friction(points), "o", color=color, ms=4, alpha=0.6, mew=0, label=label)
-    ax.set_xlim(0.0, 1.0)
-    ax.set_ylim(0.0, 1.1)
-    ax.set_xlabel("slip ratio")
-    ax.set_ylabel("friction coefficient")
+    ax.set(xlim=(0.0, 1.0), ylim=(0.0, 1.1), xlabel="slip ratio", ylabel="friction coefficient")
     ax.legend(loc="upper right")
     return figure

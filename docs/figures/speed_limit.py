@@ -26,7 +26,6 @@ def draw() -> Figure:
             assert not ((speed > LIMIT) & ~flagged).any()  # what the caption says
             ax.plot(time[flagged], speed[flagged], "o", color=color, ms=4, label="flagged infeasible")
     ax.axhline(LIMIT, color=FORBIDDEN, lw=1.2)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("forward speed (m/s)")
+    ax.set(xlabel="time (s)", ylabel="forward speed (m/s)")
     ax.legend(loc="lower right", ncols=3)
     return figure

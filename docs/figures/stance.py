@@ -40,8 +40,7 @@ def draw() -> Figure:
             (answer,) = stance.candidates(wanted)
             distances.append(np.linalg.norm(answer - wanted) if stance.admits(answer) else np.nan)
         ax.plot(SHARES, distances, color=color, label=label)
-    ax.set_xlabel("share of the model's friction")
-    ax.set_ylabel("correction of the torques")
+    ax.set(xlabel="share of the model's friction", ylabel="correction of the torques")
     ax.legend(loc="upper right")
     env.close()
     return figure

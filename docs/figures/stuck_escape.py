@@ -43,10 +43,7 @@ def draw() -> Figure:
     for center in LAYOUT["hazards"]:
         chart.add_patch(Circle(center, 0.2, color=FORBIDDEN, alpha=0.35, lw=0))
     chart.add_patch(Circle(LAYOUT["goal"], 0.3, fill=False, color=SAFE, lw=1.5))
-    chart.set_aspect("equal")
-    chart.set_xlabel("x (m)")
-    chart.set_ylabel("y (m)")
-    way.set_xlabel("time (s)")
-    way.set_ylabel("x (m)")
+    chart.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    way.set(xlabel="time (s)", ylabel="x (m)")
     way.legend(loc="lower right")
     return figure

@@ -46,8 +46,6 @@ def draw() -> Figure:
             ax.plot(times[changed], np.full(sum(changed), -0.03), "|", color=ON, ms=7)
     ax.axhline(INSET, color=FORBIDDEN, lw=1.2)
     ax.text(0.05, INSET + 0.01, "inset", color=FORBIDDEN)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("distance to the edge (m)")
-    ax.set_ylim(-0.06, 0.5)
+    ax.set(xlabel="time (s)", ylabel="distance to the edge (m)", ylim=(-0.06, 0.5))
     ax.legend(loc="upper right")
     return figure

@@ -47,7 +47,6 @@ def draw() -> Figure:
             clearance.set_ylim(low, high)
     clearance.axhline(0.0, color=FORBIDDEN, lw=1.0)
     clearance.text(0.02, 3.0, "clamp", color=FORBIDDEN)
-    clearance.set_ylabel("clearance (mm)")
-    clearance.set_xlabel("time (s)")
+    clearance.set(ylabel="clearance (mm)", xlabel="time (s)")
     clearance.legend(loc="upper right")
     return figure

@@ -54,8 +54,7 @@ def draw() -> Figure:
     above.set_ylim(0.0, 1.0)
     below.set_ylim(-0.05, 0.8)
     above.set_ylabel("error bound (m)")
-    below.set_ylabel("speed (m/s)")
-    below.set_xlabel("time (s)")
+    below.set(ylabel="speed (m/s)", xlabel="time (s)")
     above.legend(loc="center left")
     below.legend(loc="lower left")
     return figure

@@ -22,7 +22,6 @@ def draw() -> Figure:
     ax.plot(time, margin, color=ON)
     ax.plot(time[unsafe], margin[unsafe], ".", color=FORBIDDEN, ms=4, label="cbf/unsafe")
     ax.axhline(0.0, color=FORBIDDEN, lw=1.2)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("cbf/margin (cm)")
+    ax.set(xlabel="time (s)", ylabel="cbf/margin (cm)")
     ax.legend(loc="lower right")
     return figure

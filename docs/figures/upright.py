@@ -30,7 +30,6 @@ def draw() -> Figure:
         if flagged.any():
             ax.plot(time[flagged], tilt[flagged], "o", color=color, ms=4, label="flagged infeasible")
     ax.axhline(TILT, color=FORBIDDEN, lw=1.2)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("tilt of the torso (rad)")
+    ax.set(xlabel="time (s)", ylabel="tilt of the torso (rad)")
     ax.legend(loc="center right")
     return figure

@@ -8,18 +8,16 @@ import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _drivers import bang_bang
 from _style import FORBIDDEN, INK, OFF, ON, bare, panels
+from safe_wrappers.checks import Array
 
 with contextlib.redirect_stderr(io.StringIO()):  # it greets on stderr
     import gymnasium_robotics
 
 gym.register_envs(gymnasium_robotics)
-
-Array = NDArray[np.float64]
 
 
 def drive(env: Any) -> tuple[Array, int]:

@@ -31,8 +31,7 @@ def draw() -> Figure:
     above.set_ylim(0.0, 3.5)
     below.set_ylim(0.0, 4.5)
     above.set_ylabel("force beyond its cone\n(shares of the weight)")
-    below.set_ylabel("correction of the torques")
-    below.set_xlabel("time (s)")
+    below.set(ylabel="correction of the torques", xlabel="time (s)")
     above.legend(loc="upper right")
     below.text(0.05, 4.0, "shaded: flagged infeasible", color=INK)
     return figure

@@ -35,6 +35,5 @@ def draw() -> Figure:
         ax.plot(*path.T, color=color, lw=1.1)
         ax.plot(*path[0], "s", color=INK, ms=4)
         bare(ax)
-        ax.set_xlim(-0.24, 0.24)
-        ax.set_ylim(-0.22, 0.22)
+        ax.set(xlim=(-0.24, 0.24), ylim=(-0.22, 0.22))
     return figure

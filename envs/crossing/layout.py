@@ -5,21 +5,17 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
 from ..goal.layout import layout_option, numbers
 from ..traffic import CAR_MEAN_SPEED, CAR_SPEED_STD
 
-Array = NDArray[np.float64]
-
 CROSSING_LAYOUT_KEYS: Final = ("agent", "goal", "cars", "pillars")
 """What the crossing's ``reset(options={"layout": {...}})`` understands."""
 FIELD: Final = (4.0, 3.5)
 """The field is ``|x| <= 4``, ``|y| <= 3.5``, m: rails keep the robot in it."""
-ROAD_HALF_WIDTH: Final = 1.3
-"""The road is ``|y| <= 1.3``, m; pavements beyond."""
 LANE_CENTRES: Final = (-0.8, 0.8)
 """Their y, m: the first lane leads towards +x, the second towards -x."""
 CARS_PER_LANE: Final = 3

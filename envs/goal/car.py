@@ -6,7 +6,8 @@ from typing import Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+
+from safe_wrappers.checks import Array
 
 _DIRECT: Final = 15  # sensors that are observed as they are; the caster's quaternion follows them
 _HEIGHT: Final = 0.1  # m: of the car's centre where its wheels touch the floor
@@ -37,32 +38,32 @@ class WheeledCar:
         """Largest horizontal distance of any point of the upright car from its centre, m."""
         return max(math.hypot(x, y) for x, y in self.corners)
 
-    def place(self, qpos: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
+    def place(self, qpos: Array, pose: Array) -> None:
         """Stand upright on the floor with the driving direction along the pose's heading."""
         x, y, heading = pose.tolist()
         half = (heading + _QUARTER_TURN) / 2.0
         qpos[:7] = x, y, _HEIGHT, math.cos(half), 0.0, 0.0, math.sin(half)
 
-    def heading(self, qpos: NDArray[np.float64]) -> float:
+    def heading(self, qpos: Array) -> float:
         """Direction of the body's -y axis seen from above, in [-pi, pi], rad."""
         rotation = _rotation(qpos[3:7])
         return math.atan2(-rotation[1, 1], -rotation[0, 1])
 
-    def sensors(self, data: mujoco.MjData) -> NDArray[np.float64]:
+    def sensors(self, data: mujoco.MjData) -> Array:
         """The sensors, and the caster's quaternion as a rotation matrix."""
         readings = data.sensordata
         return np.concatenate([readings[:_DIRECT], _rotation(readings[_DIRECT : _DIRECT + 4]).ravel()])
 
-    def relative(self, points: NDArray[np.float64], qpos: NDArray[np.float64]) -> NDArray[np.float64]:
+    def relative(self, points: Array, qpos: Array) -> Array:
         """Points of the floor in the body's frame, tilt and height included; the first two coordinates, m."""
         offsets = np.empty((len(points), 3))
         offsets[:, :2] = points - qpos[:2]
         offsets[:, 2] = -qpos[2]
-        turned: NDArray[np.float64] = offsets @ _rotation(qpos[3:7])[:, :2]
+        turned: Array = offsets @ _rotation(qpos[3:7])[:, :2]
         return turned
 
 
-def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotation(quaternion: Array) -> Array:
     """A quaternion's rotation matrix, shape (3, 3); of no rotation where the quaternion is zero."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 from .levels import Level
@@ -27,20 +27,20 @@ class PartialLayout:
         vases: Centres, shape (n, 2), m.
     """
 
-    agent: NDArray[np.float64] | None = None
-    goal: NDArray[np.float64] | None = None
-    hazards: NDArray[np.float64] | None = None
-    vases: NDArray[np.float64] | None = None
+    agent: Array | None = None
+    goal: Array | None = None
+    hazards: Array | None = None
+    vases: Array | None = None
 
 
 @dataclass(frozen=True)
 class Layout:
     """A whole layout: the same parts as `PartialLayout`, all of them known."""
 
-    agent: NDArray[np.float64]
-    goal: NDArray[np.float64]
-    hazards: NDArray[np.float64]
-    vases: NDArray[np.float64]
+    agent: Array
+    goal: Array
+    hazards: Array
+    vases: Array
 
 
 def parse_layout(options: Mapping[str, Any] | None, level: Level) -> PartialLayout:
@@ -98,9 +98,7 @@ def layout_option(options: Mapping[str, Any] | None, keys: Sequence[str]) -> Map
     return given
 
 
-def numbers(
-    given: Mapping[str, Any], key: str, form: str, shape: tuple[int, ...]
-) -> NDArray[np.float64] | None:
+def numbers(given: Mapping[str, Any], key: str, form: str, shape: tuple[int, ...]) -> Array | None:
     """Finite numbers of a shape, or None where the key is missing.
 
     Raises:
@@ -114,7 +112,7 @@ def numbers(
     return value
 
 
-def points(given: Mapping[str, Any], key: str, at_most: int) -> NDArray[np.float64] | None:
+def points(given: Mapping[str, Any], key: str, at_most: int) -> Array | None:
     """Points in the plane, shape (n, 2), m, or None where the key is missing.
 
     Raises:
@@ -132,7 +130,7 @@ def points(given: Mapping[str, Any], key: str, at_most: int) -> NDArray[np.float
     return value
 
 
-def _finite_array(value: Any, key: str, form: str) -> NDArray[np.float64]:
+def _finite_array(value: Any, key: str, form: str) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -5,6 +5,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
+
 LIDAR_BINS: Final = 16
 """Directions per object kind; bin i spans [i, i + 1] * 2 pi / 16 counter-clockwise from straight ahead."""
 LIDAR_RANGE: Final = 3.0
@@ -14,12 +16,12 @@ _NEIGHBOURS: Final = np.array([[0], [1], [-1]])
 
 
 def pseudo_lidar(
-    relative: NDArray[np.float64],
+    relative: Array,
     kinds: NDArray[np.intp],
     n_kinds: int,
     bins: int = LIDAR_BINS,
     max_dist: float = LIDAR_RANGE,
-) -> NDArray[np.float64]:
+) -> Array:
     """Read the lidars of all object kinds at once.
 
     An object at distance d in bin i reads s = max(0, 1 - d / max_dist) there. It also reads into both

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
 from .layout import Layout, PartialLayout
@@ -52,13 +52,7 @@ def sample_layout(rng: np.random.Generator, level: Level, given: PartialLayout) 
     )
 
 
-def sample_goal(
-    rng: np.random.Generator,
-    level: Level,
-    agent: NDArray[np.float64],
-    hazards: NDArray[np.float64],
-    vases: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def sample_goal(rng: np.random.Generator, level: Level, agent: Array, hazards: Array, vases: Array) -> Array:
     """Sample the next goal beside everything that already stands in the field.
 
     A crowded scenario must not end an episode with an error: where no try is clear, the clearest is taken.
@@ -82,9 +76,9 @@ def place_one(
     rng: np.random.Generator,
     half_extent: float,
     keepout: float,
-    placed: NDArray[np.float64],
-    keepouts: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    placed: Array,
+    keepouts: Array,
+) -> Array:
     """Place one more object, shape (2,), m; where no try is clear, the clearest is taken.
 
     Args:
@@ -116,12 +110,12 @@ class Kind(NamedTuple):
 
     number: int
     keepout: float
-    known: NDArray[np.float64] | None
+    known: Array | None
 
 
 def place_objects(
     rng: np.random.Generator, half_extent: float, kinds: Mapping[str, Kind]
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Array]:
     """Place the objects that do not stand yet, kind by kind.
 
     An object with keepout k is drawn uniformly from the field shrunk by k, until it is at least k + k' away
@@ -150,7 +144,7 @@ def place_objects(
 
 def _try_objects(
     rng: np.random.Generator, half_extent: float, kinds: Mapping[str, Kind]
-) -> dict[str, NDArray[np.float64]] | None:
+) -> dict[str, Array] | None:
     centres = {name: kind.known.copy() for name, kind in kinds.items() if kind.known is not None}
     placed = np.concatenate([np.zeros((0, 2)), *centres.values()])
     keepouts = np.concatenate([np.zeros(0), *(np.full(len(c), kinds[n].keepout) for n, c in centres.items())])
@@ -171,14 +165,12 @@ def _try_objects(
     return centres
 
 
-def _draw(rng: np.random.Generator, half_extent: float, keepout: float) -> NDArray[np.float64]:
+def _draw(rng: np.random.Generator, half_extent: float, keepout: float) -> Array:
     reach = half_extent - keepout
     return rng.uniform(-reach, reach, size=2)
 
 
-def _slack(
-    point: NDArray[np.float64], keepout: float, placed: NDArray[np.float64], keepouts: NDArray[np.float64]
-) -> float:
+def _slack(point: Array, keepout: float, placed: Array, keepouts: Array) -> float:
     """Distance left over to the nearest placed object, m; infinite when there is none."""
     if not len(placed):
         return np.inf

@@ -6,7 +6,8 @@ from typing import Final, Protocol
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+
+from safe_wrappers.checks import Array
 
 
 class Robot(Protocol):
@@ -28,16 +29,16 @@ class Robot(Protocol):
     def radius(self) -> float:
         """Largest horizontal distance of any point of the robot from its centre, m."""
 
-    def place(self, qpos: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
+    def place(self, qpos: Array, pose: Array) -> None:
         """Write its pose, shape (3,): x, y (m) and heading (rad), into the configuration, shape (nq,)."""
 
-    def heading(self, qpos: NDArray[np.float64]) -> float:
+    def heading(self, qpos: Array) -> float:
         """Heading in a configuration, shape (nq,): where positive controls drive it, in [-pi, pi], rad."""
 
-    def sensors(self, data: mujoco.MjData) -> NDArray[np.float64]:
+    def sensors(self, data: mujoco.MjData) -> Array:
         """Sensor readings, shape (n_sensors,)."""
 
-    def relative(self, points: NDArray[np.float64], qpos: NDArray[np.float64]) -> NDArray[np.float64]:
+    def relative(self, points: Array, qpos: Array) -> Array:
         """Points on the floor in its lidar's frame; shape (n, 2) both, m."""
 
 
@@ -64,24 +65,24 @@ class PlanarRobot:
         """Largest distance of any point of the robot from its turning axis, m."""
         return max(self.hull_radius, *(math.hypot(x, y) for x, y in self.hull_corners))
 
-    def place(self, qpos: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
+    def place(self, qpos: Array, pose: Array) -> None:
         """The pose is the first three coordinates."""
         qpos[:3] = pose
 
-    def heading(self, qpos: NDArray[np.float64]) -> float:
+    def heading(self, qpos: Array) -> float:
         """The third coordinate, in [-pi, pi], rad."""
         return math.remainder(qpos[2], math.tau)
 
-    def sensors(self, data: mujoco.MjData) -> NDArray[np.float64]:
+    def sensors(self, data: mujoco.MjData) -> Array:
         """The first readings of the model."""
-        readings: NDArray[np.float64] = data.sensordata[: self.n_sensors]
+        readings: Array = data.sensordata[: self.n_sensors]
         return readings
 
-    def relative(self, points: NDArray[np.float64], qpos: NDArray[np.float64]) -> NDArray[np.float64]:
+    def relative(self, points: Array, qpos: Array) -> Array:
         """Points with x along the heading and y to its left, shape (n, 2), m."""
         x, y, heading = qpos[:3].tolist()
         cos, sin = math.cos(heading), math.sin(heading)
-        turned: NDArray[np.float64] = (points - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
+        turned: Array = (points - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
         return turned
 
 

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 from ..goal.layout import layout_option, numbers, points
 from ..goal.placement import Kind, place_objects, place_one
 from ..ground import GROUNDS, Patch
-
-Array = NDArray[np.float64]
 
 ROVER_LAYOUT_KEYS: Final = ("agent", "goal", "hazards", "patches", "ground", "speed")
 """What the rover's ``reset(options={"layout": {...}})`` understands."""

@@ -3,22 +3,15 @@
 import gymnasium as gym
 import mujoco
 import numpy as np
+import scenes
+
+import safe_wrappers as sw
 
 
-class Scene(gym.Env):
-    """Any MJCF as an env. It resets to the model's own pose; `start` is (qpos, qvel)."""
+class Scene(scenes.Scene):
+    """It resets to the model's own pose; `start` is (qpos, qvel)."""
 
-    def __init__(self, xml, frame_skip=5):
-        self.model = mujoco.MjModel.from_xml_string(xml)
-        self.data = mujoco.MjData(self.model)
-        self.frame_skip = frame_skip
-        self.dt = frame_skip * self.model.opt.timestep
-        limited = self.model.actuator_ctrllimited.astype(bool)
-        low = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
-        high = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
-        self.action_space = gym.spaces.Box(low, high, dtype=np.float64)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
-        self.start = None
+    start = None
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -149,3 +142,16 @@ def drive(env, room, driver, steps, seeds=(0,)):
                 env.reset()
                 before = judge.at(judge.raw.data)
     return seen
+
+
+def check_inactive(env_id, limit, largest, steps):
+    """Actions of up to `largest` pass bit for bit: the env does what it does without the filter."""
+    bare, filtered = gym.make(env_id), sw.CBFActionFilter(gym.make(env_id), [limit])
+    rng = np.random.default_rng(0)
+    a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
+    for _ in range(steps):
+        assert a.tobytes() == b.tobytes()
+        action = rng.uniform(-largest, largest, bare.action_space.shape).astype(np.float32)
+        a, reward, *_ = bare.step(action)
+        b, same, _, _, info = filtered.step(action)
+        assert reward == same and not info["cbf/intervened"] and not info["cbf/refused"].any()

@@ -1,7 +1,5 @@
 """Points among walls in MuJoCo, written out by hand: held for several physics steps, with or without a clip."""
 
-from typing import ClassVar
-
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -27,8 +25,6 @@ class PointWorld(gym.Env):
         blocks: The walls.
         damping: Of both slides.
     """
-
-    metadata: ClassVar = {"render_modes": []}
 
     def __init__(self, frame_skip=1, clip=None, blocks=None, damping=1.0):
         boxes = "".join(

@@ -6,7 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked
+from asking import Asked, asked, bound
 from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
@@ -63,13 +63,12 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
     pull = np.array([0.4, -0.7])  # a drift
     env = PointMass(tmp_path, pull=pull)
     env.reset(seed=0)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     name, offset = {"bodies": ("ball", 0.0), "sites": ("nose", 0.05)}[kind]
     clear = sw.constraints.Clearance([DISCS[0]], braking=1.5, **{kind: [name]})
     clear = Asked(clear, plant)
     rng = np.random.default_rng(0)
-    asked = 0
+    compared = 0
     for _ in range(200):
         env.set_state(np.array([0.55 - offset, 0.1]) + rng.uniform(-0.1, 0.1, 2), rng.uniform(-1, 1, 2))
         plant.observe()
@@ -88,11 +87,11 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
         rows = clear.rows()
         if not len(rows.offsets):
             continue
-        asked += 1
+        compared += 1
         limit = held_limit(distance(0.0), approach, 1.5, plant.control_dt)
         if limit > -1e6:
             assert rows.offsets[0] - rows.normals[0] @ u == pytest.approx(limit - acceleration, abs=1e-4)
-    assert asked > 20
+    assert compared > 20
 
 
 def drivers():
@@ -169,11 +168,8 @@ def test_radius_margin_and_state_error_add_up(tmp_path, radius, state_error):
 def test_far_away_no_rows_are_asked_for(tmp_path):
     env = PointMass(tmp_path)
     env.reset(seed=0)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    plant.observe()
     clear = sw.constraints.Clearance([sw.constraints.Disc([50.0, 0.0], 0.3)], 1.5, bodies=["ball"])
-    clear = Asked(clear, plant)
+    clear = asked(env, clear)
     rows = clear.rows()
     assert rows.normals.shape == (0, 2) and rows.offsets.shape == (0,)
 
@@ -181,11 +177,7 @@ def test_far_away_no_rows_are_asked_for(tmp_path):
 def test_several_points_and_obstacles_give_a_value_each(tmp_path):
     env = PointMass(tmp_path)
     env.reset(seed=0)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    plant.observe()
-    clear = sw.constraints.Clearance(DISCS, 1.5, bodies=["ball"], sites=["nose"])
-    clear = Asked(clear, plant)
+    clear = asked(env, sw.constraints.Clearance(DISCS, 1.5, bodies=["ball"], sites=["nose"]))
     np.testing.assert_allclose(clear.value()[[0, 4]], [np.hypot(1.0, 0.3) - 0.3, np.hypot(0.95, 0.3) - 0.3])
     assert clear.value().shape == (8,)
 
@@ -216,8 +208,7 @@ def test_spheres_and_boxes_around_an_arm():
                 worst = min(worst, *(o.nearest(p, None).distance[0] for o in clear.obstacles))
         return worst
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         kept = deepest(sw.CBFActionFilter(gym.make("Reacher-v5"), [clear]), True)
     bare = deepest(gym.make("Reacher-v5"), False)
     assert bare < -0.01
@@ -261,8 +252,7 @@ def test_on_an_analytic_plant_the_indices_are_asked_for():
 @pytest.mark.parametrize("frame", [{"bodies": ["ball"]}, {"sites": ["nose"], "geoms": []}])
 def test_approach_is_what_the_barrier_counts_the_stopping_distance_from(tmp_path, frame):
     env = PointMass(tmp_path)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     clearance = sw.constraints.Clearance(
         DISCS, braking=2.0, radius=0.05, margin=0.3, state_error=0.1, **frame
     )

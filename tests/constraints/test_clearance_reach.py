@@ -4,6 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import bound
 
 import safe_wrappers as sw
 
@@ -60,8 +61,7 @@ def test_what_is_out_of_reach_has_no_rows(case):
     make, bodies, braking = CASES[case]
     env = make()
     env.reset(seed=0)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     clearance = sw.constraints.Clearance(WALLS, braking, bodies=bodies, margin=0.01).bind(plant)
     raw, rng, far, touched, reached = env.unwrapped, np.random.default_rng(1), 0, 0, 0
     start = raw.data.qpos.copy()
@@ -87,8 +87,7 @@ def test_a_control_changes_the_acceleration_of_a_point_by_no_more_than_its_reach
     make, bodies, _ = CASES[case]
     env = make()
     env.reset(seed=0)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     points = sw.constraints.Clearance(WALLS, 1.0, bodies=bodies).bind(plant)._points
     raw, rng, tight, saturated = env.unwrapped, np.random.default_rng(2), 0.0, 0
     start = raw.data.qpos.copy()

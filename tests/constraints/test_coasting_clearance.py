@@ -117,8 +117,7 @@ def test_a_reach_that_is_broken_is_dropped_with_a_warning():
     _, constraint, _ = bound([[0.2055, 0.0]], max_decrease=0.001)
     with pytest.warns(UserWarning, match=r"farther than the declared max_decrease of 0\.001 m"):
         assert not constraint.admits(FULL)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert not constraint.admits(FULL)
     assert constraint.max_decrease is None
 
@@ -148,8 +147,7 @@ def test_from_inside_it_drives_out():
     with pytest.warns(UnsafeStateWarning):
         info = env.reset(seed=0, options={"layout": layout})[1]
     assert info["cbf/unsafe"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         infos = [env.step(FULL.astype(np.float32))[4] for _ in range(60)]
     assert infos[0]["cbf/unsafe"] and infos[0]["cbf/intervened"]
     first = next(k for k, info in enumerate(infos) if not info["cost_substep"])

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asking import Asked
+from asking import asked
 
 import safe_wrappers as sw
 
@@ -21,11 +21,8 @@ def parked(hazard, speed_up=0, **options):
         env.unwrapped.step(NONE)  # it settles on its wheels
     for _ in range(speed_up):
         env.unwrapped.step(FULL)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    plant.observe()
     spec = sw.constraints.CoastingClearance([sw.constraints.Discs("hazard_positions", RADIUS)], **options)
-    return Asked(spec, plant), np.array(env.unwrapped.agent_position)
+    return asked(env, spec), np.array(env.unwrapped.agent_position)
 
 
 def test_what_does_not_rest_within_the_horizon_is_refused_however_far_it_stays_away():

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asking import Asked
+from asking import bound, settled
 from contact_judge import DRIVERS, ConeJudge, touches
 from judged_loops import Scene, flagged
 
@@ -31,17 +31,6 @@ def pushed_balls(names=("left",), cone="pyramidal", condim=3, more=""):
     return Scene(BALLS.format(cone=cone, condim=condim, balls=balls, motors=motors))
 
 
-def settled(env, constraint, control):
-    """The constraint on a plant that observes the env after the control has acted for a second."""
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    env.reset()
-    for _ in range(40):
-        env.step(control)
-    plant.observe()
-    return Asked(constraint, plant)
-
-
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 @pytest.mark.parametrize(
     ("share", "tolerance", "margin"),
@@ -56,7 +45,7 @@ def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_marg
     spec = sw.constraints.ContactFeasibility(share, tolerance, margin=margin)
     for part, admitted in ((0.99, True), (1.01, False), (-0.99, True), (-1.01, False)):
         control = np.array([part * largest * weight / 50.0])
-        limit = settled(pushed_balls(cone=cone), spec, control)
+        limit = settled(pushed_balls(cone=cone), spec, control, 40)
         assert limit.plant.weight_n == pytest.approx(weight)
         assert limit.admits(control) is admitted
         inside = share * 0.8 - abs(part) * largest
@@ -67,7 +56,7 @@ def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_marg
 def test_in_the_air_nothing_is_missed_whatever_the_margin():
     env = pushed_balls(("left", "right"))
     env.start = np.array([0.0, 3.0, 0.0, 3.0]), np.zeros(4)
-    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0, margin=0.3), np.zeros(2))
+    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0, margin=0.3), np.zeros(2), 40)
     env.reset()
     limit.plant.observe()
     control = np.array([1.0, -1.0])
@@ -78,7 +67,7 @@ def test_in_the_air_nothing_is_missed_whatever_the_margin():
 def test_a_contact_without_friction_has_no_cone_to_leave():
     ball = '<body name="b" pos="5 5 .1"><freejoint/><geom condim="3" size=".1"/></body>'
     env = pushed_balls(condim=1, more=ball)
-    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0), np.ones(1))
+    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0), np.ones(1), 40)
     assert limit.admits(np.ones(1)) and limit.slacks(np.ones(1)).size == 1
 
 
@@ -86,14 +75,14 @@ def test_only_the_named_bodies_count():
     control = np.array([0.0, 0.3])  # 15 N on 11 N: only the second ball slides
     for bodies, admitted in ((None, False), (["left"], True), (["right"], False), (("left", "right"), False)):
         limit = settled(
-            pushed_balls(("left", "right")), sw.constraints.ContactFeasibility(0.7, 0.0, bodies), control
+            pushed_balls(("left", "right")), sw.constraints.ContactFeasibility(0.7, 0.0, bodies), control, 40
         )
         assert limit.admits(control) is admitted
         assert limit.slacks(control).size == (1 if bodies and len(bodies) == 1 else 2)
 
 
 def test_the_linearization_of_a_refused_push_is_where_the_ball_would_slide():
-    limit = settled(pushed_balls(), sw.constraints.ContactFeasibility(0.7, 0.0), np.array([0.2]))
+    limit = settled(pushed_balls(), sw.constraints.ContactFeasibility(0.7, 0.0), np.array([0.2]), 40)
     for control in (np.array([0.25]), np.array([-0.25])):
         rows = limit.linearize(control)
         border = rows.offsets[0] / rows.normals[0, 0]
@@ -126,25 +115,23 @@ def test_bad_arguments_are_refused_in_words(arguments, words):
 
 
 def test_what_it_cannot_watch_is_refused_when_it_is_bound():
-    def bound(env, **arguments):
-        plant = sw.MujocoPlant()
-        plant.bind(env)
-        sw.constraints.ContactFeasibility(**arguments).bind(plant)
+    def watched(env, **arguments):
+        sw.constraints.ContactFeasibility(**arguments).bind(bound(env))
 
     still = '<body name="block" pos="3 3 0"><geom type="box" size=".1 .1 .1"/></body>'
     slick = '<body name="slick" pos="3 -3 1"><freejoint/><geom size=".1" contype="0" conaffinity="0"/></body>'
     env = pushed_balls(more=still + slick)
-    bound(env)
+    watched(env)
     with pytest.raises(UnknownNameError, match="no body 'foot'"):
-        bound(env, bodies=["left", "foot"])
+        watched(env, bodies=["left", "foot"])
     with pytest.raises(ConfigurationError, match="'block' does not move"):
-        bound(env, bodies=["block"])
+        watched(env, bodies=["block"])
     with pytest.raises(UnsupportedEnvError, match="'slick' cannot touch"):
-        bound(env, bodies=["left", "slick"])
+        watched(env, bodies=["left", "slick"])
     with pytest.raises(UnsupportedEnvError, match="no body of this model"):
-        bound(pushed_balls(condim=1))
+        watched(pushed_balls(condim=1))
     with pytest.raises(UnsupportedEnvError, match="no body of this model"):
-        bound(gym.make("Reacher-v5"))
+        watched(gym.make("Reacher-v5"))
     plant = sw.AnalyticPlant(
         f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, control_dt=0.1
     )

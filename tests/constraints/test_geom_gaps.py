@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
+from asking import bound
 from judged_loops import Scene
 from scipy.optimize import lsq_linear
 
-import safe_wrappers as sw
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.mujoco.forecast import Poses
@@ -30,9 +30,7 @@ ARM = """<mujoco><option timestep="0.005" gravity="0 0 0"/><worldbody>
 
 @pytest.fixture(scope="module")
 def plant():
-    plant = sw.MujocoPlant()
-    plant.bind(Scene(ARM))
-    return plant
+    return bound(Scene(ARM))
 
 
 def brute(plant, gaps, forecast, pair):
@@ -98,8 +96,7 @@ def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
     boxes = """<mujoco><worldbody><geom name="a" type="box" size=".1 .05 .2"/>
     <body><freejoint/><geom name="b" type="box" size=".12 .04 .02"/></body></worldbody></mujoco>"""
     env = Scene(boxes)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     m, data = plant.model, mujoco.MjData(plant.model)
     gaps, rng, wrong, apart = GeomGaps(plant, ["b"], ["a"]), np.random.default_rng(0), 0, 0
     for _ in range(2500):

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asking import Asked
+from asking import asked
 
 import safe_wrappers as sw
 
@@ -17,12 +17,9 @@ def at_rest(distance):
     hazard = [RADIUS + distance, 0.0]
     layout = {"agent": [0.0, 0.0, 0.0], "goal": [1.2, 1.2], "hazards": [hazard], "vases": []}
     env.reset(seed=0, options={"layout": layout})
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    plant.observe()
     discs = [sw.constraints.Discs("hazard_positions", RADIUS)]
     spec = sw.constraints.HeadingDriveClearance(discs, margin=MARGIN, brake=False)
-    return env.unwrapped, Asked(spec, plant)
+    return env.unwrapped, asked(env, spec)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked
+from asking import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judged_loops import Scene
@@ -51,14 +51,6 @@ def limit(**arguments):
     return sw.constraints.ImpactSpeedLimit(
         **{"bodies": ["cart"], "against": ["wall"], "force_limit": LIMIT, "stiffness": K, **arguments}
     )
-
-
-def ready(env, constraint):
-    """The constraint on the plant of an env at its present state."""
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    plant.observe()
-    return Asked(constraint, plant)
 
 
 def peaks(env, policy, steps, reset=True):
@@ -165,7 +157,7 @@ def closing(model, qpos, qvel, normal, point):
 def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     env, rng = Scene(ARM), np.random.default_rng(seed)
     env.data.qpos[:3], env.data.qvel[:3] = rng.uniform(-0.8, 0.8, 3), rng.uniform(-3.0, 3.0, 3)
-    constraint = ready(
+    constraint = asked(
         env, sw.constraints.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4)
     )
     m, data, control = env.model, mujoco.MjData(env.model), rng.uniform(-1.0, 1.0, 3)
@@ -213,7 +205,7 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
 
 def test_some_of_those_pushes_come_from_the_motion_and_some_from_rest():
     env, more = Scene(ARM), {True: 0, False: 0}
-    constraint = ready(
+    constraint = asked(
         env, sw.constraints.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4)
     )
     rng = np.random.default_rng(0)
@@ -236,7 +228,7 @@ def value_at(env, constraint, speed, gap=None):
     if gap is not None:
         env.data.qpos[0] = env.data.qpos[0] + env.model.body("wall").pos[0] - 0.1 - gap - env.data.qpos[0]
     env.data.qvel[0] = speed
-    return ready(env, constraint).value()
+    return asked(env, constraint).value()
 
 
 def test_the_value_is_the_limit_less_the_peak_at_the_present_speed():
@@ -266,9 +258,9 @@ def test_what_gives_way_weighs_less():
     env = slide(extra=ball)
     env.data.qpos[0], env.data.qvel[0] = 0.2 + 1e-7, 0.3
     constraint = limit(against=["ball"])
-    assert ready(env, constraint).value() == pytest.approx(LIMIT - 0.3 * np.sqrt(K * 1.0), abs=1e-2)
+    assert asked(env, constraint).value() == pytest.approx(LIMIT - 0.3 * np.sqrt(K * 1.0), abs=1e-2)
     env.data.qvel[1] = -0.2  # it comes along x itself
-    assert ready(env, constraint).value() == pytest.approx(LIMIT - 0.5 * np.sqrt(K * 1.0), abs=1e-2)
+    assert asked(env, constraint).value() == pytest.approx(LIMIT - 0.5 * np.sqrt(K * 1.0), abs=1e-2)
 
 
 def test_a_region_brings_its_spring_its_mass_and_its_limit():
@@ -297,21 +289,21 @@ def test_a_region_brings_its_spring_its_mass_and_its_limit():
     env = slide(extra=ball)
     env.data.qpos[0], env.data.qvel[0] = 0.2 + 1e-8, 0.3
     hit = region(against=["ball"])
-    assert ready(env, hit).value() == pytest.approx(280.0 - 0.3 * np.sqrt(chest.stiffness), abs=1e-2)
+    assert asked(env, hit).value() == pytest.approx(280.0 - 0.3 * np.sqrt(chest.stiffness), abs=1e-2)
 
 
 def test_a_wall_that_the_env_moves_by_hand_is_taken_where_it_is():
     env = slide(wall='mocap="true"')
     constraint = limit()
     env.data.qvel[0] = 0.3
-    far = ready(env, constraint).value()
+    far = asked(env, constraint).value()
     env.data.mocap_pos[0, 0] = 0.1 - 0.002
-    near = ready(env, constraint).value()
+    near = asked(env, constraint).value()
     assert far == pytest.approx(LIMIT - 0.3 * np.sqrt(K * MASS))
     assert near == pytest.approx(LIMIT - np.hypot(K * 0.002, 0.3 * np.sqrt(K * MASS)), rel=1e-6)
-    assert not ready(env, constraint).admits(np.ones(1))  # 200 N more against 140
+    assert not asked(env, constraint).admits(np.ones(1))  # 200 N more against 140
     env.data.mocap_pos[0, 0] = 9.0
-    assert ready(env, constraint).admits(np.ones(1))
+    assert asked(env, constraint).admits(np.ones(1))
 
 
 # Closed loops -------------------------------------------------------------------------------------------------
@@ -409,7 +401,7 @@ def test_pushing_counts():
 def test_pushing_counts_in_an_env_of_single_physics_steps():
     env = slide(force=LIMIT, frame_skip=1)
     env.data.qpos[0] = 0.3 + 1e-6
-    constraint = ready(env, limit(horizon=30))
+    constraint = asked(env, limit(horizon=30))
     assert constraint.admits(np.full(1, 0.48)) and not constraint.admits(np.full(1, 0.52))
 
 
@@ -417,7 +409,7 @@ def test_a_forecast_that_mujoco_gives_up_is_refused():
     for start in (0.1, 0.3 + 0.01):
         env = slide(force=1e15)
         env.data.qpos[0] = start
-        constraint = ready(env, limit())
+        constraint = asked(env, limit())
         constraint.value()
         assert not constraint.admits(np.ones(1)) and constraint.slack(np.ones(1)) == -np.inf
         assert constraint.admits(np.zeros(1))
@@ -481,7 +473,7 @@ def test_what_cannot_be_moved_towards_the_wall_is_left_alone():
         ).replace('joint=""', 'joint="x"')
     )
     env.data.qvel[0] = 9.0
-    constraint = ready(env, limit())
+    constraint = asked(env, limit())
     assert constraint.value() == LIMIT and constraint.admits(np.ones(1))
 
 

@@ -4,7 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked
+from asking import Asked, bound
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
@@ -129,8 +129,7 @@ def test_value_and_rows_against_the_plants_own_prediction():
     env = gym.make("Reacher-v5")
     env.reset(seed=0)
     env.unwrapped.set_state(env.unwrapped.data.qpos.copy(), np.array([3.5, -3.0, 0.0, 0.0]))
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     limit = sw.constraints.JointSpeedLimit(4.0, margin=0.1)
     limit = Asked(limit, plant)
     plant.observe()

@@ -38,8 +38,7 @@ def test_the_stage_and_the_control_are_those_of_the_general_search(options, subs
         env.reset(seed=episode)
         # Also from inside the margin and too fast to stop.
         env.unwrapped.place(rng.uniform(-1.8, 1.8, 2), rng.uniform(-4.0, 4.0, 2))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             for one in (env.filter, searched):
                 one.start()
         for k in range(60):

@@ -5,7 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from asking import Asked
+from asking import Asked, bound
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from judged_loops import Judge, flagged, sliders
@@ -45,8 +45,7 @@ def slider_path(x, v, u, horizon, strength):
 
 def looking(scene, limit, qpos, qvel):
     """The limit, bound to a plant that has seen this state."""
-    plant = sw.MujocoPlant()
-    plant.bind(scene)
+    plant = bound(scene)
     scene.data.qpos[:], scene.data.qvel[:] = qpos, qvel
     plant.observe()
     return Asked(limit, plant)
@@ -148,8 +147,7 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
         filtered = sw.CBFActionFilter(sliders(range_="-10 10"), [limit])
         filtered.reset(seed=0)
         calls[0] = 0
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             infos = [filtered.step(a)[4] for a in actions]
         seen[max_decrease], spent[max_decrease] = np.array([i["executed_action"] for i in infos]), calls[0]
         assert sum(i["cbf/intervened"] for i in infos) > 20
@@ -183,8 +181,7 @@ def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
         "the declared max_decrease of 0.12; from now on every control is forecast"
     ]
     assert calls[0] == 17  # three steps were taken for granted
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # nor is it believed again in the next episode
+    with warnings.catch_warnings(action="error"):  # nor is it believed again in the next episode
         filtered.reset(seed=0)
         filtered.step(np.array([0.0]))
     assert calls[0] == 18
@@ -195,8 +192,7 @@ def test_a_reset_is_not_taken_for_a_broken_reach():
     filtered = sw.CBFActionFilter(
         scene, [sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=4, max_decrease=0.5)]
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         for start in (0.0, 0.9, -0.2, 0.99):
             scene.start = [start], [0.0]
             filtered.reset(seed=0)

@@ -4,7 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked
+from asking import asked, bound
 from fetch_truth import ARM, watch
 from judged_loops import DRIVERS, Judge, Scene, drive, flagged
 
@@ -25,13 +25,6 @@ CHAIN = """<mujoco><compiler angle="radian"/><option timestep="0.002"><flag cont
 <motor joint="b" ctrlrange="-9 9"/><motor joint="c" ctrlrange="-3 3"/></actuator></mujoco>"""
 """A slide and hinges, two in one body and off its origin, frames turned against each other; d has no motor."""
 DRIVEN = ["rail", "a", "b", "c"]
-
-
-def bound(env, limit, plant=None):
-    plant = plant or sw.MujocoPlant()
-    plant.bind(env)
-    plant.observe()
-    return Asked(limit, plant)
 
 
 def true_w(model, data, kind, name, joints, directions="xyz", rotations="", length=1.0, own=False):
@@ -77,7 +70,7 @@ TASKS = {
 def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
     arguments, truth = TASKS[task]
     env, threshold = Scene(CHAIN), 1e-3
-    limit = bound(env, sw.constraints.SingularityMargin(threshold, horizon=2, **arguments))
+    limit = asked(env, sw.constraints.SingularityMargin(threshold, horizon=2, **arguments))
     plant = limit.plant
     kind = next(k for k in ("site", "body", "geom") if k in arguments)
     rng, still = np.random.default_rng(0), mujoco.MjData(env.model)
@@ -107,7 +100,7 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
 def test_its_row_is_the_second_derivative_of_w_under_a_torque(task):
     arguments, _ = TASKS[task]
     env = Scene(CHAIN)
-    limit = bound(env, sw.constraints.SingularityMargin(1e-2, margin=0.1, **arguments))
+    limit = asked(env, sw.constraints.SingularityMargin(1e-2, margin=0.1, **arguments))
     plant = limit.plant
     rng, data = np.random.default_rng(1), mujoco.MjData(env.model)
     h, a, checked = 3e-5, 1.0 / (2.0 * plant.control_dt), 0
@@ -143,7 +136,7 @@ def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_i
     )
     floating = floating.replace('<motor joint="rail" ctrlrange="-50 50"/>', "")
     env = Scene(floating.replace('<geom size=".05"/>', '<freejoint/><geom size=".05"/>'))
-    limit = bound(env, sw.constraints.SingularityMargin(1e-3, site="tip", directions="xy"))
+    limit = asked(env, sw.constraints.SingularityMargin(1e-3, site="tip", directions="xy"))
     assert limit.rows().normals.shape == (0, 3)
     env.data.qpos[3:7] = np.array([0.5, 0.1, 0.7, 0.5])
     mujoco.mj_forward(env.model, env.data)
@@ -152,7 +145,7 @@ def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_i
     assert limit.value() == pytest.approx(wanted / 1e-3 - 1.0)
 
     env = Scene(floating.replace('<body name="base"', '<body name="base" mocap="true"'))
-    limit = bound(env, sw.constraints.SingularityMargin(1e-3, site="tip", directions="xy"))
+    limit = asked(env, sw.constraints.SingularityMargin(1e-3, site="tip", directions="xy"))
     env.data.mocap_quat[0] = [0.8, 0.0, 0.6, 0.0]
     env.data.qpos[:] = 0.4
     mujoco.mj_forward(env.model, env.data)
@@ -169,7 +162,7 @@ def test_a_square_task_is_not_passed_through_its_singular_pose():
         env.unwrapped.set_state(
             np.array([0.3, side * 0.5, 0.1, -0.1]), np.array([0.0, -side * 40.0, 0.0, 0.0])
         )
-        limit = bound(env, spec)
+        limit = asked(env, spec)
         assert limit.value() == pytest.approx(0.011 * np.sin(0.5) / 0.003 - 1.0)
         forecast = limit.plant.forecast(np.zeros(2), 2)
         crossing = forecast.qpos[:, 1]
@@ -180,10 +173,10 @@ def test_a_square_task_is_not_passed_through_its_singular_pose():
 
 def test_every_plant_that_a_constraint_is_bound_to_has_kinematics_of_its_own():
     env, spec = Scene(CHAIN), sw.constraints.SingularityMargin(1e-3, site="tip")
-    limit = bound(env, spec)
+    limit = asked(env, spec)
     before = limit.value().copy()
     env.data.qpos[:] = [0.1, 0.5, -0.4, 0.3, 0.2]
-    twin = bound(env, spec)
+    twin = asked(env, spec)
     assert twin.value() != before and limit.value() == before
     limit.plant.observe()
     assert twin.value() == limit.value()
@@ -194,7 +187,7 @@ def test_every_plant_that_a_constraint_is_bound_to_has_kinematics_of_its_own():
 
 def test_a_validated_threshold_is_that_of_the_sampled_configurations():
     env = Scene(CHAIN)
-    limit = bound(env, sw.constraints.SingularityMargin(site="tip", task_speed=0.1, rate_limit=2.0))
+    limit = asked(env, sw.constraints.SingularityMargin(site="tip", task_speed=0.1, rate_limit=2.0))
     found = limit.spec.validated
     assert found.samples == 2000 and 0 < found.exceeding < 2000 and found.above > 0
     # A second draw, by MuJoCo's Jacobians: what exceeds above the threshold is as rare as the sample says.
@@ -211,13 +204,13 @@ def test_a_validated_threshold_is_that_of_the_sampled_configurations():
     w = np.prod(np.linalg.svd(jacobians, compute_uv=False), axis=1)
     need = 0.1 * np.linalg.norm(np.linalg.pinv(jacobians), axis=2).max(axis=1)
     assert ((w > found.threshold) & (need > 2.0)).mean() <= 2.0 * found.unseen(0.99)
-    given = bound(env, sw.constraints.SingularityMargin(found.threshold, site="tip"))
+    given = asked(env, sw.constraints.SingularityMargin(found.threshold, site="tip"))
     assert given.spec.validated is None and given.value() == limit.value()
 
 
 def test_no_threshold_that_keeps_the_rates_is_an_error():
     with pytest.raises(ConfigurationError, match="no threshold on w keeps the rate limit"):
-        bound(Scene(CHAIN), sw.constraints.SingularityMargin(site="tip", task_speed=5.0, rate_limit=0.1))
+        asked(Scene(CHAIN), sw.constraints.SingularityMargin(site="tip", task_speed=5.0, rate_limit=0.1))
 
 
 # Closed loops -------------------------------------------------------------------------------------------------
@@ -508,8 +501,7 @@ def test_nonsense_is_refused(arguments, error, message):
 
 
 def test_a_pose_with_a_position_that_is_no_number_has_no_manipulability():
-    plant = sw.MujocoPlant()
-    plant.bind(gym.make("Reacher-v5"))
+    plant = bound(gym.make("Reacher-v5"))
     limit = sw.constraints.SingularityMargin(1e-4, body="fingertip", directions="xy").bind(plant)
     qpos = np.tile([0.3, 0.8, 0.1, 0.1], (3, 1))
     qpos[1, 2], qpos[2, 0] = (

@@ -6,7 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked
+from asking import asked
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from judged_loops import Scene, flagged, sliders
@@ -23,10 +23,8 @@ averages = pytest.mark.parametrize("average", ["step", "substep"])
 
 def watching(env, **options):
     """A limit that follows an env by itself, and its plant."""
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    plant.observe()
-    return Asked(sw.constraints.SpeedLimit(**{"limit": 50.0, "horizon": 1, **options}), plant), plant
+    found = asked(env, sw.constraints.SpeedLimit(**{"limit": 50.0, "horizon": 1, **options}))
+    return found, found.plant
 
 
 # The speed that is meant --------------------------------------------------------------------------------------
@@ -203,8 +201,7 @@ def test_a_broken_limit_shows_in_the_margin(average):
     filtered.reset(seed=0)
     filtered.step(np.array([10.0]))  # 1 m/s at its end, 0.55 m/s on average
     speed = {"step": 0.55, "substep": 1.0}[average]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", sw.UnsafeStateWarning)
+    with warnings.catch_warnings(action="ignore", category=sw.UnsafeStateWarning):
         info = filtered.step(np.array([0.0]))[4]
     assert info["cbf/margin"] == pytest.approx(0.8 - speed, abs=1e-9)
     assert info["cbf/unsafe"] == (speed > 0.8)

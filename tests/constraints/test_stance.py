@@ -4,7 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked
+from asking import bound, settled
 from judged_loops import Scene, flagged
 from qpsolvers import solve_qp
 from scipy.sparse import csc_matrix
@@ -37,16 +37,6 @@ def table(gravity="0 0 -9.81", friction=FRICTION, cone="pyramidal", more="", ran
 
 
 STILL = np.zeros(4)
-
-
-def settled(env, stance, control=STILL, steps=100):
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    env.reset()
-    for _ in range(steps):
-        env.step(control)
-    plant.observe()
-    return Asked(stance, plant)
 
 
 def whole_program(env, nominal, share, edges, settle_s, outer=False):
@@ -106,7 +96,7 @@ PUSHES = [(1.0, 1.0, -1.0, -1.0), (0.9, -0.7, 0.8, 0.2), (1.0, 1.0, 1.0, 1.0), (
 def test_its_answer_is_that_of_the_whole_program(share, cone):
     changed = 0
     env = table()
-    stance = settled(env, sw.constraints.Stance(share, cone, **STANCE))
+    stance = settled(env, sw.constraints.Stance(share, cone, **STANCE), STILL, 100)
     for push in map(np.array, PUSHES):
         stance.plant.observe()
         admitted = stance.admits(push)
@@ -131,7 +121,7 @@ def test_at_rest_the_admitted_torques_are_those_with_the_solvers_forces_in_the_c
     env, spec = table(), sw.constraints.Stance(0.7, "exact", **STANCE)
     for push in (0.0, 0.2, 0.5, 0.9):
         control = push * np.array([1.0, 1.0, -1.0, -1.0])
-        stance = settled(env, spec, control)
+        stance = settled(env, spec, control, 100)
         inside = []
         for i in range(env.data.ncon):
             wrench = np.zeros(6)
@@ -152,7 +142,7 @@ def test_what_the_pyramid_admits_the_cone_admits():
     pushes = rng.uniform(-0.15, 0.15, (40, 4))
     admitted = {}
     for name, options in {"4": {"edges": 4}, "8": {"edges": 8}, "exact": {"cone": "exact"}}.items():
-        stance = settled(env, sw.constraints.Stance(0.4, **options, **STANCE))
+        stance = settled(env, sw.constraints.Stance(0.4, **options, **STANCE), STILL, 100)
         admitted[name] = []
         for push in pushes:
             stance.plant.observe()
@@ -166,7 +156,7 @@ def test_contacts_that_the_torques_lift_open():
     # Two legs on one side pull up with all they have, and stand beside a floor that falls away: no force, no demand.
     env = table(gravity="0 0 -1")
     env.start = np.r_[0, 0, 0.33, 1, 0, 0, 0, 0, 0, 0, 0], np.r_[0, 0, 0.4, np.zeros(7)]
-    stance = settled(env, sw.constraints.Stance(0.7, **STANCE), steps=0)
+    stance = settled(env, sw.constraints.Stance(0.7, **STANCE), STILL, 0)
     env.reset()
     env.data.qvel[2] = 0.4  # the whole robot on its way up
     stance.plant.observe()
@@ -201,7 +191,7 @@ def test_an_inset_of_the_zero_moment_point_is_kept_by_the_forces():
     env = table(gravity=f"{9.81 * np.sin(tilt)} 0 {-9.81 * np.cos(tilt)}", friction=2.0)
     verdicts = []
     for inset in (0.3 - 0.34 * np.tan(tilt) - 0.1, 0.3 - 0.2 * np.tan(tilt)):
-        stance = settled(env, sw.constraints.Stance(1.0, zmp_inset=inset, **STANCE), steps=60)
+        stance = settled(env, sw.constraints.Stance(1.0, zmp_inset=inset, **STANCE), STILL)
         verdicts.append(stance.admits(STILL))
         assert stance.problem(STILL).force_rows is not None
     assert verdicts == [True, False]
@@ -214,7 +204,7 @@ def test_joints_are_predicted_to_stay_in_range():
     for speed, fits in ((0.5, True), (30.0, False)):
         answers = []
         for spec in (inside, alone):
-            stance = settled(env, spec, steps=0)
+            stance = settled(env, spec, STILL, 0)
             env.data.qvel[6:] = speed  # in the air; 0.01 s to go
             stance.plant.observe()
             answers.append(stance.admits(np.zeros(4)))
@@ -358,7 +348,6 @@ def test_plants_that_it_cannot_read_are_refused():
     )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
         sw.constraints.Stance().bind(plant)
-    reacher = sw.MujocoPlant()
-    reacher.bind(gym.make("Reacher-v5"))
+    reacher = bound(gym.make("Reacher-v5"))
     with pytest.raises(UnsupportedEnvError, match="nothing to stand on"):
         sw.constraints.Stance().bind(reacher)

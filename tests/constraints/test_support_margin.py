@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asking import Asked
+from asking import bound, settled
 from contact_judge import ConeJudge
 from judged_loops import Scene, flagged
 from scipy.spatial import ConvexHull
@@ -34,16 +34,6 @@ def table(feet=CORNERS, step=0.0, gravity="0 0 -9.81"):
     return Scene(
         TABLE.format(height=HEIGHT, mass=MASS, feet=legs, step=ground, gravity=gravity), frame_skip=5
     )
-
-
-def settled(env, limit, control, steps=60):
-    plant = sw.MujocoPlant()
-    plant.bind(env)
-    env.reset()
-    for _ in range(steps):
-        env.step(control)
-    plant.observe()
-    return Asked(limit, plant)
 
 
 @pytest.mark.parametrize(("inset", "margin"), [(0.03, 0.0), (0.1, 0.0), (0.03, 0.05)])
@@ -86,8 +76,7 @@ def hull_distance(contacts):
 
 def test_at_every_evaluation_it_is_the_distance_to_the_hull_of_all_contact_points():
     env = gym.make("Ant-v5")
-    judge, plant = ConeJudge(env, 1.0), sw.MujocoPlant()
-    plant.bind(env)
+    judge, plant = ConeJudge(env, 1.0), bound(env)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     polygons = 0

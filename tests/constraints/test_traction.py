@@ -6,21 +6,13 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from vehicles import Trolley
+from vehicles import FULL, OPEN, Trolley, rover
 
 import safe_wrappers as sw
 from safe_wrappers.appendix.vehicle.burckhardt import peak
 from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-
-FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)
-OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}
-
-
-def rover(**options):
-    env = gym.make("SafeRover-v0", max_episode_steps=100_000)
-    return sw.SlipLimiter(env, wheels=env.unwrapped.wheels, **options)
 
 
 def drive(env, action, steps, **layout):
@@ -165,15 +157,13 @@ def test_a_wheel_that_is_braked_locked_is_let_go():
 def test_a_policy_that_is_not_finite_is_braked_for_within_the_limit():
     env = rover()
     env.reset(seed=0, options={"layout": OPEN | {"ground": "wet", "speed": 3.0}})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         infos = [env.step(np.full(5, np.nan, dtype=np.float32))[4] for _ in range(60)]
     assert all(info["cbf/fallback"] for info in infos)
     assert max(info["slip_max"] for info in infos) < 0.17
     assert abs(env.unwrapped.forward_speed) < 0.2
     for _ in range(50):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             env.step(np.full(5, np.nan, dtype=np.float32))
     assert abs(env.unwrapped.forward_speed) < 0.02
 

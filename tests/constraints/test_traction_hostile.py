@@ -11,20 +11,12 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from scipy.integrate import solve_ivp
-from vehicles import MOTORS, WHEEL, Trolley
+from vehicles import FULL, MOTORS, OPEN, WHEEL, Trolley, rover
 
 import safe_wrappers as sw
 from safe_wrappers.constraints import traction as traction_module
 from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.errors import ConfigurationError
-
-FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)
-OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}
-
-
-def rover(**options):
-    env = gym.make("SafeRover-v0", max_episode_steps=100_000)
-    return sw.SlipLimiter(env, wheels=env.unwrapped.wheels, **options)
 
 
 def start(env, **layout):
@@ -153,8 +145,6 @@ def slip_of(v, w):
 
 class QuarterCar(gym.Env):
     """Its tyre follows Burckhardt's published curve, which is not the shape that the estimate believes in."""
-
-    metadata = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, ground, speed, substeps=50):
         self.model = mujoco.MjModel.from_xml_string(QUARTER)
@@ -439,8 +429,7 @@ def test_infos_keep_their_shape_and_share_nothing():
     env = start(rover())
     rng = np.random.default_rng(0)
     infos = [env.reset(seed=0)[1]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for k in range(100):
             action = rng.uniform(-2, 2, 5).astype(np.float32)
             if k % 17 == 0:

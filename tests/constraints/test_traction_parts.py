@@ -2,21 +2,12 @@
 
 import warnings
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from vehicles import Trolley
+from vehicles import FULL, OPEN, Trolley, rover
 
 import safe_wrappers as sw
 from safe_wrappers.control.vehicle.slip import slip_ratio
-
-FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)
-OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}
-
-
-def rover(**options):
-    env = gym.make("SafeRover-v0", max_episode_steps=100_000)
-    return sw.SlipLimiter(env, wheels=env.unwrapped.wheels, **options)
 
 
 def start(env, lateral=0.0, wheel_speed=None, **layout):
@@ -196,8 +187,7 @@ def test_a_servo_drives_as_a_motor_does(servo, forward):
 def test_the_fallbacks_brake_ends_at_a_standstill():
     env = rover()
     raw = start(env, ground="wet", speed=1.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for _ in range(100):
             info = env.step(np.full(5, np.nan, dtype=np.float32))[4]
             assert raw.forward_speed > -0.02
@@ -213,8 +203,7 @@ def test_a_measurement_that_is_no_number_is_reported_and_forgotten():
     wheels = env.filter.bound[0].wheels
     measured = wheels.loads
     wheels.loads = lambda model, data: np.nan * measured(model, data)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         info = env.step(FULL)[4]
     assert info["cbf/fallback"]
     assert np.isfinite(info["executed_action"]).all()
@@ -235,8 +224,7 @@ def test_a_servos_brake_ends_at_a_standstill_within_the_limit(servo):
     for _ in range(100):
         env.step(np.full(2, 40.0, dtype=np.float32))
     assert data.qvel[0] > 0.8
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for _ in range(150):
             env.step(np.full(2, np.nan, dtype=np.float32))
             slips.append(abs(float(slip_ratio(0.1 * data.qvel[6], data.qvel[0], 0.5))))

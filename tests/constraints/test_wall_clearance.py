@@ -248,8 +248,7 @@ def test_the_margin_is_kept_and_not_taken_off_the_value(margin):
 def test_from_outside_it_comes_back_and_stays(options, asked, gap, lost):
     env = filtered(margin=0.05, **options)
     placed(env, (2.0 - RADIUS - gap, -1.2))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         infos = [env.step(np.array(asked, np.float32))[4] for _ in range(200)]
     margins = np.array([info["cbf/margin"] for info in infos])
     assert infos[0]["cbf/unsafe"] == lost and not infos[-1]["cbf/unsafe"]

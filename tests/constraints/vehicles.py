@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
-from gymnasium import Env
 from gymnasium.spaces import Box
+
+import safe_wrappers as sw
 
 TROLLEY = """
 <mujoco>
@@ -30,12 +32,18 @@ TROLLEY = """
 WHEEL = '<geom type="cylinder" size="0.1 0.02" euler="90 0 0" mass="0.5" friction="{friction} 0.005 0.0001"/>'
 CASTER = '<geom type="sphere" size="0.1" mass="0.2" condim="1" priority="1"/>'
 MOTORS = '<motor joint="left" gear="6" ctrlrange="-1 1"/><motor joint="right" gear="6" ctrlrange="-1 1"/>'
+FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)
+OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}
 
 
-class Trolley(Env[Any, Any]):
+def rover(**options):
+    """SafeRover under a SlipLimiter of all its wheels."""
+    env = gym.make("SafeRover-v0", max_episode_steps=100_000)
+    return sw.SlipLimiter(env, wheels=env.unwrapped.wheels, **options)
+
+
+class Trolley(gym.Env[Any, Any]):
     """Two driven wheels behind, a frictionless caster in front; MuJoCo's own friction carries it."""
-
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, friction=0.7, height=0.1, wheel=WHEEL, actuators=MOTORS, damping=0.01, substeps=5):
         text = TROLLEY.format(

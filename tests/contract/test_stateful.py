@@ -342,8 +342,7 @@ def run(machine, examples, steps):
     limits = settings(
         max_examples=times * examples, stateful_step_count=steps, deadline=None, suppress_health_check=quiet
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         run_state_machine_as_test(machine, settings=limits)
 
 

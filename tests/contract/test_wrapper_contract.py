@@ -95,8 +95,7 @@ def test_what_is_not_plain_data_is_still_recorded_for_gym_make():
     slow = sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
     env = sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant, fallback=lambda plant: [0.0])
     again = gym.make(env.spec)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         assert trace(again, steps=100) == trace(env, steps=100)
     assert again.plant is not env.plant  # each filter reads its own env
 
@@ -106,8 +105,7 @@ def test_what_is_not_plain_data_is_still_recorded_for_gym_make():
 
 @every_wrapper
 def test_check_env_passes_on_the_wrapped_env(name, case):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of unbounded sensors, and of an env that is wrapped
+    with warnings.catch_warnings(action="ignore"):  # of unbounded sensors, and of an env that is wrapped
         check_env(build(name, case), skip_render_check=True)
 
 
@@ -214,8 +212,7 @@ def types(info):
 @every_wrapper
 def test_info_has_the_same_keys_and_types_at_every_step(name, case):
     env = build(name, case)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         seen = []
         for seed in range(2):
             env.reset(seed=seed)

@@ -1,5 +1,7 @@
 """Every exported wrapper inside Gymnasium's vector envs: what each env says arrives whole."""
 
+import contextlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -23,8 +25,7 @@ def test_inside_vector_envs_infos_are_whole(name, case, kind, mode):
     def make():
         return gym.wrappers.TimeLimit(build(name, case), 10)
 
-    envs = kinds[kind]([make, make], autoreset_mode=mode)
-    try:
+    with contextlib.closing(kinds[kind]([make, make], autoreset_mode=mode)) as envs:
         envs.reset(seed=0)
         first_episode = True
         compared = 0
@@ -43,5 +44,3 @@ def test_inside_vector_envs_infos_are_whole(name, case, kind, mode):
             if ended.any() and mode == gym.vector.AutoresetMode.DISABLED:
                 envs.reset(options={"reset_mask": ended})
         assert compared >= 2
-    finally:
-        envs.close()

@@ -1,12 +1,11 @@
 """The car in the goal task: where it stands and looks, how it drives, what it costs at every substep."""
 
-import copy
 import math
 
-import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from substep_costs import check_costs
 
 from safe_wrappers.envs.goal.car import CAR
 
@@ -96,47 +95,18 @@ def test_what_stands_straight_ahead_is_seen_in_bin_12(make_car):
     assert observation[24:40].argmax() == 12
 
 
-def violated(model, data, env, fresh):
-    """The rules, read from a state, on data of their own: centre in a hazard; at level 2 a vase touched or moving."""
-    if any(np.hypot(*(data.qpos[:2] - hazard)) <= 0.2 for hazard in env.hazard_positions):
-        return True
-    if not env.level.vases_cost:
-        return False
-    fresh.qpos[:], fresh.qvel[:] = data.qpos, data.qvel
-    mujoco.mj_fwdPosition(model, fresh)
-    bodies = model.geom_bodyid[fresh.contact.geom]
-    car = [model.body(name).id for name in ("agent", "left", "right", "rear")]
-    vases = [model.body(f"vase{i}").id for i in range(env.level.vases)]
-    pairs = np.isin(bodies, car), np.isin(bodies, vases)
-    touching = bool((pairs[0] & pairs[1][:, ::-1]).any())
-    starts = [model.body_dofadr[vase] for vase in vases]
-    return touching or max(np.linalg.norm(data.qvel[at : at + 3]) for at in starts) > 1e-4
-
-
 @pytest.mark.parametrize("level", [1, 2])
 def test_costs_equal_substep_by_substep_judging(make_car, level):
     """Independent oracle: a copy of the state stepped one substep at a time, each judged by itself."""
     env = make_car(level)
-    seen = {(0.0, 0.0): 0, (0.0, 1.0): 0, (1.0, 1.0): 0}
-    fresh = mujoco.MjData(env.model)
-    env.reset(seed=level)
-    for t in range(900):
-        if t % 225 == 0:
-            env.reset()
+
+    def act(t):
         targets = np.concatenate([env.hazard_positions, env.vase_positions])
         near = np.argsort(np.linalg.norm(targets - env.agent_position, axis=1))
-        action = towards(env, targets[near[t // 45 % 5]])
-        data = copy.copy(env.data)
-        data.ctrl[:] = action
-        substeps = []
-        for _ in range(env.frame_skip):
-            mujoco.mj_step(env.model, data)
-            substeps.append(violated(env.model, data, env, fresh))
-        info = env.step(action)[4]
-        assert info["cost"] == float(substeps[-1])
-        assert info["cost_substep"] == float(any(substeps))
-        seen[info["cost"], info["cost_substep"]] += 1
-    assert min(seen.values()) > 0, f"the drive must meet every case: {seen}"
+        return towards(env, targets[near[t // 45 % 5]])
+
+    env.reset(seed=level)
+    check_costs(env, act, 900, 225, ["agent", "left", "right", "rear"])
 
 
 def test_reward_is_distance_gained_plus_one_on_reaching(make_car):

@@ -1,11 +1,9 @@
 """The task's own rules: reward, goals, costs at every substep, state, seeds."""
 
-import copy
-
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
+from substep_costs import check_costs
 
 from safe_wrappers.envs import EPISODE_STEPS, POINT_GOAL_IDS
 from safe_wrappers.errors import ActionError, ConfigurationError
@@ -28,47 +26,19 @@ def chase(env, rng, target=None, noise=0.3):
     return np.clip(np.array([np.cos(bearing), turn]) + rng.normal(0, noise, 2), -1, 1)
 
 
-def violated(model, data, env, fresh):
-    """The rules, read from a state, on data of their own: centre in a hazard; at level 2 a vase touched or moving."""
-    if any(np.hypot(*(data.qpos[:2] - hazard)) <= 0.2 for hazard in env.hazard_positions):
-        return True
-    if not env.level.vases_cost:
-        return False
-    fresh.qpos[:], fresh.qvel[:] = data.qpos, data.qvel
-    mujoco.mj_fwdPosition(model, fresh)
-    bodies = model.geom_bodyid[fresh.contact.geom]
-    vases = [model.body(f"vase{i}").id for i in range(env.level.vases)]
-    touching = bool(((bodies == model.body("agent").id) & np.isin(bodies, vases)[:, ::-1]).any())
-    starts = [model.body_dofadr[vase] for vase in vases]
-    return touching or max(np.linalg.norm(data.qvel[at : at + 3]) for at in starts) > 1e-4
-
-
 @pytest.mark.parametrize("level", [1, 2])
 def test_costs_equal_substep_by_substep_judging(make_env, level):
     """Independent oracle: a copy of the state stepped one substep at a time, each judged by itself."""
     env = make_env(level)
     rng = np.random.default_rng(level)
-    seen = {(0.0, 0.0): 0, (0.0, 1.0): 0, (1.0, 1.0): 0}
-    fresh = mujoco.MjData(env.model)
-    env.reset(seed=level)
-    for t in range(750):
-        if t % 150 == 0:
-            env.reset()
+
+    def act(t):
         # Straight at hazards and vases in turn, so that edges are crossed often.
         targets = np.concatenate([env.hazard_positions, env.vase_positions])
-        action = chase(env, rng, targets[t // 30 % len(targets)])
-        data = copy.copy(env.data)
-        data.ctrl[:] = action
-        substeps = []
-        for _ in range(env.frame_skip):
-            mujoco.mj_step(env.model, data)
-            substeps.append(violated(env.model, data, env, fresh))
-        info = env.step(action)[4]
-        assert info["cost"] == float(substeps[-1])
-        assert info["cost_substep"] == float(any(substeps))
-        assert info["cost"] == max(info["cost_hazards"], info["cost_vases"])
-        seen[info["cost"], info["cost_substep"]] += 1
-    assert min(seen.values()) > 0, f"the drive must meet every case: {seen}"
+        return chase(env, rng, targets[t // 30 % len(targets)])
+
+    env.reset(seed=level)
+    check_costs(env, act, 750, 150, ["agent"])
 
 
 def test_hazard_edge_cut_between_control_steps_costs_only_by_substep(make_env):

@@ -97,8 +97,7 @@ def test_vector_env_steps_and_reports(mode, env_id):
 
 def test_registering_twice_changes_nothing():
     before = {env_id: gym.registry[env_id] for env_id in GOAL_IDS}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         register_envs()
     assert all(gym.registry[env_id] is spec for env_id, spec in before.items())
 

@@ -581,8 +581,7 @@ def test_a_state_that_is_not_finite_is_said(env, entry):
     env.reset(seed=9)
     qpos = env.data.qpos.copy()
     qpos[entry] = np.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         env.set_state(qpos, env.data.qvel.copy())
         with pytest.raises(SafeWrappersError, match="not finite"):
             env.step(push())

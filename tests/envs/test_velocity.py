@@ -61,8 +61,7 @@ def same(a, b):
 @pytest.fixture(autouse=True)
 def no_warnings():
     """A task that is asked for by its id warns of nothing, v4 neither."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         yield
 
 

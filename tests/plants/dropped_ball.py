@@ -1,7 +1,5 @@
 """A ball over a floor between two posts, and envs that do to its physics what real ones do."""
 
-from typing import ClassVar
-
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -27,7 +25,6 @@ XML = """<mujoco>
 class DroppedBall(gym.Env):
     """Five substeps a step; the action is the control. `meddle` is what the env does beside that."""
 
-    metadata: ClassVar = {"render_modes": []}
     frame_skip = 5
 
     def __init__(self, meddle="nothing", integrator="Euler", cone="pyramidal", **world):

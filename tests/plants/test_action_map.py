@@ -7,6 +7,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import bound
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -72,12 +73,6 @@ class Plain(Machine):
     def __init__(self, **changed):
         ends = OFFSET - np.abs(SCALE), OFFSET + np.abs(SCALE)
         super().__init__(offset=0.0, scale=1.0, low=ends[0], high=ends[1], **changed)
-
-
-def bound(env, **options):
-    plant = sw.MujocoPlant(**options)
-    plant.bind(env)
-    return plant
 
 
 @pytest.fixture(scope="module", params=HANDS)

@@ -6,8 +6,9 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import bound
+from scenes import Scene
 
-import safe_wrappers as sw
 from safe_wrappers.control.numerics.compiled import IS_COMPILED
 from safe_wrappers.plants.mujoco.contact_memory import contact_memory
 from safe_wrappers.plants.mujoco.contacts import ContactReader, can_touch_the_world
@@ -17,10 +18,9 @@ ROBOTS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5")
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-class Legs(gym.Env):
+class Legs(Scene):
     """A trunk on two driven legs beside other things that move; the action is the control."""
 
-    metadata = {"render_modes": []}  # noqa: RUF012
     XML = """<mujoco><option timestep="0.002" integrator="{integrator}" cone="{cone}"/>
     <default><geom condim="{condim}" friction="0.6 0.01 0.002"/></default>
     <worldbody>
@@ -42,13 +42,9 @@ class Legs(gym.Env):
     {end}</mujoco>"""
 
     def __init__(self, integrator="Euler", cone="pyramidal", condim=3, more="", act="", end=""):
-        text = self.XML.format(integrator=integrator, cone=cone, condim=condim, more=more, act=act, end=end)
-        self.model = mujoco.MjModel.from_xml_string(text)
-        self.data = mujoco.MjData(self.model)
-        self.frame_skip = 5
-        low, high = self.model.actuator_ctrlrange.T
-        self.action_space = gym.spaces.Box(low, high, dtype=np.float64)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+        super().__init__(
+            self.XML.format(integrator=integrator, cone=cone, condim=condim, more=more, act=act, end=end)
+        )
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -59,12 +55,6 @@ class Legs(gym.Env):
         self.data.ctrl[:] = action
         mujoco.mj_step(self.model, self.data, self.frame_skip)
         return np.zeros(1), 0.0, False, False, {}
-
-
-def bound(env, **options):
-    plant = sw.MujocoPlant(**options)
-    plant.bind(env)
-    return plant
 
 
 def decoded(model, data, contact):

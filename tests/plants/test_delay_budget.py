@@ -138,8 +138,7 @@ def test_too_little_margin_is_said_once_with_its_numbers(make):
 
 @PLANTS
 def test_a_loop_with_enough_margin_is_not_talked_about(make):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", PhaseMarginWarning)
+    with warnings.catch_warnings(action="error", category=PhaseMarginWarning):
         for loop, left in ((ControlLoop(4.0, 60.0), 60.0 - np.degrees(0.02)), (None, None)):
             plant = make(loop)
             plant.bind(Cart())

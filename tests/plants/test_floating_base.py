@@ -6,8 +6,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import bound
 
-import safe_wrappers as sw
 from safe_wrappers.appendix.contact.forces import friction_ratio, in_cone
 from safe_wrappers.appendix.legged.balance import balance
 from safe_wrappers.appendix.legged.centroidal import (
@@ -64,8 +64,7 @@ def zoo(cone="pyramidal", condim=3, seed=0, settle=0.35):
 def walker(request):
     """An env that falls and struggles, and the plant that observes it."""
     env = gym.make(request.param)
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     env.reset(seed=3)
     env.action_space.seed(3)
 
@@ -382,8 +381,7 @@ def test_a_box_on_a_slope_is_held_by_the_weight_it_has(slope):
 
 def test_the_rigid_forces_of_a_standing_ant_are_its_weight_and_need_next_to_no_change():
     env = gym.make("Ant-v5")
-    plant = sw.MujocoPlant()
-    plant.bind(env)
+    plant = bound(env)
     env.reset(seed=0)
     for _ in range(60):
         env.step(np.zeros(8, np.float32))

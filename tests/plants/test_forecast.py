@@ -6,6 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from scenes import Scene
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
@@ -31,20 +32,6 @@ def make(robot, version="v5"):
     if (robot, version) == ("Pusher", "v4"):
         pytest.skip("Gymnasium makes Pusher-v4 with MuJoCo 2 only")
     return gym.make(f"{robot}-{version}", disable_env_checker=True)
-
-
-class Scene(gym.Env):
-    """Any MJCF as an env."""
-
-    def __init__(self, xml, frame_skip=5):
-        self.model = mujoco.MjModel.from_xml_string(xml)
-        self.data = mujoco.MjData(self.model)
-        self.frame_skip = frame_skip
-        limited = self.model.actuator_ctrllimited.astype(bool)
-        low = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
-        high = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
-        self.action_space = gym.spaces.Box(low, high, dtype=np.float64)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
 
 
 def bound(env, **options):

@@ -4,6 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from scenes import Scene
 
 import safe_wrappers as sw
 from safe_wrappers.appendix.handover.flexible_joint import damping_ratios, resonances
@@ -75,15 +76,10 @@ armature="0.05" damping="{damping}"/><joint name="spring" axis="0 0 1" stiffness
 INERTIA = 3.0 * (0.2**2 + 0.2**2) / 12.0
 
 
-class TwoMasses(gym.Env):
+class TwoMasses(Scene):
     def __init__(self, stiffness=200.0, damping=0.0, across=0.0, actuator='<motor joint="motor"/>', other=""):
         given = {"stiffness": stiffness, "damping": damping, "across": across}
-        self.model = mujoco.MjModel.from_xml_string(
-            TWO_MASSES.format(actuator=actuator, other=other, **given)
-        )
-        self.data, self.frame_skip, self.dt = mujoco.MjData(self.model), 20, 0.01
-        self.action_space = gym.spaces.Box(-np.inf, np.inf, (self.model.nu,), np.float64)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+        super().__init__(TWO_MASSES.format(actuator=actuator, other=other, **given), frame_skip=20)
 
 
 def test_a_stiff_and_damped_spring_is_rigid_enough_and_one_that_rings_is_not():

@@ -50,8 +50,7 @@ def test_the_shared_step_is_the_env_s_own_bit_for_bit(env_id):
     shared, own = filtered(env_id), filtered(env_id, share_step=False)
     space, rng = shared.action_space, np.random.default_rng(0)
     over, episode = True, 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnsafeStateWarning)
+    with warnings.catch_warnings(action="ignore", category=UnsafeStateWarning):
         for t in range(150):
             if over:
                 episode += 1

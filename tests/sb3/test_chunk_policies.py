@@ -1,5 +1,7 @@
 """Stable-Baselines3 policies that emit whole chunks, and single-action ones as chunks of one."""
 
+import contextlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -83,13 +85,10 @@ def test_a_policy_of_whole_chunks_learns_and_predicts(name):
 @pytest.mark.parametrize("kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.slow)])
 def test_in_both_vector_modes_infos_come_whole(kind):
     torch.set_num_threads(1)
-    envs = make_vec_env(chunked, 2, vec_env_cls=kind, seed=0)
-    try:
+    with contextlib.closing(make_vec_env(chunked, 2, vec_env_cls=kind, seed=0)) as envs:
         infos = Infos()
         model = PPO("MlpPolicy", envs, seed=0, n_steps=32, batch_size=32, n_epochs=1)
         model.learn(64, callback=infos)
-    finally:
-        envs.close()
     keys = {frozenset(k for k in i if k.startswith("handover/")) for i in infos.seen}
     assert keys == {frozenset(name for name in KEYS if name.startswith("handover/"))}
     assert max(i["handover/peak_jerk"] for i in infos.seen) <= LIMIT

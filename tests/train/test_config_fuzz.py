@@ -337,8 +337,7 @@ def test_what_cannot_be_trained_is_refused_before_its_first_step(folder, env, pa
         holder[key] = data.draw(PARTS[part], label=part)
     path = folder / "config.yaml"
     path.write_text(yaml.dump(config))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         try:
             check_training(parse_experiment(read_config(path)))
         except SafeWrappersError as refusal:

@@ -1,5 +1,6 @@
 """Faults, handover, lease and filter in Gymnasium's vector envs: in every mode the single envs, bit for bit."""
 
+import contextlib
 import functools
 
 import numpy as np
@@ -60,11 +61,8 @@ def test_the_episodes_by_hand_have_in_them_what_is_to_be_compared(task):
 @pytest.mark.parametrize(("kind", "mode"), WAYS)
 @pytest.mark.parametrize("task", TASKS)
 def test_a_vector_env_is_its_single_envs(task, kind, mode):
-    envs = KINDS[kind](sub_envs(TASKS[task]), autoreset_mode=mode)
-    try:
+    with contextlib.closing(KINDS[kind](sub_envs(TASKS[task]), autoreset_mode=mode)) as envs:
         episodes = unroll(envs, actions_for(task), seed=SEED, steps=STEPS, options=options_for(task))
-    finally:
-        envs.close()
     for i, (got, wanted) in enumerate(zip(episodes, single(task), strict=True)):
         assert assert_same_episodes(got, wanted, f"sub-env {i}, ") >= 2
 

@@ -1,5 +1,6 @@
 """Gymnasium's vector envs in every autoreset mode are the single envs, bit for bit, infos and all."""
 
+import contextlib
 import functools
 
 import gymnasium as gym
@@ -53,12 +54,9 @@ def odd(step):
 
 @pytest.mark.parametrize(("task", "kind", "mode"), dict.fromkeys(PLAYED))
 def test_a_vector_env_is_its_single_envs(task, kind, mode):
-    envs = (KINDS | PIPES)[kind](sub_envs(TASKS[task]), autoreset_mode=mode)
-    try:
+    with contextlib.closing((KINDS | PIPES)[kind](sub_envs(TASKS[task]), autoreset_mode=mode)) as envs:
         episodes = unroll(envs, actions_for(task), seed=SEED, steps=STEPS)
         calls = envs.get_attr("filter_calls")
-    finally:
-        envs.close()
     for i, (got, wanted) in enumerate(zip(episodes, single(task), strict=True)):
         whole = assert_same_episodes(got, wanted, f"sub-env {i}, ")
         assert whole >= 2

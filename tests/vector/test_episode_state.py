@@ -87,8 +87,7 @@ def test_commands_in_flight_do_not_fly_into_the_next_episode(mode):
 
 def test_the_action_that_only_resets_is_neither_filtered_nor_counted():
     envs = carts(NEXT, lambda index: sw.RecordInterventions(cart_filter(index)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         for _ in range(2):
             envs.step(said(0.5, 0.5, 0.5))
         envs.step(said(np.nan, 0.5, 0.5))

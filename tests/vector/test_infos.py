@@ -1,5 +1,7 @@
 """Infos arrive whole: fixed keys, fixed dtypes, one row per sub-env that has something to say."""
 
+import contextlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -27,12 +29,9 @@ def wanted_dtype(key):
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
 def test_nothing_then_a_fraction_is_not_cut_to_nothing(kind):
     # A vector env takes a key's dtype from the first sub-env that reports it.
-    envs = kind(sub_envs(cart_filter))
-    try:
+    with contextlib.closing(kind(sub_envs(cart_filter))) as envs:
         envs.reset(seed=0, options={"start": [-1.0, 0.0]})
         infos = envs.step(said(0.25, 1.7, 0.25))[4]
-    finally:
-        envs.close()
     assert infos["cbf/clipped"][0] == 0.0 and infos["cbf/clipped"][1] == pytest.approx(0.7)
     assert infos["cbf/correction"][0] == 0.0 and infos["cbf/correction"][1] == pytest.approx(0.7)
     assert infos["executed_action"].tolist() == [[0.25], [1.0], [0.25]]
@@ -131,22 +130,18 @@ def test_as_a_list_each_info_is_the_single_envs():
 def test_make_vec_with_our_wrappers(kind):
     wrappers = [sw.protect, sw.RecordInterventions]
     envs = gym.make_vec("SafePointGoal1-v0", 2, vectorization_mode=kind, wrappers=wrappers)
-    try:
+    with contextlib.closing(envs):
         envs.reset(seed=0)
         infos = envs.step(envs.action_space.sample())[4]
         assert infos["executed_action"].shape == (2, 2) and infos["_interventions/cost"].all()
-    finally:
-        envs.close()
 
 
 @pytest.mark.parametrize("kind", ["sync", "async"])
 def test_make_vec_from_a_filtered_envs_spec(kind):
     envs = gym.make_vec(sw.protect(gym.make("Reacher-v5")).spec, 2, vectorization_mode=kind)
-    try:
+    with contextlib.closing(envs):
         envs.reset(seed=0)
         assert envs.step(envs.action_space.sample())[4]["_cbf/margin"].all()
-    finally:
-        envs.close()
 
 
 def test_make_vec_from_a_spec_that_records_a_plant():

@@ -1,5 +1,6 @@
 """OcclusionPenalty, filter and recorder in vector envs: in every mode the single envs, bit for bit; SB3's alike."""
 
+import contextlib
 from functools import partial
 
 import gymnasium as gym
@@ -40,7 +41,7 @@ def episode(seed):
 def test_first_episodes_are_the_single_envs(kind, mode):
     envs = KINDS[kind]([partial(make, i) for i in range(2)], autoreset_mode=mode)
     wanted = [episode(SEED + i) for i in range(2)]
-    try:
+    with contextlib.closing(envs):
         observations, infos = envs.reset(seed=SEED)
         for i in range(2):
             assert observations[i].tobytes() == wanted[i][0][0].tobytes()
@@ -52,8 +53,6 @@ def test_first_episodes_are_the_single_envs(kind, mode):
                 assert truncated[i] == over
                 got = {key: values[i] for key, values in infos.items() if not key.startswith("_")}
                 assert_same_info(got, info, f"sub-env {i}, step {t}")
-    finally:
-        envs.close()
 
 
 def test_later_episodes_go_on_with_the_noise_and_not_with_the_estimates():

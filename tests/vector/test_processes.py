@@ -1,5 +1,6 @@
 """The filter in processes of its own: made there, asked from here, gone when closed."""
 
+import contextlib
 import functools
 import multiprocessing
 
@@ -43,10 +44,8 @@ def with_wrong_barrier(index):
 def test_the_same_in_a_process_that_starts_from_nothing(context):
     actions = script(TASKS["point_goal"]().action_space, drive=0.9)
     envs = AsyncVectorEnv(sub_envs(TASKS["point_goal"], 1), context=context, autoreset_mode="SameStep")
-    try:
+    with contextlib.closing(envs):
         episodes = unroll(envs, actions, seed=4, steps=9)
-    finally:
-        envs.close()
     wanted = by_hand(TASKS["point_goal"], actions, 0, seed=4, steps=9)
     assert assert_same_episodes(episodes[0], wanted) == 1
 
@@ -65,8 +64,7 @@ def test_closing_leaves_no_process(mode, shared_memory):
 
 
 def test_the_filters_attributes_are_read_across_processes():
-    envs = AsyncVectorEnv(sub_envs(TASKS["point_goal"], 2))
-    try:
+    with contextlib.closing(AsyncVectorEnv(sub_envs(TASKS["point_goal"], 2))) as envs:
         envs.reset(seed=0)
         assert envs.get_attr("filter_calls") == (0, 0)
         assert envs.get_attr("filter_time_us") == (None, None)
@@ -81,19 +79,15 @@ def test_the_filters_attributes_are_read_across_processes():
         envs.set_attr("filter_calls", [10, 20])
         envs.step(envs.action_space.sample())
         assert envs.get_attr("filter_calls") == (11, 21)
-    finally:
-        envs.close()
 
 
 def test_every_sub_env_writes_its_own_file(tmp_path):
     envs = AsyncVectorEnv([functools.partial(recorded, tmp_path, i) for i in range(2)])
     lengths = [[3, -1, 2], [-5, 4]]
-    try:
+    with contextlib.closing(envs):
         envs.reset(seed=0, options={"ends": lengths})
         for _ in range(9):
             envs.step(np.zeros((2, 1), np.float32))
-    finally:
-        envs.close()
     assert [[row["length"] for row in read_episodes(tmp_path / f"{i}.csv")] for i in range(2)] == [
         [3, 1, 2],
         [5],

@@ -1,6 +1,8 @@
 """Whatever is done and whenever it ends: vector envs are single loops. Each env is used for every example, so what an
 example leaves behind (an episode half-way, commands in flight) must be gone at the next one's reset."""
 
+import contextlib
+
 import pytest
 from hypothesis import given, settings
 from random_episodes import STEPS, plays, spoken
@@ -23,7 +25,5 @@ def test_any_actions_and_any_ends(kind, mode):
             wanted = by_hand(cart, actions, i, seed=play["seed"] + i, steps=STEPS, options=options)
             assert_same_episodes(got, wanted, f"sub-env {i}, ")
 
-    try:
+    with contextlib.closing(envs):
         check()
-    finally:
-        envs.close()

@@ -1,5 +1,6 @@
 """SB3's Dummy and Subproc vector envs are the single envs, bit for bit, infos and all."""
 
+import contextlib
 import functools
 import multiprocessing
 
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from random_episodes import STEPS, plays, spoken
-from single_loops import Episode, Step, assert_same_episodes, by_hand, script
+from sb3_loops import assert_same, unroll
+from single_loops import by_hand, script
 from vector_worlds import AtHazard, cart, cart_filter
 
 import safe_wrappers as sw
@@ -48,56 +50,14 @@ TASKS = {
 }
 
 
-def unroll(envs, actions, *, seed, steps, options=None):
-    """The episodes of every sub-env of an SB3 vector env, which resets within the step."""
-    n = envs.num_envs
-    envs.seed(seed)
-    envs.set_options(options)
-    observations = envs.reset()
-    episodes = [[Episode(o, told)] for o, told in zip(observations, envs.reset_infos, strict=True)]
-    for _ in range(steps):
-        proposed = [actions(i, len(e) - 1, len(e[-1].steps)) for i, e in enumerate(episodes)]
-        observations, rewards, dones, infos = envs.step(np.stack(proposed))
-        assert len(infos) == n
-        for i in range(n):
-            info = dict(infos[i])
-            truncated = info.pop("TimeLimit.truncated")
-            assert ("terminal_observation" in info) == dones[i] == ("episode" in info)
-            last = info.pop("terminal_observation") if dones[i] else observations[i]
-            episodes[i][-1].steps.append(Step(last, rewards[i], dones[i] and not truncated, truncated, info))
-            if dones[i]:
-                episodes[i].append(Episode(observations[i], envs.reset_infos[i]))
-    return episodes
-
-
-def without_time(episodes):
-    """Monitor writes the wall-clock time of an episode's end: the one thing that may differ."""
-    for episode in episodes:
-        for step in episode.steps:
-            if "episode" in step.info:
-                step.info["episode"].pop("t", None)
-    return episodes
-
-
-def assert_same(got, wanted, kind, name=""):
-    if kind == "dummy":  # its rewards are float32
-        for episode in wanted:
-            for step in episode.steps:
-                step.reward = np.float32(step.reward)
-    return assert_same_episodes(without_time(got), without_time(wanted), name, types=True)
-
-
 @every_kind
 @pytest.mark.parametrize("task", TASKS)
 def test_a_vec_env_is_its_single_envs(task, kind):
     make = TASKS[task]
-    envs = KINDS[kind]([functools.partial(make, i) for i in range(3)])
-    try:
+    with contextlib.closing(KINDS[kind]([functools.partial(make, i) for i in range(3)])) as envs:
         actions = script(envs.action_space, drive=0.9 if task == "point_goal" else None)
         episodes = unroll(envs, actions, seed=5, steps=26)
         calls = envs.get_attr("filter_calls")
-    finally:
-        envs.close()
     for i, got in enumerate(episodes):
         wanted = by_hand(make, actions, i, seed=5 + i, steps=26)
         assert assert_same(got, wanted, kind, f"sub-env {i}, ") >= 2
@@ -126,16 +86,13 @@ def test_any_actions_and_any_ends(kind, examples):
             wanted = by_hand(monitored_cart, actions, i, seed=play["seed"] + i, steps=STEPS, options=options)
             assert_same(got, wanted, kind, f"sub-env {i}, ")
 
-    try:
+    with contextlib.closing(envs):
         check()
-    finally:
-        envs.close()
 
 
 @every_kind
 def test_methods_and_attributes_by_sub_env(kind):
-    envs = KINDS[kind]([functools.partial(plain_stack, i) for i in range(2)])
-    try:
+    with contextlib.closing(KINDS[kind]([functools.partial(plain_stack, i) for i in range(2)])) as envs:
         envs.seed(0)
         envs.reset()
         for _ in range(6):
@@ -151,8 +108,6 @@ def test_methods_and_attributes_by_sub_env(kind):
         assert envs.env_is_wrapped(sw.CBFActionFilter) == [True, True]
         assert envs.env_is_wrapped(sw.RecordInterventions) == [True, True]
         assert envs.env_is_wrapped(Monitor) == [True, True]
-    finally:
-        envs.close()
 
 
 def test_closing_leaves_no_process():
@@ -202,15 +157,14 @@ def test_not_a_number_in_one_sub_env_is_its_own_affair():
 
     ill, well = (unroll(e, a, seed=2, steps=10) for e, a in ((envs, sick), (healthy, actions)))
     for i in (0, 2):
-        assert_same_episodes(without_time(ill[i]), without_time(well[i]), types=True)
+        assert_same(ill[i], well[i], kind="dummy")
     assert ill[1][0].steps[1].info["cbf/nonfinite"] and not well[1][0].steps[1].info["cbf/nonfinite"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_infos_are_the_readers_own(kind):
     # What a callback does to an info reaches neither the filter nor the next step's info.
-    envs = KINDS[kind]([functools.partial(cart_filter, i) for i in range(2)])
-    try:
+    with contextlib.closing(KINDS[kind]([functools.partial(cart_filter, i) for i in range(2)])) as envs:
         envs.set_options({"start": [-1.0, 0.0]})
         envs.reset()
         infos = envs.step(np.full((2, 1), 0.5, np.float32))[3]
@@ -219,8 +173,6 @@ def test_infos_are_the_readers_own(kind):
             info["executed_action"][:] = 9.0
             info["cbf/margin"] = -1.0
         infos = envs.step(np.full((2, 1), np.nan, np.float32))[3]
-    finally:
-        envs.close()
     for info, before in zip(infos, kept, strict=True):
         assert info["executed_action"] == 0.5  # held
         assert info["cbf/margin"] > 0.0 and before["cbf/margin"] > 0.0
@@ -231,10 +183,8 @@ def test_infos_are_the_readers_own(kind):
 def test_the_same_in_a_process_that_starts_from_nothing(start_method):
     make = TASKS["point_goal"]
     envs = SubprocVecEnv([functools.partial(make, i) for i in range(2)], start_method=start_method)
-    try:
+    with contextlib.closing(envs):
         actions = script(envs.action_space, drive=0.9)
         episodes = unroll(envs, actions, seed=1, steps=20)
-    finally:
-        envs.close()
     for i, got in enumerate(episodes):
         assert assert_same(got, by_hand(make, actions, i, seed=1 + i, steps=20), "subproc") >= 2

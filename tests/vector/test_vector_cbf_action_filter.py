@@ -238,8 +238,7 @@ def test_a_copy_plays_alike_and_leaves_the_original_alone():
 def test_each_kind_of_bad_action_is_warned_of_once():
     _, together = pair(functools.partial(made, "SafePointGoal1-v0"), recommended("SafePointGoal1-v0"))
     together.reset(seed=0)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         for value in (3.0, np.nan):
             for _ in range(2):
                 together.step(np.full((ENVS, 2), value, np.float32))

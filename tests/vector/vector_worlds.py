@@ -86,8 +86,7 @@ class CountUnsafeWarnings(gym.Wrapper):
         return *rest, {**info, "unsafe_warnings": self.count}
 
     def _watched(self, function, *args, **kwargs):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             result = function(*args, **kwargs)
         self.count += sum(issubclass(w.category, sw.UnsafeStateWarning) for w in caught)
         return result

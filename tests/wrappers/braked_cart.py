@@ -6,7 +6,6 @@ with a bisection where the library has a closed form.
 
 import math
 from dataclasses import fields
-from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -21,8 +20,6 @@ class BrakedCart(gym.Env):
     first one the cart rolls on. `reading` is `age_s` old and off by at most `noise`. Motion is solved piece by piece,
     so that `farthest` is exact between samples, too. A receding cart is not braked.
     """
-
-    metadata: ClassVar = {"render_modes": []}
 
     def __init__(
         self,

@@ -1,7 +1,5 @@
 """Lines that are told what to do and remember it."""
 
-from typing import ClassVar
-
 import gymnasium as gym
 import numpy as np
 
@@ -10,8 +8,6 @@ import safe_wrappers as sw
 
 class Line(gym.Env):
     """Every action counts; what was asked, and when, is kept."""
-
-    metadata: ClassVar = {"render_modes": []}
 
     def __init__(self, controls=1, low=-1.0, high=1.0, dtype=np.float32, dt=0.1, ends_at=None, infos=None):
         self.dt, self.ends_at, self.infos = dt, ends_at, infos

@@ -34,7 +34,6 @@ WALL = '<geom type="box" pos="2 0 0.5" size="0.1 3 1"/>'
 class Turning(gym.Env):
     """`start` is qpos and qvel at every reset: heading, thing's x and y, thing2's x and y."""
 
-    metadata = {"render_modes": []}  # noqa: RUF012
     frame_skip = 4
 
     def __init__(self, start=((0, 1, 0, -1, 0), (0, 0, 0, 0, 0)), world="", arm="0.4 0 0", space=None):

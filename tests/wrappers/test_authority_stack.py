@@ -530,6 +530,5 @@ def test_single_commands_are_not_a_chunks_business(arm):
         arm, sw.StoppingBudget(far_away, braking=1.0, acceleration=0.0), motion_limits=LIMITS, fallback="hold"
     )
     env.reset(seed=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert not env.step(np.array([2.0, 3.0]))[4]["lease/refused"]

@@ -2,12 +2,12 @@
 
 import copy
 import warnings
-from typing import ClassVar
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from meddling import Meddling
 from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
@@ -34,7 +34,6 @@ CRATE = """<mujoco><option timestep="0.002" cone="{cone}"/>
 class Crates(gym.Env):
     """The action is a force on the crate, (3,), N, at a height over its middle, m."""
 
-    metadata: ClassVar = {"render_modes": []}
     action_space = gym.spaces.Box(-200.0, 200.0, (4,), np.float64)
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
 
@@ -53,23 +52,6 @@ class Crates(gym.Env):
         self.data.xfrc_applied[self.model.body("crate").id] = [*force, *np.cross([0.0, 0.0, height], force)]
         mujoco.mj_step(self.model, self.data, 10)
         return np.zeros(1), 0.0, False, False, {}
-
-
-class Meddling(gym.Wrapper):
-    """Writes to the env's data after a step, where it is told to."""
-
-    at = ()
-    steps = 0
-    position = velocity = None
-
-    def step(self, action):
-        out = super().step(action)
-        self.steps += 1
-        if self.steps in self.at:
-            self.unwrapped.data.qvel[0] += 1e-3 if self.velocity is None else self.velocity
-            if self.position is not None:
-                self.unwrapped.data.contact.pos[:] = self.position
-        return out
 
 
 def actions(env, count, seed=0, share=1.0):
@@ -96,8 +78,7 @@ def test_momentum_is_what_mujoco_says_of_the_state_after_the_step(env_id):
     raw = env.unwrapped
     env.reset(seed=0)
     data, largest = mujoco.MjData(raw.model), np.zeros(2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the rover's tyres
+    with warnings.catch_warnings(action="ignore"):  # of the rover's tyres
         for action in actions(env, 20):
             info = env.step(action)[4]
             data.qpos[:], data.qvel[:] = raw.data.qpos, raw.data.qvel
@@ -410,9 +391,7 @@ def test_a_reset_is_zero_and_has_the_types_of_a_step():
 
 
 def test_a_step_that_cannot_be_replayed_is_said_to_be_and_the_next_is_whole_again():
-    meddling = Meddling(gym.make("Ant-v5", terminate_when_unhealthy=False))
-    meddling.at = (35, 40)
-    env = sw.BalanceMonitor(meddling)
+    env = sw.BalanceMonitor(Meddling(gym.make("Ant-v5", terminate_when_unhealthy=False), (35, 40)))
     raw = env.unwrapped
     env.reset(seed=0)
     partial = []
@@ -434,14 +413,10 @@ def test_a_step_that_cannot_be_replayed_is_said_to_be_and_the_next_is_whole_agai
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_no_number_that_is_none_is_reported(bad):
-    for place in ("position", "velocity"):
-        meddling = Meddling(gym.make("HalfCheetah-v5"))
-        meddling.at = (25,)
-        setattr(meddling, place, bad)
-        env = sw.BalanceMonitor(meddling)
+    for place in ("pos", "velocity"):
+        env = sw.BalanceMonitor(Meddling(gym.make("HalfCheetah-v5"), (25,), **{place: bad}))
         env.reset(seed=0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             infos = [env.step(env.action_space.low)[4] for _ in range(27)]
         for info in infos[24:26]:  # and MuJoCo's reset in the step after it
             assert np.isfinite([*values(info), *info[MOMENTA[0]], *info[MOMENTA[1]]]).all()
@@ -498,8 +473,7 @@ def test_inside_a_chunk_shares_are_means_peaks_the_largest_and_margins_those_of_
 
 
 def test_a_chunk_is_partial_if_any_of_its_steps_was():
-    meddling = Meddling(gym.make("HalfCheetah-v5"))
-    meddling.at = (7,)
+    meddling = Meddling(gym.make("HalfCheetah-v5"), (7,))
     env = sw.ChunkHandover(sw.BalanceMonitor(meddling), 5, 5, rate_limit=1e6)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="balance/partial"):

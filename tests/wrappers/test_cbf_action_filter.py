@@ -110,8 +110,7 @@ def test_every_step_has_every_key_with_its_dtype():
     filtered = cart([wall(0.5), sw.constraints.Barrier(lambda x: 1.0 - x[1] ** 2, alpha=2.0)])
     filtered.reset(seed=0)
     actions = [[0.5], [1.0], [7.0], [np.nan], [np.inf], [-1.0], [-np.inf], [0.0]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for action in actions * 3:
             check_info(filtered.step(np.array(action))[4], 1)
 
@@ -185,8 +184,7 @@ def test_saturation_does_not_hide_the_intervention():
 def test_an_action_outside_of_the_box_is_warned_of_once():
     filtered = cart([wall(100.0)])
     filtered.reset(seed=0)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         for _ in range(3):
             filtered.step(np.array([2.0]))
     assert len(caught) == 1
@@ -420,8 +418,7 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
     # Recovery is exponential towards h = margin, so a margin is what gets it inside.
     filtered = cart([sw.constraints.Barrier(lambda x: 1.0 - x[1] ** 2, alpha=2.0, margin=0.1)])
     for _ in range(2):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             _, info = filtered.reset(seed=0, options={"state": [0.0, 1.5]})
             assert info["cbf/unsafe"] and info["cbf/margin"] == pytest.approx(-1.25)
             infos = [filtered.step(np.array([1.0], np.float32))[4] for _ in range(40)]
@@ -437,8 +434,7 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_parked_at_the_wall_is_neither_unsafe_nor_infeasible(dtype):
     filtered = cart([wall(1.0)], env=Cart(0.1, dtype=dtype))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         infos = full_throttle(filtered, 200)
     assert not any(i["cbf/infeasible"] or i["cbf/unsafe"] for i in infos)
 
@@ -457,8 +453,7 @@ def test_braking_to_the_wall_is_feasible_in_float32_too():
 
 def test_a_safe_episode_warns_of_nothing():
     filtered = cart([wall(100.0), SpeedRow(0.5)])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert any(i["cbf/intervened"] for i in full_throttle(filtered, 60))
 
 
@@ -692,8 +687,7 @@ def test_commands_in_flight_are_counted(dt):
     assert 3.0 - 1e-2 < filtered.unwrapped.farthest <= 3.0 + 1e-6
     assert min(i["cbf/margin"] for i in infos) > -1e-8
     blind = cart([wall(3.0)], dt=dt, env=Cart(dt, latency_steps=3))  # the same without telling it
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         full_throttle(blind, int(12 / dt))
     assert blind.unwrapped.farthest > 3.0 + 1e-3
 
@@ -761,8 +755,7 @@ def test_pendulum_as_published_keeps_the_speed_or_says_infeasible(driver):
     filtered = pendulum()
     rng = np.random.default_rng(0)
     infeasible = kept = 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for seed in range(4):
             filtered.reset(seed=seed)
             for k in range(200):
@@ -795,8 +788,7 @@ def car():
 def test_mountain_car_keeps_the_speed_or_says_infeasible():
     filtered = car()
     kept = intervened = 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for seed in range(4):
             filtered.reset(seed=seed)
             for _ in range(150):

@@ -315,8 +315,7 @@ def test_numbers_beyond_the_envs_dtype_stay_finite(low, blend, dtype):
     env = sw.ChunkHandover(
         Line(low=low, high=-low, dtype=dtype), 4, 2, blend=blend, fallback="zero", **bounds
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
+    with warnings.catch_warnings(action="error", category=RuntimeWarning):
         commands, _ = run(env, [np.full((4, 1), x) for x in (1.7e308, -1.7e308, 1e39, -3e38)])
     assert np.isfinite(commands).all()  # and the line asserts that they are in its box
 
@@ -654,8 +653,7 @@ def test_it_says_once_that_commands_are_held_back():
     env.reset(seed=0)
     with pytest.warns(UserWarning, match=r"rate_limit.*handover/limited"):
         env.step(np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert env.step(np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32))[4]["handover/limited"] > 0
 
 

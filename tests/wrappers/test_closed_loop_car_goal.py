@@ -83,8 +83,7 @@ def drive(env, driver, steps=STEPS, seed=0):
 @pytest.mark.parametrize("level", [1, 2])
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_no_violation_at_any_substep(driver, level):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # nothing unsafe, and no reach broken
+    with warnings.catch_warnings(action="error"):  # nothing unsafe, and no reach broken
         total = drive(sw.protect(gym.make(f"SafeCarGoal{level}-v0")), driver, seed=level)
     assert total["cost_substep"] == total["infeasible"] == total["fallback"] == total["unsafe"] == 0, total
     assert total["intervened"] > 0
@@ -101,8 +100,7 @@ def head_on(env, hazard=1.5):
     layout = {"agent": [0.0, 0.0, 0.0], "goal": [9.0, 9.0], "hazards": [[hazard, 0.0]], "vases": []}
     env.reset(seed=0, options={"layout": layout})
     violations = 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for _ in range(120):
             violations += int(env.step(np.array([1.0, 1.0], np.float32))[4]["cost_substep"])
     return violations

@@ -128,8 +128,7 @@ def test_a_wrong_plant_inside_the_declared_uncertainty(mass, damping):
         env = sw.protect(gym.make("SafePointGoal2-v0"), uncertainty=0.25)
         env.plant.perturb(mass=mass, damping=damping)
         before = env.unwrapped.model.body_mass.copy()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             total = drive(env, driver, steps=1000, seed=7)
         np.testing.assert_array_equal(env.unwrapped.model.body_mass, before)
         assert env.filter.bound[0].drive.mass == pytest.approx(
@@ -144,8 +143,7 @@ def test_a_wrong_plant_that_is_not_declared_violates():
     for driver in (HazardSeeking, LateralDrift):
         env = sw.protect(gym.make("SafePointGoal2-v0"))
         env.plant.perturb(mass=0.5, damping=1.5)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             worst += drive(env, driver, steps=1500, seed=7)["cost_substep"]
     assert worst > 0
 

@@ -141,8 +141,7 @@ def test_a_clip_that_is_not_the_env_s_is_found_out():
     env = sw.CBFActionFilter(
         gym.make("PointMaze_UMaze-v3"), [sw.constraints.WallClearance(velocity_clip=2.0)]
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         assert drive(env, BangBang, 1500)["touched"] > 0
 
 

@@ -7,6 +7,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from meddling import Meddling
 from scipy.optimize import brentq
 
 import safe_wrappers as sw
@@ -20,23 +21,6 @@ FLOATS = (
     keys.CONTACT_PENETRATION,
     keys.CONTACT_RESIDUAL,
 )
-
-
-class Meddling(gym.Wrapper):
-    """Writes to the env's data after a step, where it is told to."""
-
-    at = ()
-    steps = 0
-    contact = None
-
-    def step(self, action):
-        out = super().step(action)
-        self.steps += 1
-        if self.steps in self.at:
-            self.unwrapped.data.qvel[0] += 1e-3
-            if self.contact is not None:
-                self.unwrapped.data.contact.dist[:] = self.contact
-        return out
 
 
 def actions(env, count, seed=0):
@@ -158,9 +142,7 @@ def test_the_bodies_of_the_peak_are_named():
 
 
 def test_a_step_that_cannot_be_replayed_is_said_to_be_and_the_next_is_whole_again():
-    meddling = Meddling(gym.make("HalfCheetah-v5"))
-    meddling.at = (25, 30)
-    env = sw.ContactMonitor(meddling)
+    env = sw.ContactMonitor(Meddling(gym.make("HalfCheetah-v5"), (25, 30)))
     raw = env.unwrapped
     env.reset(seed=0)
     partial = []
@@ -182,12 +164,9 @@ def test_a_step_that_cannot_be_replayed_is_said_to_be_and_the_next_is_whole_agai
 
 
 def test_numbers_that_are_none_are_reported_as_none():
-    meddling = Meddling(gym.make("HalfCheetah-v5"))
-    meddling.at, meddling.contact = (25,), np.nan
-    env = sw.ContactMonitor(meddling)
+    env = sw.ContactMonitor(Meddling(gym.make("HalfCheetah-v5"), (25,), dist=np.nan))
     env.reset(seed=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         info = [env.step(env.action_space.low)[4] for _ in range(25)][-1]
     assert np.isnan([info[k] for k in FLOATS]).all()
 
@@ -217,8 +196,7 @@ def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
 
 
 def test_a_chunk_is_partial_if_any_of_its_steps_was():
-    meddling = Meddling(gym.make("HalfCheetah-v5"))
-    meddling.at = (7,)
+    meddling = Meddling(gym.make("HalfCheetah-v5"), (7,))
     env = sw.ChunkHandover(sw.ContactMonitor(meddling), 5, 5, rate_limit=1e6)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="contact/partial"):
@@ -239,8 +217,7 @@ def test_a_chunk_is_partial_if_any_of_its_steps_was():
 def test_which_of_our_tasks_are_seen_whole(env_id, whole):
     env = sw.ContactMonitor(gym.make(env_id))
     env.reset(seed=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         partial = [env.step(a)[4][keys.CONTACT_PARTIAL] for a in actions(env, 20)]
     assert all(partial) if not whole else not any(partial)
 

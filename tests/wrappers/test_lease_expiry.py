@@ -535,8 +535,7 @@ def test_a_command_that_is_not_finite_is_warned_of_once_and_refused():
     with pytest.warns(UserWarning, match="not finite"):
         info = env.step(np.array([np.nan, 0.0]))[4]
     assert lease_info(info) == (False, True, False) and cart.given[-1].tolist() == [0.25, 0.0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         env.step(np.array([np.inf, 0.0]))
 
 

@@ -1,3 +1,4 @@
+import contextlib
 import copy
 import pickle
 from pathlib import Path
@@ -180,8 +181,7 @@ def test_in_a_vector_env_what_is_not_judged_is_nan_and_float(mode):
     def make():
         return RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2))
 
-    envs = gym.vector.AsyncVectorEnv([make] * 2, autoreset_mode=mode)
-    try:
+    with contextlib.closing(gym.vector.AsyncVectorEnv([make] * 2, autoreset_mode=mode)) as envs:
         envs.reset(seed=0)
         for _ in range(2):
             truncated, info = envs.step(np.zeros((2, 1), np.float32))[3:]
@@ -189,8 +189,6 @@ def test_in_a_vector_env_what_is_not_judged_is_nan_and_float(mode):
             for key in keys.RUNNING:
                 assert info[key].dtype == np.float64 and np.isnan(info[key]).all()
         assert truncated.all() and "cost" not in info[keys.EPISODE_SUMMARY]
-    finally:
-        envs.close()
 
 
 def test_monitor_s_file_says_nan_for_what_is_not_judged(tmp_path):

@@ -217,8 +217,7 @@ def test_what_is_not_finite_goes_to_the_filter():
         *_, info = env.step(np.array([np.nan], np.float32))
     assert info[keys.CBF_NONFINITE] and info[keys.MAP_ANCHOR] is False and info[keys.MAP_SCALE] == 1.0
     env.unwrapped.state[:] = np.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         *_, info = env.step(np.array([1.0], np.float32))
     assert info[keys.CBF_UNSAFE] and info[keys.CBF_FALLBACK] and info[keys.MAP_ANCHOR] is False
 

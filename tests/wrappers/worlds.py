@@ -1,7 +1,6 @@
 """Small worlds whose motion is known exactly: a cart on a line, pushed by a bounded acceleration."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -12,8 +11,6 @@ from safe_wrappers.filter.constraint import BoundConstraint
 
 class Cart(gym.Env):
     """x'' = u, integrated exactly; keeps what it was given and its largest position between samples."""
-
-    metadata: ClassVar = {"render_modes": []}
 
     def __init__(self, dt=0.1, latency_steps=0, dtype=np.float32):
         self.dt = dt

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
+
+from safe_wrappers.checks import Array
 
 from ..config import ArmConfig, ExperimentConfig
 from ..tables import read_rows
@@ -19,15 +20,15 @@ _MOST_BINS = 40
 class Curve:
     """One arm's metric over B bins of steps; of two seeds their range, of one none."""
 
-    steps: NDArray[np.float64]
+    steps: Array
     """(B,)"""
-    iqm: NDArray[np.float64]
+    iqm: Array
     """(B,): over seeds."""
-    low: NDArray[np.float64] | None
+    low: Array | None
     """(B,)"""
-    high: NDArray[np.float64] | None
+    high: Array | None
     """(B,)"""
-    seeds: NDArray[np.float64]
+    seeds: Array
     """(seeds, B): each seed's own."""
     names: tuple[int, ...]
     """The seeds, in the order of the rows."""
@@ -69,9 +70,7 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
     )
 
 
-def event_rate(
-    experiment: ExperimentConfig, arm: ArmConfig, event: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64], int] | None:
+def event_rate(experiment: ExperimentConfig, arm: ArmConfig, event: str) -> tuple[Array, Array, int] | None:
     """How often something happened while training, all seeds together.
 
     Args:
@@ -98,9 +97,7 @@ def event_rate(
     return edges, _bin_ratios(edges, ends, 1000 * events, lengths), int(events.sum())
 
 
-def _bin_ratios(
-    edges: NDArray[np.float64], at: NDArray[np.float64], over: NDArray[np.float64], under: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _bin_ratios(edges: Array, at: Array, over: Array, under: Array) -> Array:
     """Sum over sum in each bin; NaN in an empty one."""
     bins = np.searchsorted(edges[1:-1], at)
     sums, counts = (np.bincount(bins, weights=w, minlength=len(edges) - 1) for w in (over, under))
@@ -109,7 +106,7 @@ def _bin_ratios(
     return ratios
 
 
-def _interval(means: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+def _interval(means: Array) -> tuple[Array | None, Array | None]:
     if len(means) < 2:
         return None, None
     if len(means) < SEEDS_FOR_AN_INTERVAL:

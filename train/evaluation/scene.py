@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import Array
 
 from ..atomic import write_bytes
 from .step_log import is_violation
@@ -23,19 +24,19 @@ _STATIC = ("hazard_positions", "hazard_radius", "goal_radius", "vase_positions")
 class Scene:
     """One episode seen from above; lengths in metres."""
 
-    agent: NDArray[np.float64]
+    agent: Array
     """(steps + 1, 2): where the robot was."""
     intervened: NDArray[np.bool_]
     """(steps,): where the filter changed the action; step t starts at `agent[t]`."""
     violated: NDArray[np.bool_]
     """(steps,): where the task's own truth saw a violation."""
-    goals: NDArray[np.float64]
+    goals: Array
     """(n, 2): each place that the goal was at."""
-    hazards: NDArray[np.float64]
+    hazards: Array
     """(n, 2)."""
     hazard_radius: float
     goal_radius: float
-    vases: NDArray[np.float64]
+    vases: Array
     """(n, 2): at the episode's start."""
 
 
@@ -77,7 +78,7 @@ class SceneRecorder:
     def _radius(self, name: str) -> float:
         return float(self._static[name].max()) if self._static[name].size else 0.0
 
-    def _place(self, name: str) -> NDArray[np.float64]:
+    def _place(self, name: str) -> Array:
         # The task may hand out a view of its own state, which the next step overwrites.
         return np.array(getattr(self._task, name, []), dtype=float).reshape(-1)[:2]
 
@@ -106,5 +107,5 @@ def load_scenes(path: Path) -> dict[int, Scene]:
     return {seed: Scene(**values) for seed, values in fields.items()}
 
 
-def _plane(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _plane(points: Array) -> Array:
     return points.reshape(len(points), -1)[:, :2] if points.size else np.zeros((0, 2))

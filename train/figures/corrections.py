@@ -35,9 +35,7 @@ def corrections_picture(logs: Mapping[str, StepLog], arms: list[str]) -> Picture
     )
 
     def paint(axes: Axes) -> None:
-        axes.set_xlabel("correction (L2, action units)")
-        axes.set_title("steps")
-        axes.set_yscale("log")
+        axes.set(xlabel="correction (L2, action units)", title="steps", yscale="log")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         axes.minorticks_off()
         for arm, values in changed.items():

@@ -38,8 +38,7 @@ def curve_picture(
     reading = f"From the first to the last tenth of training: {reading}."
 
     def paint(axes: Axes) -> None:
-        axes.set_xlabel("training steps")
-        axes.set_title(unit)
+        axes.set(xlabel="training steps", title=unit)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.xaxis.set_major_locator(MaxNLocator(6))
         for arm, curve in there.items():

@@ -60,10 +60,8 @@ def plane_picture(
     (left, right), (low, high) = limits or plane_limits([summary])
 
     def paint(axes: Axes) -> None:
-        axes.set_xlabel("return per episode (more is better)")
-        axes.set_title("cost per episode (less is better)")
-        axes.set_xlim(left, right)
-        axes.set_ylim(low, high)
+        axes.set(xlabel="return per episode (more is better)", title="cost per episode (less is better)")
+        axes.set(xlim=(left, right), ylim=(low, high))
         for arm, of_arm in ends.items():
             _paint_arm(axes, summary, arm, of_arm, arm_color(arms.index(arm)))
 

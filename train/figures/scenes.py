@@ -51,8 +51,7 @@ def scene_picture(name: str, title: str, scene: Scene, color: int, frame: Frame)
         axes.set_aspect("equal")
         axes.set_xlim(*frame[:2])
         axes.set_ylim(*frame[2:])
-        axes.set_xlabel("x in m")
-        axes.set_title("y in m")
+        axes.set(xlabel="x in m", title="y in m")
         _paint(axes, scene, arm_color(color))
 
     keys: dict[str, Key] = {"path": (arm_key(color), "line")}

@@ -10,14 +10,16 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
+
 from ..evaluation.step_log import StepLog
 from ..tables import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Look, Picture, Plotted, per_arm
 
-Rate = tuple[NDArray[np.float64], NDArray[np.float64], int]
+Rate = tuple[Array, Array, int]
 """What `event_rate` returns."""
-Stairs = Mapping[tuple[str, str], tuple[NDArray[np.number], NDArray[np.float64]]]
+Stairs = Mapping[tuple[str, str], tuple[NDArray[np.number], Array]]
 """(arm, event) -> edges of bins of steps, shape (B + 1,), and values in them, shape (B,)."""
 _BINS: Final = 20
 _LOOKS: Final[dict[str, tuple[str, Look]]] = {
@@ -111,8 +113,7 @@ def _in_an_episode(
     stairs = {(arm, event): (edges, scale * _shares(logs[arm], event, edges)) for arm, event in shown}
 
     def label(axes: Axes) -> None:
-        axes.set_xlabel("step in the episode")
-        axes.set_xlim(0, last + 1)
+        axes.set(xlabel="step in the episode", xlim=(0, last + 1))
 
     return _timeline(name, title, unit, reading, stairs, arms, label)
 
@@ -148,7 +149,7 @@ def _timeline(
     return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=2.6), keys, data)
 
 
-def _shares(log: StepLog, event: str, edges: NDArray[np.number]) -> NDArray[np.float64]:
+def _shares(log: StepLog, event: str, edges: NDArray[np.number]) -> Array:
     """Of the steps in each bin; NaN where no episode came that far."""
     steps, _ = np.histogram(log.step, edges)
     hits, _ = np.histogram(log.step[getattr(log, event)], edges)

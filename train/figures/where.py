@@ -128,8 +128,7 @@ def _painter(
     """Paints the cells, and adds each with its centre, steps and share to `hexagons`."""
 
     def paint(axes: Axes) -> None:
-        axes.set_xlabel(names[0])
-        axes.set_title(names[1])
+        axes.set(xlabel=names[0], title=names[1])
         if all(name.endswith("(m)") for name in names):
             axes.set_aspect("equal")  # a round obstacle is to look round
         x0, x1, y0, y1 = view.extent

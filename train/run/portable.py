@@ -107,8 +107,8 @@ class PolicyFolder:
         arm = replace(self.arm, hyperparameters=hyperparameters, learner=NAIVE)
         told = SpacesEnv(_space(self.config["observation_space"]), _space(self.config["action_space"]))
         envs = DummyVecEnv([lambda: told])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of batches that do not fit a rollout: nothing is trained
+        # Warnings are of batches that do not fit a rollout: nothing is trained.
+        with warnings.catch_warnings(action="ignore"):
             model: BaseAlgorithm = ALGORITHMS[algorithm](
                 env=envs, device=device, **constructor_arguments(arm, envs)
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import time
 from collections.abc import Callable
@@ -98,11 +99,8 @@ def train_run(
                     f"{wrong}, and no checkpoint is left to make it from; delete {str(folder)!r} to train again."
                 )
             progress.say(f"{wrong}; made again from the last checkpoint")
-        envs = make_vec_env(arm)
-        try:
+        with contextlib.closing(make_vec_env(arm)) as envs:
             _train(arm, seed, folder, envs, checkpoint, progress, start)
-        finally:
-            envs.close()
 
 
 def _train(

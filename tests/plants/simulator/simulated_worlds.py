@@ -116,7 +116,6 @@ class Grid(gym.Env):
     """A grid with pits ("#"), which cost 1 per step in them; four moves; the observation is (column, row)."""
 
     frame_skip = 1
-    metadata = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, render_mode=None):
         self.render_mode = render_mode
