@@ -116,7 +116,8 @@ table: .venv/installed
 endurance: .venv/installed
 	$(BIN)/python -m benchmarks.endurance
 
-# Every long figure of the README and docs/results: about eight hours on two cores, but for the table.
+# Long figures of the README and docs/results, about eight hours on two cores; those with a target or a command of
+# their own (table, endurance, shelf, fuzz, ...) are not among them: each page names its command.
 figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial
 	$(BIN)/python -m benchmarks.adversarial --mismatch

@@ -1,4 +1,4 @@
-"""An env that nobody knows: say what must hold and what a backup would do; its own simulation is the model.
+"""Any env: give the constraint and a backup policy; its own simulation is the model.
 
 python examples/own_env.py --steps 2000
 """
