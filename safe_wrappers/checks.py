@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.deprecation import deprecated_names
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 Array = NDArray[np.float64]
@@ -59,12 +58,11 @@ def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
     if not isinstance(given, Mapping):
         raise ConfigurationError(f"{name} is a {kind.__name__}, the dict of one{also}; got {given!r}")
     parameters = inspect.signature(kind).parameters
-    old = deprecated_names(kind)
     for key in given:
-        if key not in parameters and key not in old:
+        if key not in parameters:
             raise UnknownNameError(f"{name} has no {key!r}; it has {', '.join(parameters)}")
     needed = [key for key, p in parameters.items() if p.default is p.empty and key not in given]
-    if needed and not any(key in old for key in given):
+    if needed:
         raise ConfigurationError(f"{name} needs {' and '.join(needed)}; got {dict(given)!r}")
     return kind(**given)
 

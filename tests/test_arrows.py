@@ -26,7 +26,7 @@ LAYERS = {
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
-COMMON = {"checks", "deprecation", "errors", "info"}
+COMMON = {"checks", "errors", "info"}
 """Single modules at the top that every layer may use; `protect` and the package itself are the top."""
 BELOW_WRAPPERS = {"control", "plants", "drawing", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
@@ -141,12 +141,7 @@ def test_the_parser_sees_what_it_should(tmp_path):
     found = imports(path, "safe_wrappers.control")
     assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
     assert layers_used("control", LAYERS["control"] / "watchdog" / "leases.py") == {"checks", "errors"}
-    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {
-        "checks",
-        "deprecation",
-        "errors",
-        "plants",
-    }
+    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {"checks", "errors", "plants"}
 
 
 def test_control_runs_without_gymnasium_and_mujoco():

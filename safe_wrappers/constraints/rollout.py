@@ -2,7 +2,7 @@
 
 import warnings
 from abc import abstractmethod
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,6 @@ _KEPT = 10  # control steps for which a response is kept: a guess that forecasts
 _SAME_RESPONSE = 1  # linearisations of one step that use the kept response
 _RESOLUTION = 1e-6  # rounding of controls, as a share of half their range, for which rows are tightened
 RECOVERY_S = 0.1  # time constant of recovery from a violation, s
-RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}  # old names of parameters of the subclasses
 
 
 class RolloutConstraint(Constraint):

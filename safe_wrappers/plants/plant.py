@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 import gymnasium as gym
 
 from safe_wrappers.checks import Array
-from safe_wrappers.deprecation import deprecated_attribute
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.control_loop import ControlLoop
 
@@ -28,9 +27,6 @@ class Plant(ABC):
     observation_id: int = 0
     model_version: int = 0
     loop: ControlLoop | None = None
-    hold_s = deprecated_attribute("hold_s", "control_dt")
-    stamp = deprecated_attribute("stamp", "observation_id")
-    revision = deprecated_attribute("revision", "model_version")
     has_acceleration: ClassVar[bool] = True
     """Whether a control acts as a force, so that `f` and `g` are known."""
     bounds_are_action_space: ClassVar[bool] = False

@@ -11,7 +11,6 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, numbers_of, settings_from
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
@@ -29,7 +28,6 @@ from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs
 
 
-@deprecated_parameters(renamed={"jerk_limit": "rate_limit", "hold_s": "control_dt"})
 class ChunkHandover(LayerWrapper, CommandReceiver):
     """Executes action chunks that come late, over seams that keep a rate limit.
 

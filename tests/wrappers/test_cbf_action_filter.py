@@ -7,6 +7,7 @@ belongs to a wrapper of a later release and is left out here.
 import copy
 import re
 import warnings
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -242,7 +243,12 @@ def test_unknown_names_and_bad_margins_are_refused(options, error, message):
 @pytest.mark.parametrize(
     ("constraint", "message"),
     [
-        (lambda: "fast", r"a constraint \(a sw.Constraint\)"),
+        (lambda: "fast", "a constraint .an instance of a subclass of sw.Constraint, .* got 'fast'"),
+        (lambda: SpeedRow, "an instance of a subclass of sw.Constraint, .* got <class 'worlds.SpeedRow'>"),
+        (
+            lambda: SimpleNamespace(rows=lambda plant: sw.HalfSpaces.none(1)),
+            r"a subclass of sw.Constraint, whose bind\(plant\) returns a sw.BoundConstraint.*got namespace",
+        ),
         (
             lambda: {"kind": "Clearence"},
             "unknown constraint kind 'Clearence'; the kinds are Barrier, Clearance",

@@ -204,7 +204,7 @@ class ArmConfig(Section):
         for harmless in ("name", "checkpoint_every", "device", "vec_env", "trackers"):
             del values[harmless]
         without_default_buffer_size(values)
-        # As in the folders of runs that were made before there was a choice.
+        # What is as by default is left out: a setting that is added later does not change the folders of today.
         if self.learner == NAIVE:
             del values["learner"]
         else:

@@ -125,8 +125,8 @@ def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> Filt
 
 def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:
     """The lease around a filter; its clearance, if none is given, is what the filter keeps."""
-    budget = arguments.get("budget", {})
-    if "clearance" in arguments or "clearance" in budget:
+    budget = arguments.get("budget") or {}
+    if "clearance" in budget:
         return LeaseExpiry(task, **arguments)
     constraints = getattr(task, "constraints", [])
     if len(constraints) != 1:
@@ -134,9 +134,7 @@ def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpir
             f"lease: the filter has {len(constraints)} constraints; say which one the lease is made from with "
             "budget: {clearance: {kind: ..., ...}, ...}"
         )
-    # Without a budget its bounds stand beside it, as they once did; LeaseExpiry takes them and warns.
-    clearance = {"clearance": constraints[0], **budget} if budget else constraints[0]
-    return LeaseExpiry(task, **{**arguments, "budget": clearance})
+    return LeaseExpiry(task, **{**arguments, "budget": {"clearance": constraints[0], **budget}})
 
 
 def _function(name: str, where: str) -> Any:

@@ -13,10 +13,8 @@ from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
-from safe_wrappers.constraints.rollout import RENAMED
 from safe_wrappers.control.numerics.nearest_discs import nearest_discs
 from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
@@ -32,7 +30,6 @@ _RECOVERED = 0.5  # share of the best gain of clearance that a control has to re
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 
 
-@deprecated_parameters(renamed={**RENAMED, "alone": "robot_model_attr", "reach_s": "max_decrease_per_speed"})
 @dataclass
 class CoastingClearance(Constraint):
     """Keep a free-moving machine out of discs, counting its whole way until it rests without control.

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, name_list, positive
 from safe_wrappers.constraints.limits.joint_marks import range_marks, speed_marks
-from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.numerics.compiled import compiled
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
@@ -140,7 +139,6 @@ def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
     return ids
 
 
-@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class JointPositionLimit(RolloutConstraint):
     """Keep joint positions in a range that may be narrower than the model's own.
@@ -235,7 +233,6 @@ def _positions(name: str, given: float | Sequence[float] | None) -> float | list
     return listed
 
 
-@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class JointSpeedLimit(RolloutConstraint):
     """Keep `|joint speed| <= limit`.

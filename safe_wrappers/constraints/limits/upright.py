@@ -7,14 +7,12 @@ from typing import ClassVar
 import numpy as np
 
 from safe_wrappers.checks import Array, positive
-from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
-from safe_wrappers.deprecation import deprecated_parameters
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
 
-@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class Upright(RolloutConstraint):
     """Keep a body's height in a range and its own z axis within an angle of the vertical.

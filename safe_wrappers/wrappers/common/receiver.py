@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import numbers_of
-from safe_wrappers.deprecation import deprecated_attribute, deprecated_method
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.common.layer import Env
@@ -30,7 +29,6 @@ class CommandReceiver:
 
     control_dt: float
     """Control interval, s."""
-    hold_s = deprecated_attribute("hold_s", "control_dt")
     _steps_done: int
     _observed_s: float | None
 
@@ -60,8 +58,6 @@ class CommandReceiver:
     def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
         """Whether a chunk may be executed, shape (h, m): the commands of the next h control steps."""
         return self.admits(commands[-1], len(commands))
-
-    deliver = deprecated_method("deliver", "set_observation_time")
 
 
 def receiver_inside(env: Env) -> CommandReceiver | None:
