@@ -15,7 +15,6 @@ import safe_wrappers
 ROOT = Path(__file__).parents[1]
 LAYERS = {
     "control": ROOT / "safe_wrappers" / "control",
-    "appendix": ROOT / "safe_wrappers" / "appendix",
     "plants": ROOT / "safe_wrappers" / "plants",
     "drawing": ROOT / "safe_wrappers" / "drawing",
     "filter": ROOT / "safe_wrappers" / "filter",
@@ -31,7 +30,6 @@ COMMON = {"checks", "errors", "info"}
 BELOW_WRAPPERS = {"control", "plants", "drawing", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
     "control": {"control", "checks", "errors"},
-    "appendix": {"appendix", "control", "plants", "checks", "errors"},
     "plants": {"control", "plants", *COMMON},
     "drawing": {"plants", "drawing", *COMMON},
     "filter": {"control", "plants", "drawing", "filter", *COMMON},
@@ -39,13 +37,12 @@ MAY_USE = {
     "wrappers": {"wrappers", *BELOW_WRAPPERS},
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
     "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
-    "envs": {"appendix", "control", "constraints", "envs", *COMMON},
+    "envs": {"control", "constraints", "envs", *COMMON},
     "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {
     "control": LEARNERS | {"gymnasium", "mujoco"},
-    "appendix": LEARNERS | {"gymnasium"},
     "filter": LEARNERS | {"gymnasium", "mujoco"},
     "plants": LEARNERS,
     "drawing": LEARNERS,
