@@ -97,6 +97,10 @@ class Plant(ABC):
     def received(self, observation: Any, info: dict[str, Any]) -> None:  # noqa: B027 - most plants read the env
         """Take what the env's reset or step has returned; called before the next `observe`."""
 
+    def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
+        """Step the env with what may be executed; what `env.step` returns."""
+        return env.step(action)
+
     def follow(self) -> None:  # noqa: B027 - most plants have no model of the env's
         """Read the env's model anew if it has changed; `model_version` counts how often."""
 

@@ -172,7 +172,7 @@ class CBFActionFilter(LayerWrapper):
         sent, report = self.judge(action)
         self.filter_seconds += time.perf_counter() - started
         self.filter_calls += 1
-        observation, reward, terminated, truncated, info = self.env.step(sent)
+        observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
         self.plant.received(observation, info)
         info |= report
         info[keys.CBF_MISMATCH] = self.deviates()

@@ -50,7 +50,7 @@ class Constants(Remade):
     def __init__(self, model: mujoco.MjModel, fields: tuple[str, ...]) -> None:
         self._options = model.opt
         arrays = [getattr(model, name) for name in fields]
-        self._views = [array.reshape(-1).view(np.uint8) for array in arrays if array.size]
+        self._views = [array.reshape(-1).view(np.uint8).data for array in arrays if array.size]
         self._seen = self._now()
 
     def _now(self) -> tuple[float, int, bytes]:

@@ -120,7 +120,8 @@ class MujocoPlant(Snapshot):
         )
         self._idle = self.controls(np.clip(0.0, self.lower, self.upper))
         self.control_dt = env_checks.check_timing(self._env, self.substeps * float(model.opt.timestep))
-        self._new_snapshot()
+        if moved:
+            self._new_snapshot()
         self.frames = of_model.Frames(model, self.data)
         self._delay_steps = int(np.ceil(self.delay_s / model.opt.timestep - 1e-9))
         self._pending = deque(self._pending, maxlen=max(1, -(-self._delay_steps // self.substeps)))
