@@ -104,7 +104,7 @@ class BoundRollout(BoundSlacks):
 
     def observe(self, memory: RolloutMemory) -> None:
         self._value = self.now()
-        self._known: dict[tuple[int, bytes], Array] = {}
+        self._known: dict[bytes, Array] = {}
         self._tangents = Tangents(self.slacks, self._slopes)
         self._linear: HalfSpaces | None = None
         self._linearized = 0
@@ -138,7 +138,7 @@ class BoundRollout(BoundSlacks):
 
         In time: the least room in every control interval, bound by bound.
         """
-        key = self.plant.model_version, control.tobytes()
+        key = control.tobytes()
         if key not in self._known:
             self._known[key] = self._slacks(control)
         return self._known[key]

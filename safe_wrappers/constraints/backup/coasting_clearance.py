@@ -138,7 +138,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         seen = np.zeros(0)
         if self._origin.near or self._body.near:
             discs = np.concatenate([self._origin.discs, self._body.discs])[:, :2].ravel()
-            seen = np.concatenate([[self.plant.model_version], self.coasting.state(), discs])
+            seen = np.concatenate([self.coasting.state(), discs])
         # Rollouts are kept while nothing moves.
         still = seen.size and seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()
         if not still:
