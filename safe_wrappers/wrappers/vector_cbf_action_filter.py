@@ -240,8 +240,8 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         if not mask.any():
             return
         for key, values in reports.items():
-            values[~mask] = 0
-            infos[key], infos[f"_{key}"] = values.copy(), mask.copy()
+            infos[key], infos[f"_{key}"] = values.copy(), mask.copy()  # the rest goes into final_info
+            infos[key][~mask] = 0
         if self.filters[0].filter.reporting:
             actions = reports[keys.PROPOSED_ACTION], reports[keys.EXECUTED_ACTION]
             for i in np.flatnonzero(mask).tolist():
