@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple, NoReturn
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, positive
+from safe_wrappers.checks import Array, numbers_of, positive, shown
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import check_timing, name_of, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant
@@ -176,13 +176,11 @@ class RolloutPlant(Plant):
             NotFiniteError: Not finite.
             ConfigurationError: Another shape, or no action of a discrete space.
         """
-        try:
-            control = np.atleast_1d(np.asarray(action, dtype=np.float64))
-        except (TypeError, ValueError):
-            control = np.zeros(0)
-        wanted = f"{of} must be a finite action of {self._space}, got {action!r}"
-        if control.shape != self.lower.shape:
+        given = numbers_of(action)
+        wanted = f"{of} must be a finite action of {self._space}, got {shown(action)}"
+        if given is None or np.atleast_1d(given).shape != self.lower.shape:
             raise ConfigurationError(wanted)
+        control = np.atleast_1d(given).astype(np.float64)
         if not np.isfinite(control).all():
             raise NotFiniteError(wanted)
         clipped = np.clip(control, self.lower, self.upper)

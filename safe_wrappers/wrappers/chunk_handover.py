@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, numbers_of, settings_from
+from safe_wrappers.checks import OF_NUMBERS, Array, non_negative, numbers_of, settings_from, shown
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
 from safe_wrappers.deprecation import deprecated_parameters
@@ -231,7 +231,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         expected = f"expected a chunk of shape {self.action_space.shape}"
         given = numbers_of(action)
         if given is None:
-            raise ActionError(f"{expected}, of numbers, got {action!r}")
+            raise ActionError(f"{expected}, {OF_NUMBERS}, got {shown(action)}")
         chunk = given.astype(np.float64)
         if self.chunk_size == 1 and chunk.shape == (self._controls,):
             return chunk[None]  # an ordinary policy's action

@@ -295,6 +295,16 @@ def test_what_leaves_actions_alone_may_be_inside_or_outside():
     assert all("episode" in info and "cbf/margin" in info for info in infos)
 
 
+def test_actions_that_are_no_numbers_are_refused_and_no_env_is_stepped():
+    envs = sw.protect(SyncVectorEnv([functools.partial(made, "SafePointGoal1-v0")] * 2))
+    envs.reset(seed=0)
+    masked = np.ma.masked_array(np.zeros((2, 2)), [[False, False], [False, True]])
+    for actions in ([[0.0, 0.0], [10**400, 0.0]], masked, list(masked)):
+        with pytest.raises(sw.errors.ActionError, match="none of them masked"):
+            envs.step(actions)
+    assert envs.filters[0].unwrapped.data.time == 0.0
+
+
 def test_the_last_step_of_an_episode_is_reported_beside_envs_that_go_on():
     # SB3's adapter asks for SAME_STEP: there a buffer of executed actions reads final_info.
     makers = [functools.partial(ScheduledCart, index) for index in range(2)]
