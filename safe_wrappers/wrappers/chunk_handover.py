@@ -15,7 +15,7 @@ from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
-from safe_wrappers.plants.env_checks import check_actions, check_timing
+from safe_wrappers.plants.env_checks import check_actions, check_timing, reward_numbers
 from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
@@ -172,7 +172,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         chunk = self._checked(action)
         clipped = self._clipped(chunk)
         refused = not self._submit(chunk)
-        total, infos, commands, latency = 0.0, [], [], -1
+        total: Any = 0.0
+        infos, commands, latency = [], [], -1
         terminated = truncated = False
         for _ in range(self.execution_horizon):
             now = self._queue.now
@@ -188,7 +189,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             self._fallback.executed(executed)
             self._executed = np.concatenate([self._executed, executed[None]])
             self._in_seam.append(self._seams_at(now, command))
-            total += float(reward)
+            total = total + reward_numbers(reward)
             infos.append(dict(info))  # the env may use the same one again
             commands.append(command)
             if terminated or truncated:

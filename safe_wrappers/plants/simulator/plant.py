@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers.checks import Array, whole_number
+from safe_wrappers.plants.env_checks import reward_numbers
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
 from safe_wrappers.plants.simulator.replay_check import check_replay
 from safe_wrappers.plants.simulator.simulation import (
@@ -119,7 +120,7 @@ class SimulatorPlant(RolloutPlant):
                 observation, reward, terminated, truncated, info = env.step(action)
                 view = View(env.unwrapped, observation, info)
                 found.observations.append(observation)
-                found.rewards.append(float(reward))
+                found.rewards.append(reward_numbers(reward))
                 if measure is not None:
                     found.values.append(measure(view))
                     if not found.values[-1] >= least:

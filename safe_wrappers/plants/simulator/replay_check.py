@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.plants.env_checks import name_of, reward_numbers
 from safe_wrappers.plants.simulator.simulation import Env, Simulation
 
 _LONGEST = 10  # steps that are simulated ahead before the env makes them
@@ -49,8 +49,8 @@ def check_replay(simulation: Simulation, steps: int, seed: int = 0) -> None:
     raw._np_random = generator
 
 
-Answer = tuple[Any, float, bool, bool]
-"""Observation, reward, terminated and truncated."""
+Answer = tuple[Any, Any, bool, bool]
+"""Observation, reward (a float, or an array where it is a vector), terminated and truncated."""
 
 
 def stretch(env: Env, actions: list[Any]) -> list[Answer]:
@@ -58,7 +58,9 @@ def stretch(env: Env, actions: list[Any]) -> list[Answer]:
     answers: list[Answer] = []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        answers.append((copy.deepcopy(observation), float(reward), bool(terminated), bool(truncated)))
+        answers.append(
+            (copy.deepcopy(observation), reward_numbers(reward), bool(terminated), bool(truncated))
+        )
         if terminated or truncated:
             break
     return answers
@@ -66,10 +68,9 @@ def stretch(env: Env, actions: list[Any]) -> list[Answer]:
 
 def difference(simulated: Answer, real: Answer) -> str | None:
     """Where two answers differ, in words; None: nowhere."""
-    for name, one, other in zip(("reward", "terminated", "truncated"), simulated[1:], real[1:], strict=True):
-        if one != other and not (one != one and other != other):
-            return f"its {name} is {one!r} instead of {other!r}"
-    return _differing("observation", simulated[0], real[0])
+    names = ("observation", "reward", "terminated", "truncated")
+    parts = (_differing(*each) for each in zip(names, simulated, real, strict=True))
+    return next((part for part in parts if part is not None), None)
 
 
 def _differing(name: str, one: Any, other: Any) -> str | None:
@@ -87,4 +88,4 @@ def _differing(name: str, one: Any, other: Any) -> str | None:
         return None  # zeros of another sign
     at = tuple(unequal[0].tolist())
     one, other = (np.atleast_1d(array)[at].item() for array in (a, b))
-    return f"its {name}{list(at)} is {one!r} instead of {other!r}"
+    return f"its {name}{list(at) if a.ndim else ''} is {one!r} instead of {other!r}"
