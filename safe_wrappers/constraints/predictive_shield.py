@@ -165,6 +165,8 @@ class BoundPredictiveShield(BoundConstraint):
         # Many envs report their cost after steps, and not after a reset.
         self._unknown = isinstance(self.spec.h, str) and self.spec.h not in view.info
         self._now = math.inf if self._unknown else self._measure(view)
+        if not self.plant.exact:  # any more
+            self.spec.promise = "best effort"
 
     def check(self) -> None:
         if np.isfinite(self.plant.state).all():

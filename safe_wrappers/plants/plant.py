@@ -97,6 +97,13 @@ class Plant(ABC):
     def received(self, observation: Any, info: dict[str, Any]) -> None:  # noqa: B027 - most plants read the env
         """Take what the env's reset or step has returned; called before the next `observe`."""
 
+    def deviation(self) -> str:
+        """How the env's last step was not what was decided, in words; "" if it was, or nothing can be compared.
+
+        Asked after `received`, before the next `observe`.
+        """
+        return ""
+
     def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
         """Step the env with what may be executed; what `env.step` returns."""
         self.offer_rollout()

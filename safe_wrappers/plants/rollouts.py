@@ -164,13 +164,14 @@ class RolloutPlant(Plant):
         return [every[i] for i in np.argsort(distances, kind="stable") if distances[i] > 0.0]
 
     def action(self, control: Array) -> Any:
-        """The env's action for a control, shape (m,)."""
+        """The env's action for a control, shape (m,): in the space's dtype, unless it is not a number of that."""
         if isinstance(self._space, gym.spaces.Discrete):
             return int(control[0])
-        return control.astype(self._space.dtype)
+        rounded = control.astype(self._space.dtype)
+        return rounded if bool((rounded == control).all()) else control.copy()
 
     def control(self, action: Any, of: str) -> Array:
-        """The control for an action, clipped to a Box's bounds; `of` says in messages whose it is.
+        """The control for an action, inside a Box and in its dtype; `of` says in messages whose it is.
 
         Raises:
             NotFiniteError: Not finite.
@@ -186,7 +187,7 @@ class RolloutPlant(Plant):
         clipped = np.clip(control, self.lower, self.upper)
         if self.discrete and bool((np.rint(clipped) != control).any()):
             raise ConfigurationError(wanted)
-        return clipped
+        return clipped.astype(self._space.dtype).astype(np.float64)
 
     @abstractmethod
     def rollout(

@@ -1,5 +1,6 @@
 """SimulatorPlant: the env's own simulation is the model."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -9,14 +10,16 @@ import numpy as np
 from safe_wrappers.checks import Array, whole_number
 from safe_wrappers.plants.env_checks import reward_numbers
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
-from safe_wrappers.plants.simulator.replay_check import check_replay
+from safe_wrappers.plants.simulator.replay_check import check_replay, differing
 from safe_wrappers.plants.simulator.simulation import (
     Env,
     Simulation,
     Snapshot,
-    fresh_generator,
+    other_noise,
     simulation_of,
 )
+
+_ROUNDING = 1e-6  # of float32
 
 
 class SimulatorPlant(RolloutPlant):
@@ -28,7 +31,12 @@ class SimulatorPlant(RolloutPlant):
 
     **It knows what will be drawn**: the random generator of the env belongs to its state, so that a rollout has the
     noise that the env will have. Only a simulator has this privilege; `same_noise=False` takes it away, and then
-    rollouts are samples, and prove nothing about the env.
+    rollouts are samples, and prove nothing about the env. It reseeds, in the simulation, the generators of NumPy and
+    of `random` that the env, its wrappers or anything in them holds.
+
+    **After every step** what the env has returned is compared with the rollout of the executed action. From the first
+    difference on (a generator that copies share, a clock, another process) nothing is proved, and `cbf/mismatch` says
+    at which steps it was.
 
     Args:
         snapshot: `(save, restore)`: functions `save(env)` and `restore(env, state)` of the unwrapped env, which is
@@ -64,6 +72,8 @@ class SimulatorPlant(RolloutPlant):
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
         self.exact = self.same_noise and self.check_steps > 0
         self._simulation: Simulation | None = None
+        self._compares, self._sent = self.exact, b""
+        self._foreseen: dict[bytes, tuple[Any, float | None, Measure | None]] = {}
 
     def bind(self, env: Env) -> None:
         """Attach to an env, and check that its simulation is the env."""
@@ -72,7 +82,7 @@ class SimulatorPlant(RolloutPlant):
         self._simulation = simulation_of(env, self._snapshot)
         self.view = View(env.unwrapped, np.zeros(0), {})
         if self.check_steps:
-            check_replay(self._simulation, self.check_steps)
+            check_replay(self._simulation, self.check_steps, self.same_noise)
 
     @property
     def simulation(self) -> Simulation:
@@ -91,15 +101,32 @@ class SimulatorPlant(RolloutPlant):
     def observe(self) -> None:
         """Every rollout starts where the env is."""
         self.observation_id += 1
+        self._foreseen.clear()
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:
         """Take what the env's reset or step has returned."""
         self.view = View(self.simulation.env.unwrapped, observation, info)
 
     def executed(self, control: Array | None) -> None:
-        """A new episode may have changed what copies share."""
+        """Remember it for `deviation`; a new episode may have changed what copies share."""
         if control is None:
             self.simulation.start()
+        else:
+            self._sent = control.tobytes()
+
+    def deviation(self) -> str:
+        """Where the env's step was not the rollout of what was executed: in the observation, or in what was measured.
+
+        By more than rounding: an env may compute otherwise with a list. From the first one on it is not `exact`.
+        """
+        observation, value, measure = self._foreseen.get(self._sent, (self.view.observation, None, None))
+        found = differing("observation", observation, self.view.observation, _ROUNDING)
+        if found is None and measure is not None:
+            found = differing("h", value, measure(self.view), _ROUNDING)
+        if found is None:
+            return ""
+        self.exact = False
+        return f"the env's step was not its simulation's: {found}"
 
     def rollout(
         self,
@@ -113,13 +140,17 @@ class SimulatorPlant(RolloutPlant):
         """Simulate a control, then a policy, from the env's present state: see `RolloutPlant.rollout`."""
 
         def simulated(env: gym.Env[Any, Any]) -> Rollout:
-            if not self.same_noise:
-                env.unwrapped.np_random = fresh_generator(self.observation_id)
+            if self.same_noise:
+                return rolled_out(env)
+            with other_noise(env, self.observation_id):
+                return rolled_out(env)
+
+        def rolled_out(env: gym.Env[Any, Any]) -> Rollout:
             found, action = Rollout(), self.action(control)
             for step in range(horizon):
                 observation, reward, terminated, truncated, info = env.step(action)
                 view = View(env.unwrapped, observation, info)
-                found.observations.append(observation)
+                found.observations.append(observation if step else copy.deepcopy(observation))
                 found.rewards.append(reward_numbers(reward))
                 if measure is not None:
                     found.values.append(measure(view))
@@ -133,7 +164,11 @@ class SimulatorPlant(RolloutPlant):
                     action = policy(view)
             return found
 
-        return self.simulation.run(simulated)
+        found = self.simulation.run(simulated)
+        if self._compares:
+            value = found.values[0] if found.values else None
+            self._foreseen[control.tobytes()] = found.observations[0], value, measure
+        return found
 
     def margins(self, measure: Measure, horizon: int) -> Array:
         """Zeros: a rollout is what the env does."""
