@@ -146,6 +146,10 @@ class BoundPredictiveShield(BoundConstraint):
             )
         if not self.plant.exact:
             spec.promise = "best effort"  # of an unchecked, noisy or fitted model a set proves nothing
+        # The env's own judge decides by itself when it looks.
+        self._between = "" if isinstance(spec.h, str) or self.plant.substeps == 1 else spec.sees
+        if self._between and not self.plant.judges_substeps:
+            self.plant.warn_of_substeps("this env does not step MuJoCo as Gymnasium's MujocoEnv does")
         discrete = self.plant.discrete
         if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
             raise ConfigurationError(
@@ -245,7 +249,9 @@ class BoundPredictiveShield(BoundConstraint):
         until = None if spec.terminal is None else self._terminal
         least = float(self._needed.min())
         try:
-            rollout = self.plant.rollout(control, spec.horizon, policy, self._measure, least, until)
+            rollout = self.plant.rollout(
+                control, spec.horizon, policy, self._measure, least, until, self._between
+            )
         except NotFiniteError:
             return -math.inf  # the backup has no answer
         values = np.array(rollout.values)

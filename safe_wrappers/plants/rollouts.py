@@ -60,6 +60,10 @@ class RolloutPlant(Plant):
     """Whether a `View` of a rollout has the env and its info; else only the observation."""
     exact: bool = False
     """Whether rollouts were checked to be what the env does, its noise included."""
+    substeps: int = 1
+    """Physics substeps of a control step that are known of."""
+    judges_substeps: bool = False
+    """Whether rollouts can be measured at each of them."""
     info_keys: ClassVar[tuple[str, ...]] = ()
     """The keys that `info` writes."""
     lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
@@ -198,6 +202,7 @@ class RolloutPlant(Plant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
+        between: str = "",
     ) -> Rollout:
         """Simulate a control, then a policy, from the env's present state.
 
@@ -208,6 +213,8 @@ class RolloutPlant(Plant):
             measure: Takes a `View`, returns a number.
             least: A measured number below it, or NaN, ends the rollout.
             until: Takes a `View`; where it is True the rollout ends.
+            between: What the measure sees of a `View` at physics substeps ("observation", "env" or "view"), where the
+                plant `judges_substeps`; the least of a step counts. "": it is not asked there.
         """
 
     @abstractmethod

@@ -1,11 +1,14 @@
 """SimulatorPlant: the env's own simulation is the model."""
 
+import contextlib
 import copy
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
 
 from safe_wrappers.checks import Array, whole_number
 from safe_wrappers.plants.env_checks import reward_numbers
@@ -18,6 +21,7 @@ from safe_wrappers.plants.simulator.simulation import (
     other_noise,
     simulation_of,
 )
+from safe_wrappers.plants.simulator.substeps import Substeps, known_substeps
 
 _ROUNDING = 1e-6  # of float32
 
@@ -72,7 +76,7 @@ class SimulatorPlant(RolloutPlant):
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
         self.exact = self.same_noise and self.check_steps > 0
         self._simulation: Simulation | None = None
-        self._compares, self._sent = self.exact, b""
+        self._compares, self._sent, self._compared_substeps = self.exact, b"", False
         self._foreseen: dict[bytes, tuple[Any, float | None, Measure | None]] = {}
 
     def bind(self, env: Env) -> None:
@@ -81,6 +85,9 @@ class SimulatorPlant(RolloutPlant):
         self._attach(env)
         self._simulation = simulation_of(env, self._snapshot)
         self.view = View(env.unwrapped, np.zeros(0), {})
+        self.substeps = known_substeps(env.unwrapped)
+        stepping = getattr(type(env.unwrapped), "_step_mujoco_simulation", None)
+        self.judges_substeps = stepping is MujocoEnv._step_mujoco_simulation
         if self.check_steps:
             check_replay(self._simulation, self.check_steps, self.same_noise)
 
@@ -136,24 +143,29 @@ class SimulatorPlant(RolloutPlant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
+        between: str = "",
     ) -> Rollout:
         """Simulate a control, then a policy, from the env's present state: see `RolloutPlant.rollout`."""
 
-        def simulated(env: gym.Env[Any, Any]) -> Rollout:
-            if self.same_noise:
-                return rolled_out(env)
-            with other_noise(env, self.observation_id):
-                return rolled_out(env)
+        def simulated(env: gym.Env[Any, Any]) -> tuple[Rollout, float | None, str]:
+            with contextlib.ExitStack() as stack:
+                if not self.same_noise:
+                    stack.enter_context(other_noise(env, self.observation_id))
+                seen = Substeps(measure, between if self.judges_substeps else "")
+                stack.enter_context(seen.of(env.unwrapped))
+                return rolled_out(env, seen)
 
-        def rolled_out(env: gym.Env[Any, Any]) -> Rollout:
-            found, action = Rollout(), self.action(control)
+        def rolled_out(env: gym.Env[Any, Any], seen: Substeps) -> tuple[Rollout, float | None, str]:
+            found, action, first = Rollout(), self.action(control), None
             for step in range(horizon):
                 observation, reward, terminated, truncated, info = env.step(action)
                 view = View(env.unwrapped, observation, info)
                 found.observations.append(observation if step else copy.deepcopy(observation))
                 found.rewards.append(reward_numbers(reward))
                 if measure is not None:
-                    found.values.append(measure(view))
+                    value = measure(view)
+                    first = first if step else value
+                    found.values.append(seen.least(value, view))
                     if not found.values[-1] >= least:
                         break
                 found.ended = bool(terminated or truncated)
@@ -162,13 +174,32 @@ class SimulatorPlant(RolloutPlant):
                     break
                 if policy is not None and step + 1 < horizon:
                     action = policy(view)
-            return found
+            return found, first, seen.why_not
 
-        found = self.simulation.run(simulated)
+        found, value, why_not = self.simulation.run(simulated)
+        if between and self.judges_substeps and not (why_not or self._compared_substeps):
+            plain = self.rollout(control, len(found.observations), policy, measure)
+            pairs = zip(plain.observations, found.observations, strict=False)
+            if any(differing("observation", *pair) for pair in pairs):
+                why_not = "to look at this env between them changes what it does"
+            self._compared_substeps = True
+        if why_not:
+            self.judges_substeps = False
+            self.warn_of_substeps(why_not)
+            return self.rollout(control, horizon, policy, measure, least, until)
         if self._compares:
-            value = found.values[0] if found.values else None
             self._foreseen[control.tobytes()] = found.observations[0], value, measure
         return found
+
+    def warn_of_substeps(self, why: str) -> None:
+        """Say that a measure is not taken at the physics substeps, and what takes it there."""
+        warnings.warn(
+            f"PredictiveShield judges h at the ends of control steps alone, since {why}: each has {self.substeps} "
+            "physics substeps, and between its ends h may be lost without a flag. Keep a margin for that, or take "
+            "JointSpeedLimit, JointPositionLimit, SpeedLimit, Workspace or another constraint that forecasts every "
+            "substep",
+            stacklevel=2,
+        )
 
     def margins(self, measure: Measure, horizon: int) -> Array:
         """Zeros: a rollout is what the env does."""
