@@ -24,7 +24,7 @@ _NOT_REACHED = -math.ulp(0.0)  # the slack of a rollout that keeps h but does no
 
 @dataclass
 class PredictiveShield(Constraint):
-    """Keep `h >= margin` at the end of every step, by simulating what a backup could do after an action.
+    """Keep `h >= margin` at every step, by simulating what a backup could do after an action.
 
     An action is admitted if after it one of the backups keeps h to the horizon, or until the episode ends, or, with a
     `terminal` set, until it has reached that set. Of a refused action's neighbours, and the first actions of the
@@ -33,8 +33,10 @@ class PredictiveShield(Constraint):
     **Proved for the copy and the terminal set**, if there is one: a state from which a backup reaches it stays such a
     state, whatever the policy does, if the simulation is the env (`SimulatorPlant` checks that), the set is invariant
     under that backup with h >= margin, and backups depend on the state alone. **Best effort: horizon**, without one:
-    what comes later is not looked at, and an admitted action may lead where every backup loses. h between the ends of
-    steps is not looked at either.
+    what comes later is not looked at, and an admitted action may lead where every backup loses.
+
+    **When h is judged**: at the ends of steps; in envs that step as Gymnasium's `MujocoEnv` does, at every physics
+    substep. A warning says where that is not possible. An info key is judged when the env judges it.
 
     Args:
         h: A function of what it `sees` that returns a number, at least 0 where all is well; or the name of an info

@@ -1,5 +1,6 @@
 """What a plant can do that simulates: rollouts of a control and a policy, judged step by step."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -216,6 +217,16 @@ class RolloutPlant(Plant):
             between: What the measure sees of a `View` at physics substeps ("observation", "env" or "view"), where the
                 plant `judges_substeps`; the least of a step counts. "": it is not asked there.
         """
+
+    def warn_of_substeps(self, why: str) -> None:
+        """Say that a measure is not taken at the physics substeps, and what takes it there."""
+        warnings.warn(
+            f"PredictiveShield judges h at the ends of control steps alone, since {why}: each has {self.substeps} "
+            "physics substeps, and between its ends h may be lost without a flag. Keep a margin for that, or take "
+            "JointSpeedLimit, JointPositionLimit, SpeedLimit, Workspace or another constraint that forecasts every "
+            "substep",
+            stacklevel=2,
+        )
 
     @abstractmethod
     def margins(self, measure: Measure, horizon: int) -> Array:

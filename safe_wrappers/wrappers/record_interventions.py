@@ -112,6 +112,7 @@ class RecordInterventions(LayerWrapper):
     """
 
     layer: ClassVar = Layer.RECORDER
+    _return: Any  # a number, or an array where rewards are vectors
 
     def __init__(self, env: Env, path: str | os.PathLike[str] | None = None) -> None:
         LayerWrapper.__init__(self, env)
@@ -163,8 +164,7 @@ class RecordInterventions(LayerWrapper):
         return observation, reward, terminated, truncated, info
 
     def _clear(self) -> None:
-        self._steps = 0
-        self._return: Any = 0.0
+        self._steps, self._return = 0, 0.0
         self._tallies = [_Tally(figure) for figure in keys.EPISODE]
 
 

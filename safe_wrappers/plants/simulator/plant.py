@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -190,16 +189,6 @@ class SimulatorPlant(RolloutPlant):
         if self._compares:
             self._foreseen[control.tobytes()] = found.observations[0], value, measure
         return found
-
-    def warn_of_substeps(self, why: str) -> None:
-        """Say that a measure is not taken at the physics substeps, and what takes it there."""
-        warnings.warn(
-            f"PredictiveShield judges h at the ends of control steps alone, since {why}: each has {self.substeps} "
-            "physics substeps, and between its ends h may be lost without a flag. Keep a margin for that, or take "
-            "JointSpeedLimit, JointPositionLimit, SpeedLimit, Workspace or another constraint that forecasts every "
-            "substep",
-            stacklevel=2,
-        )
 
     def margins(self, measure: Measure, horizon: int) -> Array:
         """Zeros: a rollout is what the env does."""
