@@ -24,7 +24,7 @@ _NOT_REACHED = -math.ulp(0.0)  # the slack of a rollout that keeps h but does no
 
 @dataclass
 class PredictiveShield(Constraint):
-    """Keep `h >= margin` at the end of every step, by simulating what a backup could do after an action.
+    """Keep `h >= margin` at every step, by simulating what a backup could do after an action.
 
     An action is admitted if after it one of the backups keeps h to the horizon, or until the episode ends, or, with a
     `terminal` set, until it has reached that set. Of a refused action's neighbours, and the first actions of the
@@ -33,8 +33,10 @@ class PredictiveShield(Constraint):
     **Proved for the copy and the terminal set**, if there is one: a state from which a backup reaches it stays such a
     state, whatever the policy does, if the simulation is the env (`SimulatorPlant` checks that), the set is invariant
     under that backup with h >= margin, and backups depend on the state alone. **Best effort: horizon**, without one:
-    what comes later is not looked at, and an admitted action may lead where every backup loses. h between the ends of
-    steps is not looked at either.
+    what comes later is not looked at, and an admitted action may lead where every backup loses.
+
+    **When h is judged**: at the ends of steps; in envs that step as Gymnasium's `MujocoEnv` does, at every physics
+    substep. A warning says where that is not possible. An info key is judged when the env judges it.
 
     Args:
         h: A function of what it `sees` that returns a number, at least 0 where all is well; or the name of an info
@@ -146,6 +148,10 @@ class BoundPredictiveShield(BoundConstraint):
             )
         if not self.plant.exact:
             spec.promise = "best effort"  # of an unchecked, noisy or fitted model a set proves nothing
+        # The env's own judge decides by itself when it looks.
+        self._between = "" if isinstance(spec.h, str) or self.plant.substeps == 1 else spec.sees
+        if self._between and not self.plant.judges_substeps:
+            self.plant.warn_of_substeps("this env does not step MuJoCo as Gymnasium's MujocoEnv does")
         discrete = self.plant.discrete
         if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
             raise ConfigurationError(
@@ -165,6 +171,8 @@ class BoundPredictiveShield(BoundConstraint):
         # Many envs report their cost after steps, and not after a reset.
         self._unknown = isinstance(self.spec.h, str) and self.spec.h not in view.info
         self._now = math.inf if self._unknown else self._measure(view)
+        if not self.plant.exact:  # any more
+            self.spec.promise = "best effort"
 
     def check(self) -> None:
         if np.isfinite(self.plant.state).all():
@@ -243,7 +251,9 @@ class BoundPredictiveShield(BoundConstraint):
         until = None if spec.terminal is None else self._terminal
         least = float(self._needed.min())
         try:
-            rollout = self.plant.rollout(control, spec.horizon, policy, self._measure, least, until)
+            rollout = self.plant.rollout(
+                control, spec.horizon, policy, self._measure, least, until, self._between
+            )
         except NotFiniteError:
             return -math.inf  # the backup has no answer
         values = np.array(rollout.values)

@@ -14,7 +14,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.env_checks import check_timing, wrappers_of
+from safe_wrappers.plants.env_checks import check_timing, one_reward, wrappers_of
 from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 
@@ -236,7 +236,7 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
             rows.append(
                 (
                     action.astype(float),
-                    float(reward),
+                    one_reward(reward, "diagnose"),
                     info,
                     first,
                     terminated,

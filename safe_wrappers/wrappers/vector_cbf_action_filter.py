@@ -153,11 +153,11 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
             single.filter_calls += was_judged
         observations, rewards, terminated, truncated, infos = self.env.step(sent)
         self._ended = np.asarray(terminated | truncated)
-        self._compare(reports, judged)
         restarted = self._ended if self._same_step else ~judged
         if self._same_step and restarted.any():
             self._received(infos["final_obs"], infos["final_info"], restarted)
         self._received(observations, infos, ~restarted)
+        self._compare(reports, judged)
         self._report(infos, reports, judged & ~restarted)
         if self._same_step and restarted.any():
             self._report(infos["final_info"], reports, restarted)
@@ -166,9 +166,9 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         return observations, rewards, terminated, truncated, infos
 
     def _compare(self, reports: dict[str, NDArray[Any]], judged: Mask) -> None:
-        """`cbf/mismatch`; an env that has begun another episode within the step cannot be compared."""
-        restarted = self._ended & self._same_step
-        for i in np.flatnonzero(judged & ~restarted).tolist():
+        """`cbf/mismatch`; a state that another episode has replaced within the step cannot be compared."""
+        replaced = self._same_step and not self.filters[0].plant.simulates
+        for i in np.flatnonzero(judged & ~self._ended if replaced else judged).tolist():
             reports[keys.CBF_MISMATCH][i] = self.filters[i].deviates()
 
     def _received(self, observations: Any, infos: dict[str, Any], mask: Mask) -> None:
@@ -262,8 +262,8 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         if not mask.any():
             return
         for key, values in reports.items():
-            values[~mask] = 0
-            infos[key], infos[f"_{key}"] = values.copy(), mask.copy()
+            infos[key], infos[f"_{key}"] = values.copy(), mask.copy()  # the rest goes into final_info
+            infos[key][~mask] = 0
         if self.filters[0].filter.reporting:
             actions = reports[keys.PROPOSED_ACTION], reports[keys.EXECUTED_ACTION]
             for i in np.flatnonzero(mask).tolist():

@@ -359,6 +359,9 @@ def test_backups_that_do_not_fit_are_refused():
         sw.CBFActionFilter(Cart(), [shield(backup=lambda o: [0.5, 0.5])]).reset(seed=0)
     with pytest.raises(ConfigurationError, match="the backup must be a finite action"):
         sw.CBFActionFilter(Cart(), [shield(backup=np.array([np.nan]))])
+    for no_number in ([10**400], np.ma.masked_array([0.0], True)):
+        with pytest.raises(ConfigurationError, match="the backup must be a finite action"):
+            sw.CBFActionFilter(Cart(), [shield(backup=lambda o, u=no_number: u)]).reset(seed=0)
     with pytest.raises(ConfigurationError, match="discrete action has no zero"):
         sw.ActionShield(Grid(), [PredictiveShield("cost", 2)])
     with pytest.raises(UnsupportedEnvError, match=r"take plant=SimulatorPlant\(\)"):

@@ -261,3 +261,18 @@ def test_many_envs_follow_their_models_as_single_ones_do():
             for key in ("executed_action", "cbf/margin", "cbf/stage", "cbf/mismatch"):
                 np.testing.assert_array_equal(infos[key][i], info[key], err_msg=key)
     assert many.filters[1].plant.model_version > 1
+
+
+def test_a_simulation_follows_the_model_of_its_env():
+    """Gravity, mass and motors that change in mid-episode are those of the next rollout."""
+    raw = gym.make("Reacher-v5")
+    shield = sw.constraints.PredictiveShield(lambda x: 30.0 - np.abs(x[6:8]).max(), horizon=2, backup="zero")
+    env = sw.CBFActionFilter(raw, [shield], plant=sw.SimulatorPlant(check_steps=20))
+    env.reset(seed=0)
+    for step, change in enumerate(["gear", "mass", "gravity", "damping"] * 3):
+        CHANGES[change](env.unwrapped.model)
+        action = np.full(2, (-1.0) ** step, np.float32)
+        foreseen = env.plant.rollout(action.astype(float), 1).observations[0]
+        observation, *_, info = env.step(action)
+        np.testing.assert_array_equal(foreseen, observation)
+        assert not info["cbf/mismatch"] and not info["cbf/intervened"]

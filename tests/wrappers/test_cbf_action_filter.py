@@ -552,6 +552,13 @@ def test_the_users_fallback_sees_the_plant_and_nonsense_from_it_is_replaced():
     info = filtered.step(np.array([0.9], np.float32))[4]
     np.testing.assert_array_equal(seen[-1], [1.0, 0.5])
     np.testing.assert_array_equal(info["executed_action"], [0.0])
+    for no_number in (["fast"], [10**400], np.ma.masked_array([0.0], True)):
+        filtered = cart([CONTRADICTION], fallback=lambda plant, u=no_number: u)
+        filtered.reset(seed=0)
+        with pytest.raises(
+            ConfigurationError, match="the fallback's control is a number or an array of numbers"
+        ):
+            filtered.step(np.zeros(1))
     filtered = cart([CONTRADICTION], fallback=lambda plant: [0.0, 0.0])
     filtered.reset(seed=0)
     with pytest.raises(

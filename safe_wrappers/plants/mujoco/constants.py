@@ -1,6 +1,8 @@
 """Constants: the numbers of a MuJoCo model that are read once, and whether they have changed since."""
 
-from typing import Final
+import operator
+from collections.abc import Sequence
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -33,10 +35,20 @@ def read_fields(model: mujoco.MjModel) -> list[str]:
 def different_fields(model: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
     """The arrays, and options of the physics, in which two models differ."""
     found = [n for n in read_fields(model) if not np.array_equal(getattr(model, n), getattr(other, n))]
-    options = [n for n in dir(model.opt) if not n.startswith("_")]
+    one, two = model.opt, other.opt
     return found + [
-        f"opt.{n}" for n in options if not np.array_equal(getattr(model.opt, n), getattr(other.opt, n))
+        f"opt.{n}" for n in option_fields(model) if not np.array_equal(getattr(one, n), getattr(two, n))
     ]
+
+
+def option_fields(model: mujoco.MjModel) -> list[str]:
+    """The options of the physics: gravity, wind, flags, integrator, ..."""
+    return [name for name in dir(model.opt) if not name.startswith("_")]
+
+
+def every_constant(model: mujoco.MjModel) -> "Constants":
+    """All arrays of numbers, and all options."""
+    return Constants(model, read_fields(model), option_fields(model))
 
 
 class Constants(Remade):
@@ -45,16 +57,25 @@ class Constants(Remade):
     Args:
         model: Watched; it is not copied.
         fields: Names of its arrays.
+        options: Names of options of the physics.
     """
 
-    def __init__(self, model: mujoco.MjModel, fields: tuple[str, ...]) -> None:
-        self._options = model.opt
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        fields: Sequence[str],
+        options: Sequence[str] = ("timestep", "disableflags"),
+    ) -> None:
+        values = {name: getattr(model.opt, name) for name in options}
         arrays = [getattr(model, name) for name in fields]
+        arrays += [value for value in values.values() if isinstance(value, np.ndarray)]
+        numbers = [name for name, value in values.items() if not isinstance(value, np.ndarray)]
+        self._options, self._numbers = model.opt, operator.attrgetter(*numbers)
         self._views = [array.reshape(-1).view(np.uint8).data for array in arrays if array.size]
         self._seen = self._now()
 
-    def _now(self) -> tuple[float, int, bytes]:
-        return self._options.timestep, self._options.disableflags, b"".join(self._views)
+    def _now(self) -> tuple[Any, bytes]:
+        return self._numbers(self._options), b"".join(self._views)
 
     def changed(self) -> bool:
         """Whether they are not what they were when this was made, or at the last call."""

@@ -18,7 +18,13 @@ from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
 from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
-from safe_wrappers.plants.mujoco.constants import DYNAMICS, PLACES, Constants, different_fields, read_fields
+from safe_wrappers.plants.mujoco.constants import (
+    DYNAMICS,
+    PLACES,
+    Constants,
+    different_fields,
+    every_constant,
+)
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.plant import Plant
@@ -102,7 +108,7 @@ class MujocoPlant(Snapshot):
         self._env_model, self.model = source.model, model
         self._constants = Constants(source.model, (*DYNAMICS, *PLACES))
         self._dynamics = Constants(source.model, DYNAMICS)
-        self._every_constant = Constants(source.model, tuple(read_fields(source.model)))
+        self._every_constant = every_constant(source.model)
         self._mismatch = (
             ", ".join(different_fields(model, source.model)[:8]) if model is not source.model else ""
         )

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import numbers_of
+from safe_wrappers.checks import numbers_of, shown
 from safe_wrappers.errors import ActionError, UnsupportedEnvError
 from safe_wrappers.plants.default import PlantTemplate
 from safe_wrappers.plants.env_checks import wrappers_of
@@ -51,7 +51,7 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
             given = numbers_of(action)
             if given is None or not np.isfinite(given).all():
                 raise ActionError(
-                    f"expected an action of finite numbers, got {action!r}; the env was not stepped"
+                    f"expected an action of finite numbers, got {shown(action)}; the env was not stepped"
                 )
 
     def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:

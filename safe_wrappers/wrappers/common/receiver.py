@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import numbers_of
+from safe_wrappers.checks import OF_NUMBERS, numbers_of, shown
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.common.layer import Env
@@ -47,8 +47,11 @@ class CommandReceiver:
         Raises:
             ActionError: Not a finite time.
         """
-        if observed_s is not None and not math.isfinite(observed_s):
-            raise ActionError(f"observed_s is a time in seconds, or None for nothing; got {observed_s!r}")
+        given = None if observed_s is None else numbers_of(observed_s)
+        if observed_s is not None and (given is None or given.ndim or not np.isfinite(given)):
+            raise ActionError(
+                f"observed_s is a time in seconds, or None for nothing; got {shown(observed_s)}"
+            )
         self._observed_s = observed_s
 
     def admits(self, end: NDArray[np.float64], steps: int) -> bool:
@@ -77,7 +80,7 @@ def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None)
     """A copy of an action, in its own dtype unless told; an `ActionError` for another shape or no numbers."""
     given = numbers_of(action)
     if given is None:
-        raise ActionError(f"expected an action of shape {shape}, of numbers, got {action!r}")
+        raise ActionError(f"expected an action of shape {shape}, {OF_NUMBERS}, got {shown(action)}")
     if given.shape != shape:
         raise ActionError(f"expected an action of shape {shape}, got shape {given.shape}")
     return given if dtype is None else given.astype(dtype, copy=False)

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
@@ -63,6 +64,7 @@ class AdaptionPenalty(LayerWrapper):
         scale: float = 1.0,
     ) -> None:
         LayerWrapper.__init__(self, env)
+        refuse_vector_rewards(env, "AdaptionPenalty")
         if filter_inside(env) is None:
             example = "AdaptionPenalty(sw.protect(env), penalty=...)"
             raise ConfigurationError(f"AdaptionPenalty needs a CBFActionFilter inside: {example}")
@@ -103,7 +105,7 @@ class AdaptionPenalty(LayerWrapper):
         """Steps the env; an unchanged step's reward passes through untouched."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         penalty = 0.0
-        info[keys.ADAPTION_TASK_REWARD] = float(reward)
+        info[keys.ADAPTION_TASK_REWARD] = one_reward(reward, "AdaptionPenalty")
         if info[keys.CBF_INTERVENED]:
             penalty = self.of(float(info[keys.CBF_CORRECTION]))
             reward = float(reward) - penalty

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
@@ -70,6 +71,7 @@ class StuckEscape(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
+        refuse_vector_rewards(env, "StuckEscape")
         inside = filter_inside(env)
         if inside is None:
             raise ConfigurationError(
@@ -116,7 +118,7 @@ class StuckEscape(LayerWrapper):
             info[keys.CBF_CORRECTION] = float(np.linalg.norm(executed - proposed))
             info[keys.CBF_INTERVENED] = bool((executed != proposed).any() or not finite.all())
         self._observation = observation
-        self._rewards.append(float(reward))
+        self._rewards.append(one_reward(reward, "StuckEscape"))
         self._changed.append(info[keys.CBF_INTERVENED])
         full = len(self._rewards) == self._window
         stuck = full and 2 * sum(self._changed) > self._window and sum(self._rewards) <= self.progress
