@@ -151,7 +151,8 @@ class BoundPredictiveShield(BoundConstraint):
         # The env's own judge decides by itself when it looks.
         self._between = "" if isinstance(spec.h, str) or self.plant.substeps == 1 else spec.sees
         if self._between and not self.plant.judges_substeps:
-            self.plant.warn_of_substeps("this env does not step MuJoCo as Gymnasium's MujocoEnv does")
+            own = "this env does not step MuJoCo as Gymnasium's MujocoEnv does"
+            self.plant.warn_of_substeps(own if self.plant.simulates_env else "logs are of control steps")
         discrete = self.plant.discrete
         if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
             raise ConfigurationError(

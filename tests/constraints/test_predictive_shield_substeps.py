@@ -128,6 +128,9 @@ def test_envs_that_step_in_a_way_of_their_own_are_told_at_construction():
         UserWarning, match=r"does not step MuJoCo as Gymnasium's MujocoEnv.*10 physics substeps"
     ):
         sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [shield], plant=plant)
+    logged = sw.IdentifiedPlant(sw.plants.log_steps(gym.make("Reacher-v5"), episodes=20, max_steps=20))
+    with pytest.warns(UserWarning, match=r"logs are of control steps: each has 2 physics substeps"):
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [PredictiveShield(lambda x: 1.0, 2)], plant=logged)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cost = PredictiveShield("cost", 2)  # judged by the env, at every substep of its own

@@ -23,6 +23,7 @@ from safe_wrappers.plants.identified.linear import LinearModel
 from safe_wrappers.plants.identified.logs import Episode, checked_episodes
 from safe_wrappers.plants.identified.windows import Model, measured, shortfalls
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
+from safe_wrappers.plants.simulator.substeps import known_substeps
 
 MODELS = ("linear", "ensemble")
 _SCALE_WINDOWS = 8  # per fitted episode
@@ -141,6 +142,7 @@ class IdentifiedPlant(RolloutPlant):
                     "of this env, with the wrappers that are inside the filter (such as FlattenObservation)"
                 )
         self._attach(env)
+        self.substeps = known_substeps(env.unwrapped)
         self.view = View(None, np.zeros(first.observations.shape[1]), {})
 
     @property

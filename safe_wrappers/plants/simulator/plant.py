@@ -75,7 +75,8 @@ class SimulatorPlant(RolloutPlant):
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
         self.exact = self.same_noise and self.check_steps > 0
         self._simulation: Simulation | None = None
-        self._compares, self._sent, self._compared_substeps = self.exact, b"", False
+        self._compares, self._compared_substeps = self.exact, False
+        self._sent, self._answered = b"", False
         self._foreseen: dict[bytes, tuple[Any, float | None, Measure | None]] = {}
 
     def bind(self, env: Env) -> None:
@@ -111,6 +112,7 @@ class SimulatorPlant(RolloutPlant):
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:
         """Take what the env's reset or step has returned."""
+        self._answered = True
         self.view = View(self.simulation.env.unwrapped, observation, info)
 
     def executed(self, control: Array | None) -> None:
@@ -118,14 +120,16 @@ class SimulatorPlant(RolloutPlant):
         if control is None:
             self.simulation.start()
         else:
-            self._sent = control.tobytes()
+            self._sent, self._answered = control.tobytes(), False
 
     def deviation(self) -> str:
         """Where the env's step was not the rollout of what was executed: in the observation, or in what was measured.
 
         By more than rounding: an env may compute otherwise with a list. From the first one on it is not `exact`.
         """
-        observation, value, measure = self._foreseen.get(self._sent, (self.view.observation, None, None))
+        if not (self._answered and self._sent in self._foreseen):
+            return ""
+        observation, value, measure = self._foreseen[self._sent]
         found = differing("observation", observation, self.view.observation, _ROUNDING)
         if found is None and measure is not None:
             found = differing("h", value, measure(self.view), _ROUNDING)
