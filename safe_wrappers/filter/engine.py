@@ -67,6 +67,7 @@ class SafetyFilter:
         load_compiled()
         self._search = search(plant, self.bound, falling_back, solver, low, high, dtype)
         self._low, self._high = low, high
+        self._loaded = False
         self._narrower = not plant.bounds_are_action_space
         self._all_predict = all(c.predicts for c in self.bound)
 
@@ -78,6 +79,10 @@ class SafetyFilter:
         self.observe()
         for c in self.bound:
             c.check()
+        if not self._loaded and self.margin == self.margin:
+            for c in self.bound:
+                c.load(self._low, self._high)
+            self._loaded = True
 
     def take_over(self, before: "SafetyFilter") -> None:
         """Go on in the episode of another filter of the same plant and the same kinds of constraints.
