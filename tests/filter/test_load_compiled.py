@@ -24,11 +24,8 @@ env = sw.protect(gym.make(sys.argv[1]))
 env.reset(seed=0)
 before, changed = ready(), 0
 for k in range(300):
-    action = env.action_space.high if k % 20 < 10 else env.action_space.low
-    *_, terminated, truncated, info = env.step(action)
-    changed += int(info["cbf/intervened"])
-    if terminated or truncated:
-        env.reset()
+    swing = env.action_space.low if sys.argv[1] == "Swimmer-v5" and k % 20 < 10 else env.action_space.high
+    changed += env.step(swing)[-1]["cbf/intervened"]
 print(changed > 0, sorted(ready() - before))
 """
 
