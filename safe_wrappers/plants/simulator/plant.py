@@ -1,12 +1,15 @@
 """SimulatorPlant: the env's own simulation is the model."""
 
+import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, whole_number
+from safe_wrappers.checks import Array, positive, whole_number
+from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
 from safe_wrappers.plants.simulator.replay_check import check_replay
 from safe_wrappers.plants.simulator.simulation import (
@@ -38,6 +41,10 @@ class SimulatorPlant(RolloutPlant):
             count in seconds ask for it.
         same_noise: Whether rollouts draw the random numbers that the env will draw.
         check_steps: Random steps of the check at binding; 0 checks nothing.
+        check_s: How long this check may take, s, before it ends with fewer steps, and a warning.
+
+    Attributes:
+        checked_steps: How many steps the check has compared.
 
     Raises:
         UnsupportedEnvError: The env cannot be copied, or its simulation differs from it; the message says where.
@@ -57,10 +64,12 @@ class SimulatorPlant(RolloutPlant):
         control_dt: float | None = None,
         same_noise: bool = True,
         check_steps: int = 1000,
+        check_s: float = 2.0,
     ) -> None:
         self._snapshot, self.same_noise = snapshot, bool(same_noise)
         super().__init__(control_dt)
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
+        self.check_s, self.checked_steps = positive("check_s", check_s, "s"), 0
         self.exact = self.same_noise and self.check_steps > 0
         self._simulation: Simulation | None = None
 
@@ -71,7 +80,15 @@ class SimulatorPlant(RolloutPlant):
         self._simulation = simulation_of(env, self._snapshot)
         self.view = View(env.unwrapped, np.zeros(0), {})
         if self.check_steps:
-            check_replay(self._simulation, self.check_steps)
+            self.checked_steps = check_replay(self._simulation, self.check_steps, self.check_s)
+            if self.checked_steps < self.check_steps:
+                needed_s = math.ceil(1.2 * self.check_s * self.check_steps / self.checked_steps)
+                warnings.warn(
+                    f"the simulation of {name_of(env)} was compared with the env on {self.checked_steps:,} random "
+                    f"steps, which took {self.check_s:g} s, instead of {self.check_steps:,}; for all of them pass "
+                    f"plant=SimulatorPlant(check_s={needed_s})",
+                    stacklevel=2,
+                )
 
     @property
     def simulation(self) -> Simulation:

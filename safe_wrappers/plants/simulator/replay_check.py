@@ -1,6 +1,7 @@
 """The contract of a simulation: from every state it goes on as the env does, bit for bit."""
 
 import copy
+import time
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,13 @@ from safe_wrappers.plants.simulator.simulation import Env, Simulation
 _LONGEST = 10  # steps that are simulated ahead before the env makes them
 
 
-def check_replay(simulation: Simulation, steps: int, seed: int = 0) -> None:
+def check_replay(simulation: Simulation, steps: int, limit_s: float, seed: int = 0) -> int:
     """Make random steps, each stretch of 1 to 10 in the simulation first and then in the env.
 
     The env is left reset; its random generator as it was. Where a simulation copies the env, a copy is stepped.
+
+    Returns:
+        How many steps were compared: all, or those of the stretches that began in the time.
 
     Raises:
         UnsupportedEnvError: The first difference of an observation, a reward or an end.
@@ -28,8 +32,8 @@ def check_replay(simulation: Simulation, steps: int, seed: int = 0) -> None:
     lengths = np.random.default_rng(seed)
     env.reset(seed=seed)
     checked.start()
-    made = 0
-    while made < steps:
+    made, end = 0, time.monotonic() + limit_s
+    while made < steps and (not made or time.monotonic() < end):
         actions = [space.sample() for _ in range(int(lengths.integers(1, _LONGEST + 1)))]
         ahead = checked.run(lambda other, actions=actions: stretch(other, actions))  # type: ignore[misc]
         behind = stretch(env, actions)
@@ -47,6 +51,7 @@ def check_replay(simulation: Simulation, steps: int, seed: int = 0) -> None:
             checked.start()
     env.reset(seed=seed)
     raw._np_random = generator
+    return made
 
 
 Answer = tuple[Any, float, bool, bool]

@@ -1,6 +1,7 @@
 """The simulation of an env: equal to the env bit for bit, without a trace in it, or refused."""
 
 import os
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -330,3 +331,23 @@ def test_the_check_costs_about_as_many_steps_as_it_makes():
 
     bound(Counted(), check_steps=200)
     assert 400 <= Counted.made <= 440
+
+
+class SlowCart(Cart):
+    """A cart whose step takes 20 ms."""
+
+    def step(self, action):
+        time.sleep(0.02)
+        return super().step(action)
+
+
+def test_the_check_ends_in_time_and_says_on_how_many_steps_it_was_made():
+    begun = time.monotonic()
+    with pytest.warns(UserWarning, match=r"SlowCart.* on \d+ random steps.* instead of 1,000"):
+        plant = bound(SlowCart(), check_s=0.4)
+    assert time.monotonic() - begun < 4.0  # all of them take 40 s
+    assert 0 < plant.checked_steps <= 30
+    quick = bound(Cart(), check_steps=20, check_s=60.0)
+    assert quick.checked_steps >= 20
+    with pytest.raises(ConfigurationError, match="check_s"):
+        sw.SimulatorPlant(check_s=0.0)
