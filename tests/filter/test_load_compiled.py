@@ -45,7 +45,9 @@ hypot(3.0, 4.0), hypot(3, 4)
 
 def run(script, *arguments, **environment):
     command = [sys.executable, "-c", script, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, **environment})
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**os.environ, **environment}
+    )
     return done.stdout.strip(), done.stderr.strip()
 
 

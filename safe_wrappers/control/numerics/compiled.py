@@ -31,7 +31,9 @@ def _compiler() -> Callable[..., Any] | None:
 
 _SILENT_S = 2.0
 """How long a process compiles without a word."""
-_COMPILING = "safe-wrappers: compiling for this machine, once (10 to 40 s); later starts load what is compiled"
+_COMPILING = (
+    "safe-wrappers: compiling for this machine, once (10 to 40 s); later starts load what is compiled"
+)
 
 
 def _announce_waits() -> None:
