@@ -56,6 +56,15 @@ def test_no_step_compiles(env_id):
     assert run(EPISODE, env_id)[0] == "True []"
 
 
+def test_no_later_step_of_a_vector_env_compiles():
+    script = EPISODE.replace(
+        "gym.make(sys.argv[1])", "gym.make_vec(sys.argv[1], 2, vectorization_mode='sync')"
+    )
+    script = script.replace("env.reset(seed=0)", "env.reset(seed=0), env.step(0.0 * env.action_space.high)")
+    script = script.replace('["cbf/intervened"]', '["cbf/intervened"].sum()')
+    assert run(script, "SafePointGoal1-v0")[0] == "True []"
+
+
 @pytest.mark.parametrize(("step", "lines"), [(0, 0), (3, 1)])
 def test_a_long_wait_for_the_compiler_is_told_once(step, lines, tmp_path):
     told = run(HYPOT.format(step=step), NUMBA_CACHE_DIR=str(tmp_path))[1].splitlines()
