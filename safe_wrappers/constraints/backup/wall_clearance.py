@@ -91,6 +91,7 @@ class BoundWallClearance(BoundBackupClearance):
         control = np.zeros(self.plant.model.nu)
         self.admits(control)
         self.decide(control, low, high)
+        self.candidates(control)
 
     def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
         """The proposal or the closest candidate, without a solver."""
