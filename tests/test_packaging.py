@@ -176,7 +176,9 @@ def test_the_blocks_of_the_package_page_run(wheel, python, tmp_path):
     blocks = re.findall(r"^```python\n(.*?)^```", metadata_of(wheel).get_payload(), re.DOTALL | re.MULTILINE)
     assert len(blocks) >= 3
     steps = "env.reset(seed=0)\nfor _ in range(3):\n    info = env.step(env.action_space.sample())[4]\n"
-    done = run(python, "".join(f"{block}\n{steps}print('cbf/margin' in info)\n" for block in blocks), tmp_path)
+    done = run(
+        python, "".join(f"{block}\n{steps}print('cbf/margin' in info)\n" for block in blocks), tmp_path
+    )
     assert done.stdout.split() == ["True"] * len(blocks), done.stderr
 
 
