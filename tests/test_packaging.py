@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -15,6 +16,8 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+HOME = PROJECT["urls"]["Repository"]
 SITE = sysconfig.get_paths()["purelib"]
 
 BLOCK = '''
@@ -35,14 +38,12 @@ sys.meta_path.insert(0, Absent())
 def wheel(tmp_path_factory):
     """The wheel, built from a copy so that nothing is left in the checkout."""
     source = tmp_path_factory.mktemp("source")
-    for name in ("safe_wrappers", "envs", "train", "pyproject.toml", "LICENSE", "README.md"):
+    for name in ("safe_wrappers", "envs", "train", "pyproject.toml", "setup.py", "LICENSE", "README.md"):
         origin = ROOT / name
         if origin.is_dir():
             shutil.copytree(origin, source / name, ignore=shutil.ignore_patterns("__pycache__"))
         elif origin.exists():
             shutil.copy(origin, source / name)
-    if not (source / "README.md").exists():
-        (source / "README.md").write_text("# safe-wrappers\n")  # before the first release there is none
     target = tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
     command += ["--disable-pip-version-check", "--no-index", "--wheel-dir", str(target), str(source)]
@@ -72,6 +73,7 @@ def python(wheel, tmp_path_factory):
 
 def run(python, code, folder):
     environ = {"PATH": os.environ.get("PATH", ""), "MUJOCO_GL": "disabled", "OMP_NUM_THREADS": "1"}
+    environ["SAFE_WRAPPERS_COMPILED"] = "0"  # the same bits, without compiling for this copy
     return subprocess.run(
         [str(python), "-c", code], cwd=folder, env=environ, capture_output=True, text=True, check=False
     )
@@ -99,10 +101,14 @@ def test_the_wheel_has_every_module_and_asset_of_the_repository(wheel):
     assert sum(n.startswith("safe_wrappers/envs/assets/") and n.endswith(".xml") for n in names) >= 5
 
 
-def test_metadata(wheel):
+def metadata_of(wheel):
     archive = zipfile.ZipFile(wheel)
     (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
-    metadata = email.message_from_string(archive.read(name).decode())
+    return email.message_from_string(archive.read(name).decode())
+
+
+def test_metadata(wheel):
+    archive, metadata = zipfile.ZipFile(wheel), metadata_of(wheel)
     assert metadata["Name"] == "safe-wrappers"
     assert metadata["Requires-Python"] == ">=3.11"
     assert metadata["License-Expression"] == "MIT"
@@ -164,6 +170,40 @@ print("ok")
 """
     done = run(python, code, tmp_path)
     assert done.stdout.strip() == "ok", done.stderr
+
+
+def test_the_blocks_of_the_package_page_run(wheel, python, tmp_path):
+    blocks = re.findall(r"^```python\n(.*?)^```", metadata_of(wheel).get_payload(), re.DOTALL | re.MULTILINE)
+    assert len(blocks) >= 3
+    steps = "env.reset(seed=0)\nfor _ in range(3):\n    info = env.step(env.action_space.sample())[4]\n"
+    done = run(
+        python, "".join(f"{block}\n{steps}print('cbf/margin' in info)\n" for block in blocks), tmp_path
+    )
+    assert done.stdout.split() == ["True"] * len(blocks), done.stderr
+
+
+def test_links_of_the_package_page_lead_to_files_of_the_repository(wheel):
+    links = re.findall(r"\]\(([^)#]+)", metadata_of(wheel).get_payload())
+    ours = [link.removeprefix(f"{HOME}/") for link in links if link.startswith(HOME)]
+    assert len(ours) > 20
+    for link in links:
+        assert link.startswith("https://"), link
+    for kind, branch, path in (link.split("/", 2) for link in ours):
+        assert (ROOT / path).exists() and branch == "main", path
+        assert kind == ("raw" if path.endswith(".webp") else "blob"), path
+
+
+def test_addresses_and_versions_agree():
+    yaml = pytest.importorskip("yaml")  # of the training scripts
+    assert all(url.startswith(HOME) for url in PROJECT["urls"].values())
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (cited["repository-code"], cited["version"]) == (HOME, PROJECT["version"])
+    assert f"## {PROJECT['version']}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    checks = yaml.safe_load((ROOT / ".github/workflows/checks.yml").read_text(encoding="utf-8"))
+    pythons = checks["jobs"]["library"]["strategy"]["matrix"]["python"]
+    assert [f"Programming Language :: Python :: {one}" for one in pythons] == [
+        one for one in PROJECT["classifiers"] if " :: 3." in one
+    ]
 
 
 def test_what_needs_stable_baselines_says_so(python, tmp_path):

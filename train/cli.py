@@ -7,6 +7,7 @@ and not before the config file could be read.
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from collections.abc import Sequence
@@ -138,12 +139,19 @@ def _init(options: argparse.Namespace, console: Console) -> None:
     init_command(next(iter(options.configs), None), options.overrides, console)
 
 
+def _schema(options: argparse.Namespace, console: Console) -> None:
+    from .config.schema import config_schema
+
+    print(json.dumps(config_schema(), indent=1))
+
+
 _WITHOUT_EXPERIMENT: Final = {
     "diagnose": _diagnose,
     "enjoy": _enjoy,
     "push": _push,
     "list": _list,
     "init": _init,
+    "schema": _schema,
 }
 
 

@@ -19,6 +19,7 @@ COMMANDS: Final = {
     "diagnose": "run an env, and a policy: what is wrong, and which wrapper treats it; takes ENV for CONFIG.yaml",
     "list": "print the names of envs, recipes, wrappers, algorithms and configs, or of those kinds that are named",
     "init": "write a commented config to begin with; takes env=ID and algorithm=NAME",
+    "schema": "print the JSON schema of configs, from which editors complete keys",
 }
 DIAGNOSED_STEPS: Final = 2000
 ENJOYED_EPISODES: Final = 3
@@ -70,6 +71,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         options.configs = []
     elif command == "list":
         options.configs = []
+    elif command == "schema":
+        if options.words:
+            parser.error(f"schema takes nothing, got {' '.join(options.words)}")
     elif command == "init":
         if len(options.configs) > 1:
             parser.error("init takes one CONFIG.yaml, which it writes")

@@ -97,7 +97,8 @@ def _configs() -> Rows:
         except ConfigurationError:
             continue
         if "arms" in settings:
-            first = path.read_text(encoding="utf-8").lstrip().partition("\n")[0]
+            lines = path.read_text(encoding="utf-8").strip().splitlines()
+            first = next(line for line in lines if not line.startswith("# yaml-language-server:"))
             rows[str(path)] = first.lstrip("# ") if first.startswith("#") else ""
     return rows
 

@@ -59,6 +59,9 @@ class BoundSlacks(BoundConstraint):
         least = float(self.slacks(control).min(initial=np.inf))
         return least if least == least else -np.inf
 
+    def load(self, low: Array, high: Array) -> None:
+        self.slacks(np.clip(np.zeros(low.size), low, high))
+
     def linearize(self, control: Array) -> HalfSpaces:
         return linearize(self.slacks, control, self.plant.lower, self.plant.upper)
 

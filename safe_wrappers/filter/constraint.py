@@ -130,6 +130,9 @@ class BoundConstraint:
     def check(self) -> None:
         """Refuse at a reset what only a state can show."""
 
+    def load(self, low: Array, high: Array) -> None:
+        """Run once, in the first observed state, the compiled code that a step may need; the box is the filter's."""
+
     def value(self) -> Array:
         """The barriers h, shape (k,), positive inside; the margin is not taken off. k may be 0: nothing is near."""
         return np.zeros(0)

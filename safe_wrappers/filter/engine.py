@@ -59,6 +59,7 @@ class SafetyFilter:
         self._making = fallback, solver, low, high, dtype, search
         self._low, self._high = low, high
         self._narrower = not plant.bounds_are_action_space
+        self._loaded = False
         load_compiled()
         self._bind()
 
@@ -85,6 +86,10 @@ class SafetyFilter:
         self.observe()
         for c in self.bound:
             c.check()
+        if not self._loaded and self.margin == self.margin:
+            for c in self.bound:
+                c.load(self._low, self._high)
+            self._loaded = True
 
     def take_over(self, before: "SafetyFilter") -> None:
         """Go on in the episode of another filter of the same plant and the same kinds of constraints.

@@ -49,7 +49,7 @@ def site(tmp_path_factory):
         env={**os.environ, "MUJOCO_GL": "disabled"},
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    assert all("compiling for this machine" in line for line in done.stderr.splitlines()), done.stderr
     return folder
 
 

@@ -1,5 +1,6 @@
-"""The projection is compiled, or loaded, where a filter is made: no control step waits for it."""
+"""Compiling: where a filter is made and at its first reset, so that no step waits for it; and not in silence."""
 
+import os
 import subprocess
 import sys
 
@@ -7,23 +8,65 @@ import pytest
 
 from safe_wrappers.control.numerics.compiled import IS_COMPILED
 
-SCRIPT = """
+pytestmark = pytest.mark.skipif(not IS_COMPILED, reason="nothing is compiled in this process")
+
+EPISODE = """
+import sys
 import gymnasium as gym
 import safe_wrappers as sw
-from safe_wrappers.filter.rows_and_box import keep_rows, row_slacks
 
 def ready():
-    return len(keep_rows.signatures), len(row_slacks.signatures)
+    modules = [vars(module) for name, module in list(sys.modules.items()) if name.startswith("safe_wrappers.")]
+    compiled = [thing for module in modules for thing in module.values() if hasattr(thing, "py_func")]
+    return {(one.py_func.__qualname__, str(signature)) for one in compiled for signature in one.signatures}
 
-env = sw.protect(gym.make("Reacher-v5"))
-before = ready()
+env = sw.protect(gym.make(sys.argv[1]))
 env.reset(seed=0)
-changed = sum(env.step(env.action_space.high)[4]["cbf/intervened"] for _ in range(10))
-print(before, ready(), changed > 0)
+before, changed = ready(), 0
+for k in range(300):
+    swing = env.action_space.low if sys.argv[1] == "Swimmer-v5" and k % 20 < 10 else env.action_space.high
+    changed += env.step(swing)[-1]["cbf/intervened"]
+print(changed > 0, sorted(ready() - before))
+"""
+
+HYPOT = """
+import itertools, time
+from safe_wrappers.control.numerics.compiled import compiled, hypot
+
+@compiled
+def of_a_user(x):
+    return x + 1.0
+
+time.monotonic = itertools.count(step={step}).__next__  # a clock that this machine's speed does not change
+of_a_user(1.0)
+hypot(3.0, 4.0), hypot(3, 4)
 """
 
 
-@pytest.mark.skipif(not IS_COMPILED, reason="nothing is compiled in this process")
-def test_a_filter_has_its_projection_before_the_first_step():
-    ran = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
-    assert ran.stdout.split("\n")[0] == "(1, 1) (1, 1) True"
+def run(script, *arguments, **environment):
+    command = [sys.executable, "-c", script, *arguments]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**os.environ, **environment}
+    )
+    return done.stdout.strip(), done.stderr.strip()
+
+
+@pytest.mark.parametrize("env_id", ["Swimmer-v5", "Reacher-v5", "SafePointGoal1-v0"])
+def test_no_step_compiles(env_id):
+    assert run(EPISODE, env_id)[0] == "True []"
+
+
+def test_no_later_step_of_a_vector_env_compiles():
+    script = EPISODE.replace(
+        "gym.make(sys.argv[1])", "gym.make_vec(sys.argv[1], 2, vectorization_mode='sync')"
+    )
+    script = script.replace("env.reset(seed=0)", "env.reset(seed=0), env.step(0.0 * env.action_space.high)")
+    script = script.replace('["cbf/intervened"]', '["cbf/intervened"].sum()')
+    assert run(script, "SafePointGoal1-v0")[0] == "True []"
+
+
+@pytest.mark.parametrize(("step", "lines"), [(0, 0), (3, 1)])
+def test_a_long_wait_for_the_compiler_is_told_once(step, lines, tmp_path):
+    told = run(HYPOT.format(step=step), NUMBA_CACHE_DIR=str(tmp_path))[1].splitlines()
+    assert len(told) == lines
+    assert all("compiling for this machine" in line for line in told)

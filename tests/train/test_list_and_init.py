@@ -31,7 +31,8 @@ def listed(capsys, *kinds):
 def test_every_kind_is_listed_and_each_by_itself(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").mkdir()
-    (tmp_path / "configs" / "a.yaml").write_text("# What it is for.\nname: a\narms: {}\n")
+    text = "# yaml-language-server: $schema=schema.json\n# What it is for.\nname: a\narms: {}\n"
+    (tmp_path / "configs" / "a.yaml").write_text(text)
     (tmp_path / "other.yaml").write_text("jobs: []\n")
     (tmp_path / "broken.yaml").write_text("a: [")
     found = listed(capsys)

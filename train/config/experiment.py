@@ -16,7 +16,8 @@ from .types import validate
 
 _EXPERIMENT_KEYS: Final = tuple(field.name for field in fields(ExperimentConfig))
 _ARM_KEYS: Final = tuple(field.name for field in fields(ArmConfig) if field.name != "name")
-_COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key not in ("filter", "learner", "start_from"))
+COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key not in ("filter", "learner", "start_from"))
+"""What may be said for all arms at the top."""
 
 
 def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
@@ -33,11 +34,11 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
         ConfigurationError: A value of the wrong type or outside its range, or a missing one.
     """
     for key in settings:
-        check_name(key, (*_EXPERIMENT_KEYS, *_COMMON_KEYS), "config")
+        check_name(key, (*_EXPERIMENT_KEYS, *COMMON_KEYS), "config")
     for key in ("name", "env", "algorithm", "total_steps", "arms", "seeds"):
         if key not in settings:
             raise ConfigurationError(f"config: {key!r} is missing.")
-    common = {key: settings[key] for key in _COMMON_KEYS if key in settings}
+    common = {key: settings[key] for key in COMMON_KEYS if key in settings}
     arms = _mapping(settings["arms"], "arms")
     if not arms:
         raise ConfigurationError("arms: expected at least one, such as `unfiltered: {filter: none}`.")

@@ -145,6 +145,9 @@ class BoundCoastingClearance(BoundDetourClearance):
             self._seen, self._known = seen, {}
         return np.array([self._least])
 
+    def load(self, low: Array, high: Array) -> None:
+        _ = self.plant.acting_range
+
     def nearest(self, neighbours: int) -> Array:
         discs = np.concatenate([self._origin.discs, self._body.discs])
         (x, y), (ahead_x, ahead_y) = self._here, self._ahead
@@ -295,7 +298,9 @@ class _Group:
         """Along a course: least clearance, that at its end, and the most that one of them fell, m."""
         if not self.near:
             return math.inf, math.inf, 0.0
-        left = clearances_on_a_course(self._outline, *course[:2], self._close)
+        # Contiguous as at rest: for another layout the function is compiled once more.
+        places = np.ascontiguousarray(course.places)
+        left = clearances_on_a_course(self._outline, places, course.ahead, self._close)
         return float(left.min()), float(left[-1].min()), float((self.now - left.min(axis=0)).max())
 
     def nearest(self) -> Array:

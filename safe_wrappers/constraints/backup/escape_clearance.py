@@ -221,6 +221,9 @@ class BoundEscapeClearance(BoundBackupClearance):
             return left
         return left - self._needed() if left == left else -np.inf
 
+    def load(self, low: Array, high: Array) -> None:
+        self._slacks(self._firsts())
+
     def _needed(self) -> float:
         """What a way out must leave: 0, or the best that there is while new estimates use up only the margin."""
         if self._best is None:

@@ -38,6 +38,7 @@ class HeadingDriveBatch(ConstraintBatch):
         self._joints, self._motions = np.zeros((2, 3 * n)), np.zeros((n, 6))
         self._origins = np.zeros((n, 2))
         self._counts: list[int] = []
+        self._loaded = False
         self._read_constants()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -69,7 +70,8 @@ class HeadingDriveBatch(ConstraintBatch):
         among.admit_each(*scene, pairs, least, admitted)
         found, refused = pairs.copy(), np.flatnonzero(judged & ~admitted)
         sides = np.where(self._steps > 0, self._sides, 0.0)
-        if refused.size:
+        if refused.size or not self._loaded:  # the first step compiles what a later one would wait for
+            self._loaded = True
             bounds, detour = self._bounds(refused), self._bound[0].spec.detour
             among.decide_each(*scene, pairs, refused, sides, detour, bounds, self._single, found, stages)
         self._tried = np.where(judged & ~admitted, sides, 0.0)
@@ -83,13 +85,18 @@ class HeadingDriveBatch(ConstraintBatch):
 
     def _bounds(self, envs: NDArray[np.int64]) -> Array:
         """The action box, and the part of it where forces still change, as (drive, turn), shape (r, 4, 2)."""
-        bounds, dt = np.empty((len(envs), 4, 2)), self._bound[0].plant.control_dt
+        # Contiguous for any number of envs: else functions are compiled once for one env and again for several.
+        bounds, acting, dt = (
+            np.empty((len(envs), 4, 2)),
+            np.empty((len(envs), 2, 2)),
+            self._bound[0].plant.control_dt,
+        )
         bounds[:, :2] = self._box[envs]
         turn, on_hinge = self._bound[0].frame.turn_index, np.zeros((2, len(self._bound), 2))
         on_hinge[:, :, turn] = self._turn_gear * self._motions[:, 2::3].T
-        acting_ranges(self._actuators, on_hinge[0], on_hinge[1], dt, envs, bounds[:, 2:])
-        bounds[:, 2:] = np.clip(bounds[:, 2:], bounds[:, :1], bounds[:, 1:2])
-        return self._pairs(bounds)
+        acting_ranges(self._actuators, on_hinge[0], on_hinge[1], dt, envs, acting)
+        bounds[:, 2:] = np.clip(acting, bounds[:, :1], bounds[:, 1:2])
+        return np.ascontiguousarray(self._pairs(bounds))
 
     def _observe(self) -> None:
         """Take the present motion of every robot, and its discs."""

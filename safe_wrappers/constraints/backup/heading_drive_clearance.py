@@ -170,14 +170,21 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         """The whole search at once, without a solver."""
         if self.admits(proposal):
             return proposal, among.PROPOSAL, HalfSpaces.none(2)
-        plant, found = self.plant, np.empty(2)
-        bounds = among.bounds_of(low, high, plant.lower, plant.upper, *plant.acting_range, self.turns_first)
-        stage, side, normals, offsets = among.closest_admitted(
-            *self._scene, self._pair(proposal), self._kept_side(), self.spec.detour, bounds, found
-        )
+        found, stage, side, normals, offsets = self._closest(proposal, low, high)
         if side != 0.0:
             self._keep_side(side)
         # Comparisons with NaN are false: an overflow must not look admitted. The search looks at it again.
         if stage == among.UNRESOLVED or not np.isfinite(found).all():
             return None
         return self._pair(found), stage, self._half_spaces(normals, offsets)
+
+    def _closest(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, float, Array, Array]:
+        """What `closest_admitted` writes, and returns."""
+        plant, found = self.plant, np.empty(2)
+        bounds = among.bounds_of(low, high, plant.lower, plant.upper, *plant.acting_range, self.turns_first)
+        told = self._pair(proposal), self._kept_side(), self.spec.detour
+        return found, *among.closest_admitted(*self._scene, *told, bounds, found)
+
+    def load(self, low: Array, high: Array) -> None:
+        among.is_admitted(*self._scene, 0.0, 0.0)
+        self._closest(np.zeros(2), low, high)

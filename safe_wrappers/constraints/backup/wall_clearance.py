@@ -87,6 +87,12 @@ class BoundWallClearance(BoundBackupClearance):
     def admits(self, control: Array) -> bool:
         return point_scene.is_admitted(self._scene, self._motion, self._left, control)
 
+    def load(self, low: Array, high: Array) -> None:
+        control = np.zeros(self.plant.model.nu)
+        self.admits(control)
+        self.decide(control, low, high)
+        self.candidates(control)
+
     def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
         """The proposal or the closest candidate, without a solver."""
         control = proposal.copy()

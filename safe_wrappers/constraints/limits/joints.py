@@ -310,6 +310,11 @@ class BoundJointSpeedLimit(BoundRollout):
         )
         return HalfSpaces(*rows)
 
+    def load(self, low: Array, high: Array) -> None:
+        super().load(low, high)
+        if self.plant.has_acceleration:
+            self.rows()
+
 
 @compiled
 def _speed_rows(

@@ -296,5 +296,5 @@ class Recorder(Remade):
         """Forward kinematics of positions of shape (k, nq)."""
         k, bodies = len(qpos), self._model.nbody
         frames, centres, axes = np.empty((k, bodies, 3)), np.empty((k, bodies, 3)), np.empty((k, bodies, 9))
-        _kinematics(self._posed, self._still.xmat, qpos, frames, centres, axes)
+        _kinematics(self._posed, self._still.xmat, np.ascontiguousarray(qpos), frames, centres, axes)
         return Poses(frames, axes.reshape(k, bodies, 3, 3), centres)

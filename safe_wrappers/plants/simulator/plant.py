@@ -2,6 +2,8 @@
 
 import contextlib
 import copy
+import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -9,8 +11,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 
-from safe_wrappers.checks import Array, whole_number
-from safe_wrappers.plants.env_checks import reward_numbers
+from safe_wrappers.checks import Array, positive, whole_number
+from safe_wrappers.plants.env_checks import name_of, reward_numbers
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
 from safe_wrappers.plants.simulator.replay_check import check_replay, differing
 from safe_wrappers.plants.simulator.simulation import (
@@ -50,6 +52,10 @@ class SimulatorPlant(RolloutPlant):
             count in seconds ask for it.
         same_noise: Whether rollouts draw the random numbers that the env will draw.
         check_steps: Random steps of the check at binding; 0 checks nothing.
+        check_s: How long this check may take, s, before it ends with fewer steps, and a warning.
+
+    Attributes:
+        checked_steps: How many steps the check has compared.
 
     Raises:
         UnsupportedEnvError: The env cannot be copied, or its simulation differs from it; the message says where.
@@ -69,10 +75,12 @@ class SimulatorPlant(RolloutPlant):
         control_dt: float | None = None,
         same_noise: bool = True,
         check_steps: int = 1000,
+        check_s: float = 2.0,
     ) -> None:
         self._snapshot, self.same_noise = snapshot, bool(same_noise)
         super().__init__(control_dt)
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
+        self.check_s, self.checked_steps = positive("check_s", check_s, "s"), 0
         self.exact = self.same_noise and self.check_steps > 0
         self._simulation: Simulation | None = None
         self._compares, self._compared_substeps = self.exact, False
@@ -89,7 +97,16 @@ class SimulatorPlant(RolloutPlant):
         stepping = getattr(type(env.unwrapped), "_step_mujoco_simulation", None)
         self.judges_substeps = stepping is MujocoEnv._step_mujoco_simulation
         if self.check_steps:
-            check_replay(self._simulation, self.check_steps, self.same_noise)
+            steps = self.check_steps, self.check_s
+            self.checked_steps = check_replay(self._simulation, *steps, self.same_noise)
+            if self.checked_steps < self.check_steps:
+                needed_s = math.ceil(1.2 * self.check_s * self.check_steps / self.checked_steps)
+                warnings.warn(
+                    f"the simulation of {name_of(env)} was compared with the env on {self.checked_steps:,} random "
+                    f"steps, which took {self.check_s:g} s, instead of {self.check_steps:,}; for all of them pass "
+                    f"plant=SimulatorPlant(check_s={needed_s})",
+                    stacklevel=2,
+                )
 
     @property
     def simulation(self) -> Simulation:

@@ -1,6 +1,7 @@
 """The contract of a simulation: from every state it goes on as the env does, bit for bit."""
 
 import copy
+import time
 import warnings
 from typing import Any
 
@@ -13,11 +14,16 @@ from safe_wrappers.plants.simulator.simulation import Env, Simulation, other_noi
 _LONGEST = 10  # steps that are simulated ahead before the env makes them
 
 
-def check_replay(simulation: Simulation, steps: int, same_noise: bool = True, seed: int = 0) -> None:
+def check_replay(
+    simulation: Simulation, steps: int, limit_s: float, same_noise: bool = True, seed: int = 0
+) -> int:
     """Make random steps, each stretch of 1 to 10 in the simulation first and then in the env.
 
     The env is left reset; its random generator as it was. Where a simulation copies the env, a copy is stepped. With
     `same_noise=False` it is said if other random numbers change nothing.
+
+    Returns:
+        How many steps were compared: all, or those of the stretches that began in the time.
 
     Raises:
         UnsupportedEnvError: The first difference of an observation, a reward or an end.
@@ -30,8 +36,8 @@ def check_replay(simulation: Simulation, steps: int, same_noise: bool = True, se
     lengths = np.random.default_rng(seed)
     env.reset(seed=seed)
     checked.start()
-    made, changed = 0, same_noise
-    while made < steps:
+    made, end, changed = 0, time.monotonic() + limit_s, same_noise
+    while made < steps and (not made or time.monotonic() < end):
         actions = [space.sample() for _ in range(int(lengths.integers(1, _LONGEST + 1)))]
         ahead = checked.run(lambda other, actions=actions: stretch(other, actions))  # type: ignore[misc]
         if not changed:
@@ -60,6 +66,7 @@ def check_replay(simulation: Simulation, steps: int, same_noise: bool = True, se
             "keep them",
             stacklevel=2,
         )
+    return made
 
 
 def _with_other_noise(env: Env, actions: list[Any]) -> "list[Answer]":

@@ -3,6 +3,7 @@
 import copy
 import os
 import random
+import time
 import warnings
 
 import gymnasium as gym
@@ -497,3 +498,23 @@ def test_an_action_in_a_finer_dtype_is_simulated_as_it_is_executed(env_id, form)
         action = rng.uniform(env.action_space.low, env.action_space.high)
         info = env.step(action.tolist() if form is list else action.astype(form))[4]
         assert not info["cbf/mismatch"]
+
+
+class SlowCart(Cart):
+    """A cart whose step takes 20 ms."""
+
+    def step(self, action):
+        time.sleep(0.02)
+        return super().step(action)
+
+
+def test_the_check_ends_in_time_and_says_on_how_many_steps_it_was_made():
+    begun = time.monotonic()
+    with pytest.warns(UserWarning, match=r"SlowCart.* on \d+ random steps.* instead of 1,000"):
+        plant = bound(SlowCart(), check_s=0.4)
+    assert time.monotonic() - begun < 4.0  # all of them take 40 s
+    assert 0 < plant.checked_steps <= 30
+    quick = bound(Cart(), check_steps=20, check_s=60.0)
+    assert quick.checked_steps >= 20
+    with pytest.raises(ConfigurationError, match="check_s"):
+        sw.SimulatorPlant(check_s=0.0)
