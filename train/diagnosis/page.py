@@ -30,7 +30,8 @@ def diagnosis_page(diagnosis: Diagnosis, command: str, files: PlotFiles) -> str:
     found = [section(finding.title, *_parts(finding, files)) for finding in there]
     rest = [finding for finding in diagnosis.findings if not finding.present]
     rows = "".join(f"<tr><td>{text(one.title)}</td><td>{text(_why_not(one))}</td></tr>" for one in rest)
-    others = section("Not found, or not measured", f"<table><tbody>{rows}</tbody></table>") if rest else ""
+    table = f'<table class="words"><tbody>{rows}</tbody></table>'
+    others = section("Not found, or not measured", table) if rest else ""
     made = section("This page", f"<pre>{text(command)}</pre>")
     return document(f"Diagnosis of {diagnosis.env}", "\n".join([head, *found, others, made]))
 
