@@ -24,7 +24,7 @@ _TEMPLATE: Final = """\
 name: {name}  # the folder below `output`
 env: {env}  # an id of gymnasium.make; {{id: ..., kwargs: {{...}}}} with arguments of the env
 algorithm: {algorithm}
-total_steps: 100_000  # of all envs together
+total_steps: 100_000  # of all envs together, rounded up to whole rollouts
 n_envs: 4
 #vec_env: subproc  # each env in a process of its own
 #action_repeat: 4  # control steps for which the policy holds an action; the filter checks each
