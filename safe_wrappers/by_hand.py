@@ -39,8 +39,8 @@ class Remedy(NamedTuple):
     says: str
     code: str
     """Makes the filtered env out of `env`, with this library as `sw`."""
-    open: tuple[str, ...] = ()
-    """Names in the code that the user has to give a value."""
+    is_open: bool = False
+    """Whether the user has to give h, horizon and backup."""
 
 
 def remedy_for(env: Any, single: Env) -> Remedy:
@@ -89,7 +89,7 @@ def _simulating(kind: str, plant: str) -> Remedy:
         "It can be simulated. Say by h(observation) what must stay positive, by backup(observation) which action "
         "keeps it so, and by horizon how many steps to look ahead; then these lines protect it",
         _lines("shield", "sw.constraints.PredictiveShield(h, horizon, backup)", kind, plant),
-        ("h", "horizon", "backup"),
+        is_open=True,
     )
 
 

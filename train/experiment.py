@@ -76,8 +76,7 @@ def check_training(experiment: ExperimentConfig) -> None:
     for arm in experiment.arms:
         env = make_training_env(arm)
         check_task(arm, env)
-        if arm.env.reset_options:
-            env.reset()  # the task alone knows its options
+        env.reset()  # the task alone knows its options, and a filter of one's own is asked here first
         check_margins(arm, env)
         check_trackers(arm)
         env.close()

@@ -99,7 +99,8 @@ class EnvConfig(Section):
 
     id: Annotated[str, AfterValidator(check_env_id)]
     """As for `gymnasium.make`; ids of gymnasium-robotics too, if it is installed (`pip install
-    'safe-wrappers[robotics]'`). `module:Id-v0` imports the module first."""
+    'safe-wrappers[robotics]'`). `module:Id-v0` imports the module first, which has to
+    register the id."""
     kwargs: Options = Field(default_factory=dict)
     """Passed to `gymnasium.make`."""
     faults: Annotated[dict[str, Options], AfterValidator(check_faults)] = Field(default_factory=dict)
