@@ -129,6 +129,16 @@ class Drifting(gym.Env):
         return self.at.copy(), 0.0, False, False, {"cost": float(abs(self.at[0]) > 1.0)}
 
 
+def test_constraints_that_never_acted_with_any_driver_are_named():
+    limits = [sw.constraints.JointSpeedLimit(4.0), sw.constraints.JointPositionLimit(-6.0, 6.0, ["joint0"])]
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
+    still = diagnose(env, lambda seen: np.zeros(2), steps=60, symptoms=["limits"])
+    assert still.idle_constraints == ["JointPositionLimit"], "others than the policy made the first act"
+    assert "Never acted, with any driver: JointPositionLimit." in str(still)
+    assert still.as_dict()["idle_constraints"] == ["JointPositionLimit"]
+    assert diagnose(gym.make("Reacher-v5"), steps=20, symptoms=["limits"]).idle_constraints == []
+
+
 def test_an_env_of_ones_own_is_simulated_while_it_is_diagnosed_and_nothing_leaks():
     env = Drifting()
     with warnings.catch_warnings(action="error"):

@@ -26,6 +26,7 @@ def diagnosis_page(diagnosis: Diagnosis, command: str, files: PlotFiles) -> str:
     head = (
         f"<header><h1>{text(diagnosis.env)}</h1><p>{diagnosis.steps:,} control steps each of the drivers: "
         f'{text(drivers)}.</p></header><p class="verdict">{text(verdict)}</p>'
+        + (f"<p>{text(diagnosis.idle_words)}</p>" if diagnosis.idle_words else "")
     )
     found = [section(finding.title, *_parts(finding, files)) for finding in there]
     rest = [finding for finding in diagnosis.findings if not finding.present]
