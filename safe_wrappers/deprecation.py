@@ -65,7 +65,8 @@ def deprecated_parameters(
                 f"{kind.__name__}: {', '.join(old)} {'is' if len(old) == 1 else 'are'} deprecated; write "
             )
             message += f"{kind.__name__}(..., {', '.join(written)})"
-            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            around = untyped.__init__ is not accepting  # a function that tells of missing arguments
+            warnings.warn(message, DeprecationWarning, stacklevel=2 + around)
             init(*bound.args, **bound.kwargs)
 
         untyped.__init__ = accepting

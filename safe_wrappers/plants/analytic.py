@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
+from safe_wrappers.arguments import tells_arguments
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -17,6 +18,7 @@ from safe_wrappers.plants.plant import Plant
 
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
+@tells_arguments
 class AnalyticPlant(Plant):
     """`x' = f(x) + g(x) u` from plain functions.
 
