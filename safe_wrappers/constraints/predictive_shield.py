@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -44,7 +44,8 @@ class PredictiveShield(Constraint):
         horizon: Steps that are simulated, the proposed action among them.
         backup: "zero" (not with discrete actions), "hold" (the action goes on), an action, a function of what it
             `sees` that returns one, anything with `predict(observation, deterministic=True)` such as an SB3 model; or
-            a list of these: any that survives admits.
+            a list of these: any that survives admits. A list of numbers is one action, if there are as many as the
+            action has, or if they are not all whole.
         terminal: A function of what it `sees`: whether the state lies in a set that the backups never leave, with
             h >= margin. None: there is none.
         sees: Whether `h`, `terminal` and `backup` take the "observation", as the env inside the filter returns it,
@@ -84,13 +85,20 @@ class PredictiveShield(Constraint):
         if self.max_decrease is not None:
             self.max_decrease = positive("max_decrease", self.max_decrease, "the unit of h")
         self.promise = "best effort" if self.terminal is None else "proved"
-        backups = self.backup if isinstance(self.backup, list | tuple) else [self.backup]
+        several = isinstance(self.backup, list | tuple) and not _is_action(self.backup)
+        backups = self.backup if several else [self.backup]
         if not backups:
             raise ConfigurationError("backup is a backup, or a list with at least one")
         self.backup = [_checked(one) for one in backups]
 
     def bind(self, plant: Plant) -> "BoundPredictiveShield":
         return BoundPredictiveShield(self, plant)
+
+
+def _is_action(backup: Sequence[Any]) -> bool:
+    """Whether a list is one action, of numbers that are not all whole. Whole ones may be discrete actions, too."""
+    numbers = all(isinstance(one, int | float | np.number) for one in backup)
+    return numbers and any(isinstance(one, float | np.floating) for one in backup)
 
 
 def _checked(backup: Any) -> Any:
@@ -158,7 +166,10 @@ class BoundPredictiveShield(BoundConstraint):
             raise ConfigurationError(
                 "a discrete action has no zero: give as backup the action that is safe, or hold, or a function"
             )
-        self._backups = [self._prepared(one) for one in spec.backup]
+        given = spec.backup
+        if len(given) == self.plant.lower.size and all(isinstance(one, int) for one in given):
+            given = [given]  # an action that is written in whole numbers
+        self._backups = [self._prepared(one) for one in given]
         self._needed = spec.margin + self.plant.margins(self._measure, spec.horizon)
         self._points = np.random.default_rng(0).random((spec.candidates, self.plant.lower.size))
 

@@ -115,6 +115,7 @@ class BoundTraction(BoundConstraint):
                 f"({self.plant.delay_s} s) predicts instead; use delay_s=0"
             )
         self.wheels = DrivenWheels(self.plant, self.spec.wheels)
+        self.wheels.refuse_stiff_servos(self.plant)
         self.constants = self.wheels.constants(self.plant)
         options, feedback = self.plant.model.opt, self.wheels.feedback
         hold = float(options.timestep), self.plant.substeps

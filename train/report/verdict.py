@@ -24,7 +24,7 @@ def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
         *((_safety(found.off, found.on), judge) if found.judged else (judge, _own_measure(found.on))),
         _collisions(found.off, found.on),
         *_price(found),
-        _work(found.on),
+        _work(found.on, found.evaluated),
     )
     return [part for part in parts if part]
 
@@ -138,16 +138,27 @@ def _brackets(outcomes: Sequence[Outcome]) -> str:
     return f"In brackets bootstrap 95 % intervals over seeds{rest}."
 
 
-def _work(on: Side) -> str:
-    if not on.infeasible and not on.fallback:
-        rest = "no step was infeasible and none ran the fallback"
+def _work(on: Side, evaluated: Side) -> str:
+    """What the filter did in evaluation, and then, where it was on in training and failed there, how often."""
+    if evaluated.infeasible or evaluated.fallback:
+        rest = _failed(evaluated.infeasible, evaluated.fallback)
     else:
-        rest = f"{on.infeasible:,} steps were infeasible and {on.fallback:,} ran the fallback"
-    if on.changed is None:
-        return f"{rest[:1].upper()}{rest[1:]}."
-    return (
-        f"The filter changed {percent(on.changed) if on.changed else 'none'} of the evaluation steps; {rest}."
-    )
+        rest = "no step was infeasible and none ran the fallback"
+    if evaluated.changed is None:
+        in_evaluation = f"In evaluation {rest}."
+    else:
+        changed = percent(evaluated.changed) if evaluated.changed else "none"
+        in_evaluation = f"The filter changed {changed} of the evaluation steps; {rest}."
+    infeasible, fallback = on.infeasible - evaluated.infeasible, on.fallback - evaluated.fallback
+    if not infeasible and not fallback:
+        return in_evaluation
+    steps = on.steps - evaluated.steps
+    return f"{in_evaluation} In training {_failed(infeasible, fallback)}, of {steps:,}."
+
+
+def _failed(infeasible: int, fallback: int) -> str:
+    were = "step was" if infeasible == 1 else "steps were"
+    return f"{infeasible:,} {were} infeasible and {fallback:,} ran the fallback"
 
 
 def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> list[str]:

@@ -46,7 +46,8 @@ class CoastingClearance(Constraint):
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.
         untouched: `Disc` and `Discs` for the outline.
-        outline: Points [x, y] in the body's frame, m; the outline is their convex hull.
+        outline: Points [x, y] in the body's frame, m; the outline is their convex hull. Needed for `untouched`; with
+            `keep_out` alone only `max_decrease_per_speed` counts its corners.
         body: Name of the machine's body, on a free joint.
         robot_model_attr: Name of an attribute of the env that holds a model of the machine alone, for the forecasts;
             None takes the plant's model.
@@ -82,6 +83,11 @@ class CoastingClearance(Constraint):
         if not (self.keep_out or self.untouched):
             raise ConfigurationError("give obstacles in keep_out (for the origin) or untouched (the outline)")
         self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
+        if self.outline and not self.untouched and self.max_decrease is None:
+            raise ConfigurationError(
+                "outline is kept out of untouched, and keep_out is for the body's origin alone: give the obstacles "
+                "that the outline must not meet in untouched, or leave outline out"
+            )
         if isinstance(self.horizon, bool) or self.horizon != int(self.horizon) or self.horizon < 2:
             wanted = "horizon is a whole number of control intervals >= 2"
             raise ConfigurationError(f"{wanted}, got {self.horizon!r}")
@@ -109,6 +115,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             wanted = "robot_model_attr names an attribute that holds an MjModel"
             raise ConfigurationError(f"{wanted}; {name!r} is {alone!r}")
+        self.plant.named("body", spec.body, "body")
         self.coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
         outline = np.reshape(spec.outline, (-1, 2))

@@ -70,7 +70,7 @@ class BoundUpright(BoundRollout):
 
     def __init__(self, spec: Upright, plant: Plant) -> None:
         super().__init__(spec, plant)
-        self._body = self.plant.named("body", self.spec.body)
+        self._body = self.plant.named("body", self.spec.body, "body")
 
     def now(self) -> Array:
         pose = self.plant.pose()

@@ -49,8 +49,7 @@ def check_replay(
             if found is not None:
                 raise UnsupportedEnvError(
                     f"the simulation of {name_of(env)} is not the env: at step {number} after its state was restored "
-                    f"(step {made + number} of the check) {found}. Say how to restore all of its state,"
-                    " SimulatorPlant(snapshot=(save, restore)), or simulate in child processes, snapshot='fork'"
+                    f"(step {made + number} of the check) {found}. {simulation.remedy}"
                 )
         made += len(behind)
         if behind[-1][2] or behind[-1][3]:

@@ -12,7 +12,7 @@ import random
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from types import FunctionType, ModuleType
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -37,6 +37,12 @@ class Simulation(ABC):
     Args:
         env: With the wrappers inside the filter.
     """
+
+    remedy: ClassVar[str] = (
+        "Say how to restore all of its state, SimulatorPlant(snapshot=(save, restore)), or simulate in child "
+        "processes, SimulatorPlant(snapshot='fork'), where the system has them"
+    )
+    """What to do where the simulation differs from the env."""
 
     def __init__(self, env: Env) -> None:
         self.env = env
@@ -96,6 +102,11 @@ class RestoredSimulation(Simulation):
 
 class ForkedSimulation(Simulation):
     """In a child process, which has the env as it is; its cost grows with the memory of this process."""
+
+    remedy = (
+        "A child process has all of its memory: what differs lies outside of it (a clock, a file, a server), and the "
+        "env's step must not depend on that; or say how to restore it, SimulatorPlant(snapshot=(save, restore))"
+    )
 
     def __init__(self, env: Env) -> None:
         super().__init__(env)
