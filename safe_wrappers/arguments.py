@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
-from safe_wrappers.deprecation import deprecated_names
 from safe_wrappers.errors import CallError
 
 T = TypeVar("T")
@@ -20,9 +19,7 @@ def refuse_call(kind: type[Any], args: Sequence[Any], kwargs: Mapping[str, Any])
         CallError: The message has the argument's meaning, or the arguments that there are.
     """
     taken = inspect.signature(kind).parameters
-    if any(one.kind is one.VAR_KEYWORD for one in taken.values()) or set(kwargs) & set(
-        deprecated_names(kind)
-    ):
+    if any(one.kind is one.VAR_KEYWORD for one in taken.values()):
         return
     names = [name for name, one in taken.items() if one.kind is not one.VAR_POSITIONAL]
     for name in kwargs:
