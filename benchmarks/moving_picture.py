@@ -240,9 +240,9 @@ def caption(counts: dict[str, Any]) -> str:
     returned = {name: count["reward"] / count["episodes"] for name, count in counts.items()}
     hurt = f"in a hazard in {safe['violations']:,}" if safe["violations"] else "never in a hazard"
     return (
-        f"Two {free['algorithm']} agents on the same maps, each trained for {free['trained_for']:,} control steps: left"
-        f" without a filter, right through `sw.protect`. The first {SECONDS:.0f} s of the episodes with seeds 0, 1 and 2,"
-        " at double speed. An amber ring marks an action that the filter changed. Over whole episodes of seeds 0 to"
+        f"Two {free['algorithm']} agents on the same maps, each trained for {free['trained_for']:,} control steps:"
+        f" left without a filter, right through `sw.protect`. The first {SECONDS:.0f} s of the episodes with seeds 0, 1"
+        " and 2, at double speed. An amber ring marks an action that the filter changed. Over whole episodes of seeds 0 to"
         f" {free['episodes'] - 1} the left one returns {returned['unfiltered']:.1f} and is in a hazard in"
         f" {free['violations']:,} of {free['steps']:,} steps; the right one returns {returned['filtered']:.1f}"
         f" ({returned['filtered'] / returned['unfiltered']:.0%}) and is {hurt}; {safe['changed'] / safe['steps']:.0%}"

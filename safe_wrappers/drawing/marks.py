@@ -13,7 +13,7 @@ from safe_wrappers.checks import Array
 Role = Literal["keep out", "limit", "way", "estimate", "proposed", "executed"]
 Shape = Literal["sphere", "ellipsoid", "capsule", "box", "arrow"]
 
-_CORNERS: Final = 20
+_CORNERS: Final = 16
 THIN: Final = 0.012
 """m: half the width of a line."""
 FLOOR: Final = 0.02
@@ -72,8 +72,7 @@ def ball(role: Role, center: ArrayLike, radius: float) -> Mark:
 
 
 def ring(role: Role, center: ArrayLike, radius: float) -> list[Mark]:
-    """A circle on the floor, m, as a polygon of thin boxes: there may be many rings, and a round rod costs ten times
-    as much to draw."""
+    """A circle on the floor, m, as a polygon of thin boxes: of many rings, round rods would cost most of a frame."""
     angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1)
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     corners = [spatial(point) for point in spatial(center)[:2] + radius * around]

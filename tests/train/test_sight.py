@@ -53,7 +53,7 @@ def filmed(env_id, monkeypatch):
         env.render()
         return places[-1], camera.lookat.copy()
 
-    monkeypatch.setattr(renderer, "_get_viewer", lambda mode: SimpleNamespace(cam=camera))
+    monkeypatch.setattr(renderer, "_get_viewer", lambda mode: SimpleNamespace(cam=camera, scn=scene))
     monkeypatch.setattr(renderer, "render", render)
     return env, data, frame
 

@@ -12,6 +12,7 @@ from safe_wrappers.train.evaluation.episode_selection import shown_episode
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.evaluation.scene import load_scenes
 from safe_wrappers.train.processes.parallel import RunsFailedError
+from safe_wrappers.train.report.film_section import films
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.tables import read_rows
 from safe_wrappers.train.videos import film
@@ -162,6 +163,12 @@ def test_a_crash_while_filming_does_not_fail_the_evaluation(evaluated, inline, m
     assert said(experiment).startswith(
         "No videos: filming fake_task:FilmedGoal-v0 failed: video: its process"
     )
+
+
+def test_nothing_is_filmed_that_the_config_does_not_want(evaluated, inline):
+    experiment = evaluated("evaluation.films=false")
+    assert said(experiment) == "" and inline == []
+    assert "The config wants none (evaluation.films)" in films(experiment)
 
 
 def test_nothing_is_filmed_before_the_evaluation(fake_experiment, inline):

@@ -29,6 +29,8 @@ def films(experiment: ExperimentConfig) -> str:
             problem
             or "nothing has been filmed yet; safe-wrappers evaluate does, where the task can draw frames."
         )
+        if not experiment.evaluation.films:
+            why = "the config wants none (evaluation.films); safe-wrappers enjoy RUN --output FILM.webp makes one."
         return f'<p class="line"><b>No videos.</b> {text(why[:1].upper() + why[1:])}</p>'
     marks = keys(
         {

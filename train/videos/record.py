@@ -85,13 +85,13 @@ def video_problem(experiment: ExperimentConfig) -> str:
 
 
 def record_videos(experiment: ExperimentConfig, console: Console) -> None:
-    """Films the shown episode for every arm and condition that is not on film yet.
+    """Films the shown episodes for every arm and condition that are not on film yet, if the config wants films.
 
     Nothing here fails an evaluation: where no frame can be drawn, one line says why, on the console and later
     in the report.
     """
     shown = shown_episode(experiment)
-    if shown is None:
+    if shown is None or not experiment.evaluation.films:
         return
     problem = ""
     envs: list[EnvConfig] = []

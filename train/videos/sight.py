@@ -48,6 +48,7 @@ class InSight(gym.Wrapper[Any, Any, Any, Any]):
         if renderer is not None and renderer.camera_id in (None, -1):
             root = robot_root(renderer.model)
             viewer = renderer._get_viewer(str(self.render_mode))
+            # Half of what a frame costs without a graphics card.
             viewer.scn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
             camera = viewer.cam
             if self._home is None:

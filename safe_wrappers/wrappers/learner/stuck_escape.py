@@ -27,8 +27,9 @@ class StuckEscape(LayerWrapper):
     Stuck means: in the last `after_s` more than half of the policy's actions were changed by the filter or replaced
     by this wrapper, and the rewards of these steps add up to `progress` at most. A deterministic policy that pushes
     against the filter, or circles an obstacle, may do so for ever. For `escape_s` an action that was drawn at random
-    is proposed; or, with a `value`, of 64 that were drawn the best that the filter admits, chosen anew at every step. The filter inside checks it like any other,
-    so that its guarantees stay. A deadlock is ended by chance, not by a plan; it may take several draws.
+    is proposed; or, with a `value`, of 64 that were drawn the best that the filter admits, chosen anew at every step.
+    The filter inside checks it like any other, so that its guarantees stay. A deadlock is ended by chance, not by a
+    plan; it may take several draws.
 
     While it acts, the filter's keys are about what the filter was given, the drawn action: an escape is
     `cbf/escaping`, not `cbf/intervened`. `cbf/nonfinite` is also true for a policy's action that is not finite.
