@@ -40,7 +40,7 @@ COUNTED = range(100)
 
 PANEL, GAP, HEAD, FOOT, STRIP = 400, 12, 30, 54, 10
 """Pixels: a side's picture, what is between the two, the lines above and below it, the strip of time."""
-CAMERA = {"distance": 4.0, "elevation": -72.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.08, 0.0])}
+CAMERA = {"distance": 4.3, "elevation": -72.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.08, 0.0])}
 INK, PAPER, BARE = (29, 35, 43), (255, 255, 255), (205, 210, 216)
 CHANGED, CHANGED_TEXT, VIOLATED = (240, 165, 0), (184, 116, 0), (208, 32, 48)
 SIDES = {
@@ -241,9 +241,9 @@ def caption(counts: dict[str, Any]) -> str:
     hurt = f"in a hazard in {safe['violations']:,}" if safe["violations"] else "never in a hazard"
     return (
         f"Two {free['algorithm']} agents on the same maps, each trained for {free['trained_for']:,} control steps:"
-        f" left without a filter, right through `sw.protect`. The first {SECONDS:.0f} s of the episodes with seeds 0, 1"
-        " and 2, at double speed. An amber ring marks an action that the filter changed. Over whole episodes of seeds 0 to"
-        f" {free['episodes'] - 1} the left one returns {returned['unfiltered']:.1f} and is in a hazard in"
+        f" left without a filter, right through `sw.protect`. The first {SECONDS:.0f} s of the episodes with seeds"
+        " 0, 1 and 2, at double speed. An amber ring marks an action that the filter changed. Over whole episodes of"
+        f" seeds 0 to {free['episodes'] - 1} the left one returns {returned['unfiltered']:.1f} and is in a hazard in"
         f" {free['violations']:,} of {free['steps']:,} steps; the right one returns {returned['filtered']:.1f}"
         f" ({returned['filtered'] / returned['unfiltered']:.0%}) and is {hurt}; {safe['changed'] / safe['steps']:.0%}"
         " of its actions are changed"
