@@ -91,7 +91,7 @@ def check_training(experiment: ExperimentConfig) -> None:
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
-    """Evaluates every trained run on the same episode seeds, filter off and on, and films one episode.
+    """Evaluates every trained run on the same episode seeds, filter off and on, and films two of them.
 
     Args:
         experiment: Whose runs to evaluate.

@@ -107,7 +107,7 @@ def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filte
         "Trained through the filter, the policy returned per evaluation episode 9.4 [8.9, 9.9] with it taken off"
         " (6 of 200 steps in violation, 3 %) and 5.03 [4.53, 5.53] with it (no step in violation).",
         "With the filter on, the policy trained without it returned more (2 seeds say little)."
-        " In brackets the range over 2 seeds, which is not an interval.",
+        " In brackets the range over 2 seeds, which is not an interval. Trained for 512 control steps each.",
     ]
     page = cards(experiment, numbers)
     for title, value, what, hurt in (

@@ -50,7 +50,7 @@ article.card h3 { font-size: 17px; }
 article.card p { font-size: 16px; margin-top: 6px; }
 article.card .other { font-size: 14px; }
 .figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 14px; }
-.films { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 300px), 1fr)); gap: 14px; }
+.films { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); gap: 14px; }
 .figures, .films { margin-bottom: 14px; }
 /* Title, keys, drawing and sentence stand at the same height as the neighbour's. */
 figure {

@@ -75,7 +75,7 @@ def _price(found: Comparison) -> list[str]:
     if not found.outcomes:
         return []
     told = [_policy(found, arm) for arm in dict.fromkeys(outcome.arm.name for outcome in found.outcomes)]
-    return [*told, " ".join(filter(None, (_choice(found), _brackets(found.outcomes))))]
+    return [*told, " ".join(filter(None, (_choice(found), _brackets(found.outcomes), _training(found))))]
 
 
 def _policy(found: Comparison, name: str) -> str:
@@ -136,6 +136,15 @@ def _brackets(outcomes: Sequence[Outcome]) -> str:
         return f"In brackets the range over {max(counts)} seeds, which is not an interval."
     rest = "" if min(counts) >= SEEDS_FOR_AN_INTERVAL else ", of two seeds their range"
     return f"In brackets bootstrap 95 % intervals over seeds{rest}."
+
+
+def _training(found: Comparison) -> str:
+    """For how long the compared policies were trained."""
+    arms = {arm.name: arm for pair in found.pairs for arm in (pair.bare, pair.filtered)}
+    lengths = [f"{arm.total_steps * arm.action_repeat:,}" for arm in arms.values()]
+    if len(set(lengths)) == 1:
+        return f"Trained for {lengths[0]} control steps{' each' if len(lengths) > 1 else ''}."
+    return f"Trained for {' and '.join(lengths)} control steps."
 
 
 def _work(on: Side, evaluated: Side) -> str:

@@ -3,6 +3,8 @@
 import math
 from typing import Any, ClassVar
 
+import numpy as np
+
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.errors import ConfigurationError
@@ -106,8 +108,11 @@ class AdaptionPenalty(LayerWrapper):
         observation, reward, terminated, truncated, info = self.env.step(action)
         penalty = 0.0
         info[keys.ADAPTION_TASK_REWARD] = one_reward(reward, "AdaptionPenalty")
-        if info[keys.CBF_INTERVENED]:
-            penalty = self.of(float(info[keys.CBF_CORRECTION]))
+        changed, correction = info[keys.CBF_INTERVENED], info[keys.CBF_CORRECTION]
+        if info.get(keys.CBF_ESCAPING, False):  # StuckEscape gave the filter another action than this one
+            changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))
+        if changed:
+            penalty = self.of(float(correction))
             reward = float(reward) - penalty
         info[keys.ADAPTION_PENALTY] = penalty
         return observation, reward, terminated, truncated, info
