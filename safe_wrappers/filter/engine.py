@@ -78,6 +78,11 @@ class SafetyFilter:
         self._search = search(plant, self.bound, Fallback(fallback, self.bound), solver, low, high, dtype)
         self._all_predict = all(c.predicts for c in self.bound)
 
+    @property
+    def outdated(self) -> bool:
+        """Whether the plant's model has changed since the constraints were bound to it."""
+        return self.plant.model_version != self._model_version
+
     def start(self) -> None:
         """Forget the episode, take the state of the next one, and refuse what only a state can show."""
         self.plant.executed(None)
@@ -105,7 +110,7 @@ class SafetyFilter:
         """Take the env's present state, and `margin` from it."""
         plant = self.plant
         plant.observe()
-        if plant.model_version != self._model_version:  # what the constraints remember of the episode stays
+        if self.outdated:  # what the constraints remember of the episode stays
             self._bind()
             for c in self.bound:
                 c.start()

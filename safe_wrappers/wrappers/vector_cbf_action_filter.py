@@ -114,9 +114,8 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         """Read the models of these envs anew where they have changed."""
         for i in np.flatnonzero(envs).tolist():
             engine = self.filters[i].filter
-            version = engine.plant.model_version
             engine.plant.follow()
-            if engine.plant.model_version != version:
+            if engine.outdated:
                 engine.observe()
         self._follow_constraints()
 

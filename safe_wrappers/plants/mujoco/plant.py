@@ -83,6 +83,7 @@ class MujocoPlant(Snapshot):
         self._factors, self.loop = (1.0, 1.0), checked_loop(loop)
         self._raw: Any = None
         self._sent: Array | None = None
+        self._range: tuple[Array, Array] = self.lower, self.upper
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and its model."""
