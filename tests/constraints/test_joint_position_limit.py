@@ -261,4 +261,4 @@ def test_a_hinge_that_the_model_lets_turn_often_is_not_warned_of():
     env = gym.make("Reacher-v5")
     env.unwrapped.model.jnt_limited[0], env.unwrapped.model.jnt_range[0] = 1, (-30.0, 30.0)
     with warnings.catch_warnings(action="error"):
-        sw.CBFActionFilter(env, [sw.constraints.JointPositionLimit(-20.0, 20.0, ["joint0"])])
+        sw.CBFActionFilter(env, [sw.constraints.JointPositionLimit(-20.0, 30.1, ["joint0"])])

@@ -207,12 +207,12 @@ class BoundJointPositionLimit(BoundRollout):
             )
 
     def _warn_of_degrees(self, own: Array) -> None:
-        """Warn of a bound beyond a full turn, at a hinge whose own range, shape (n, 2), is not as wide."""
+        """Warn of a bound beyond a full turn and beyond twice the hinge's own range, shape (n, 2)."""
         model: mujoco.MjModel = self.plant.model
         for j, own_range, *bounds in zip(self._ids, own, self._low, self._high, strict=True):
             known = max((abs(end) for end in own_range if np.isfinite(end)), default=0.0)
             farthest = max((abs(bound) for bound in bounds if np.isfinite(bound)), default=0.0)
-            if model.jnt_type[j] == HINGE and farthest > max(known, 2.0 * np.pi):
+            if model.jnt_type[j] == HINGE and farthest > 2.0 * max(known, np.pi):
                 warnings.warn(
                     f"JointPositionLimit keeps the hinge {model.joint(j).name!r} between {bounds[0]:g} and "
                     f"{bounds[1]:g} rad, and a full turn is 6.28 rad. If these are degrees, give np.deg2rad of them",
