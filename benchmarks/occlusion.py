@@ -26,14 +26,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 import safe_wrappers as sw
 from benchmarks.crossing_drivers import DRIVERS
 from benchmarks.tables import RESULTS, markdown, total
 from benchmarks.tracked import CROSSING, crossing
-from safe_wrappers.appendix.estimation.consistency import chi_square_band, normalised_error_squared
-from safe_wrappers.appendix.estimation.covariance import double_integrator_covariance
-from safe_wrappers.appendix.estimation.sigma_coverage import chebyshev_tail, gaussian_tail
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -153,7 +151,8 @@ def scheduled_samples(found: Episode, run: int) -> dict[str, float]:
 
 
 def _nees(found: Episode, index: int, track: int) -> float:
-    return float(normalised_error_squared(found.error[index, track], found.covariance[index, track]))
+    error = found.error[index, track]
+    return float(error @ np.linalg.solve(found.covariance[index, track], error))
 
 
 def blind_for(found: Episode) -> Array:
@@ -200,10 +199,10 @@ def consistency_table(rows: list[dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|",
     ]
     names = list(dict.fromkeys(name for row in rows for name in row["nees"]))
-    upper = chi_square_band(2, 1, 0.9)[1]
+    upper = chi2.ppf(0.95, 2)
     for name in sorted(names, key=_phase_order):
         values = np.array([row["nees"][name] for row in rows if name in row["nees"]])
-        low, high = chi_square_band(2, len(values))
+        low, high = chi2.interval(0.95, 2 * len(values), scale=1.0 / len(values))
         inside = low <= values.mean() <= high
         lines.append(
             f"| {name} | {len(values):,} | {values.mean():.3f} | {low:.3f} to {high:.3f} "
@@ -226,8 +225,11 @@ def consistency_table(rows: list[dict[str, Any]]) -> str:
             cells.append(f"{share:.2%} ± {2.0 * spread:.2%}")
         million = 1e6 * total[3] / max(total[0], 1.0)
         lines.append(f"| {name} | {int(total[0]):,} | {' | '.join(cells)} | {million:,.0f} |")
-    for name, tail in (("promised, Gaussian", gaussian_tail), ("promised, any distribution", chebyshev_tail)):
-        shares = tail(np.array(KS, dtype=np.float64))
+    squares = np.square(KS, dtype=np.float64)
+    for name, shares in (
+        ("promised, Gaussian", chi2.sf(squares, 1)),
+        ("promised, any distribution", 1.0 / squares),
+    ):
         lines.append(f"| {name} | - | {' | '.join(f'{s:.2%}' for s in shares)} | {1e6 * shares[-1]:,.0f} |")
     seen = sum(row["seen_when_turned_away"] for row in rows)
     return "\n".join([*lines, "", f"Track-steps seen while the robot was turned away: {seen}."])
@@ -272,7 +274,8 @@ def growth_job(seed: int) -> list[dict[str, Any]]:
                 times = found.step_s * np.arange(1, count + 1)
                 sigma = np.sqrt(found.covariance[first : first + count, track, 0, 0])
                 if reversion_s is None:
-                    form = np.sqrt(double_integrator_covariance(start, intensity, times)[:, 0, 0])
+                    (p, both), (_, v) = start
+                    form = np.sqrt(p + 2 * both * times + v * times**2 + intensity * times**3 / 3)
                 else:
                     form = reverting_sigma(start, intensity, reversion_s, times)
                 worst = max(worst, float(np.abs(sigma / form - 1.0).max()))

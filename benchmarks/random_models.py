@@ -147,8 +147,7 @@ def _counts(kind: str) -> str:
 def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random) -> tuple[str, str]:
     onlooker = sw.MujocoPlant()
     onlooker.bind(machine)
-    share_step = None if _sleeps(machine.model) else rng.choice((None, True))
-    plants = {"share_step": share_step} if rng.random() < 0.8 else {"delay_s": 0.013}
+    plants = {} if rng.random() < 0.8 else {"delay_s": 0.013}
     env, unfit = _filtered(machine, plants, rng)
     env.reset(seed=seed)
     twin.reset(seed=seed)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_wrappers.appendix.handover.flexible_joint import resonances, torque_slew_limit
+from benchmarks.flexible_joint import resonances, torque_slew_limit
 
 RAMP_ENERGY = 1e-3
 """J that one ramp of torque at the rate limit may leave ringing in the arm, in any pose."""

@@ -40,9 +40,9 @@ import torch
 
 import safe_wrappers as sw
 from benchmarks.chunk_policy import RUNS, TASKS, Policy, Task, policy
+from benchmarks.flexible_joint import manifold
 from benchmarks.seam_bounds import Bounds, bounds_of
 from benchmarks.tables import RESULTS, markdown
-from safe_wrappers.appendix.handover.flexible_joint import manifold
 from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.control.handover.smoothstep import smoothstep
@@ -142,13 +142,8 @@ def alone(env: Any, qpos: Array, qvel: Array, commands: Array) -> float:
     qvel[springs] = 0.0
     for _ in range(5):  # the deflection turns the link, and with it what the spring carries
         q = qpos[motors] + qpos[springs]
-        carried = manifold(
-            commands[0],
-            arm.rotor_inertia,
-            arm.link_inertia(q),
-            bias=arm.link_bias(q, qvel[motors]),
-            motor_friction=arm.motor_damping * qvel[motors],
-        )
+        net = commands[0] - arm.motor_damping * qvel[motors]
+        carried = manifold(net, arm.rotor_inertia, arm.link_inertia(q), arm.link_bias(q, qvel[motors]))
         qpos[springs] = -carried / arm.stiffness
     env.set_state(qpos, qvel)
     return max(env.step(command)[4]["vibration_energy"] for command in commands)

@@ -9,9 +9,9 @@ noises that the tracks are told of. The other track is told of all but the turn.
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from benchmarks.tables import RESULTS
-from safe_wrappers.appendix.estimation.sigma_coverage import gaussian_tail
 from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
 from safe_wrappers.control.estimation.turning_tracks import TurningTracks
@@ -63,7 +63,7 @@ def main() -> None:
         for tracks in told.values():
             tracks.advance(STEP_S)
             tracks.see(np.arange(TARGETS), measured, np.eye(2, 4), POSITION_STD**2 * np.eye(2))
-    tail = " | ".join(f"{p:.2%}" for p in gaussian_tail(np.array(KS, dtype=np.float64), dimensions=2))
+    tail = " | ".join(f"{p:.2%}" for p in chi2.sf(np.square(KS, dtype=np.float64), 2))
     lines = ["| track | not seen for | k = 1 | k = 2 | k = 3 | mean sigma (m) |", "|---|---|---|---|---|---|"]
     lines.append(f"| promised, normal, in the plane | - | {tail} | - |")
     before = 0.0

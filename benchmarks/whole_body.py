@@ -34,7 +34,6 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.tables import RESULTS
-from safe_wrappers.appendix.legged.balance import support_margin, zmp_of_forces
 from safe_wrappers.control.legged.support import common_plane, support_polygon
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.replay import Replay
@@ -114,11 +113,17 @@ class Judge:
             polygon = None if ground is None else support_polygon(ground.flat(points))
             if ground is None or polygon is None or len(polygon) < 3:
                 return
-            zmp = zmp_of_forces(points, forces, ground)
-            if not np.isfinite(zmp).all():
+            total = np.sum(forces, axis=0)
+            pressure = total @ ground.normal
+            if pressure <= 0.0:
                 return  # they touch, and nothing presses
+            moment = np.cross(np.array(points) - ground.origin, forces).sum(axis=0)
+            zmp = ground.origin + np.cross(ground.normal, moment) / pressure
+            edges = np.roll(polygon, -1, axis=0) - polygon  # anticlockwise
+            inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
+            inward /= np.linalg.norm(edges, axis=1, keepdims=True)
             row.polygons += 1
-            row.near_edge += not support_margin(ground.flat(zmp), polygon, INSET_M) >= 0.0
+            row.near_edge += not ((ground.flat(zmp) - polygon) * inward).sum(axis=1).min() >= INSET_M
 
         if not self._replay.after(visit):
             raise RuntimeError(

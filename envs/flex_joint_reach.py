@@ -11,8 +11,8 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ActionError, ConfigurationError
+from safe_wrappers.checks import Array, finite_action
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP, IS_SUCCESS
 
 from .flexible_arm import MOTORS, SPRINGS, FlexibleArm
@@ -155,9 +155,7 @@ class FlexJointReachEnv(MujocoEnv, EzPickle):
         Raises:
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
         """
-        control = np.asarray(action, dtype=np.float64)
-        if control.shape != (self.model.nu,) or not np.isfinite(control).all():
-            raise ActionError(f"action must be {self.model.nu} finite numbers; got {control.tolist()}")
+        control = finite_action(action, self.model.nu)
         self._step_mujoco_simulation(control, self.frame_skip)
         share = self.data.actuator_force / self._full_torque
         self._reward_dist = -self._reward_dist_weight * self._distance

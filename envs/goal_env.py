@@ -11,8 +11,8 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ActionError, ConfigurationError
+from safe_wrappers.checks import Array, finite_action
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED
 
 from .goal.layout import Layout, PartialLayout, parse_layout
@@ -191,9 +191,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         Raises:
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
         """
-        control = np.asarray(action, dtype=np.float64)
-        if control.shape != (self.model.nu,) or not np.isfinite(control).all():
-            raise ActionError(f"action must be {self.model.nu} finite numbers; got {control.tolist()}")
+        control = finite_action(action, self.model.nu)
         before = self._goal_distance()
         self._step_mujoco_simulation(control, self.frame_skip)
         reward = before - self._goal_distance()

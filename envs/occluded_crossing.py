@@ -11,9 +11,9 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
+from safe_wrappers.checks import Array, finite_action
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
-from safe_wrappers.errors import ActionError, SafeWrappersError
+from safe_wrappers.errors import SafeWrappersError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP, GOALS_REACHED
 
 from .crossing.layout import (
@@ -221,9 +221,7 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
             SafeWrappersError: The physics left finite numbers.
         """
-        control = np.asarray(action, dtype=np.float64)
-        if control.shape != (self.model.nu,) or not np.isfinite(control).all():
-            raise ActionError(f"action must be {self.model.nu} finite numbers; got {control.tolist()}")
+        control = finite_action(action, self.model.nu)
         before = self._goal_distance()
         self._step_mujoco_simulation(control, self.frame_skip)
         distance = self._goal_distance()

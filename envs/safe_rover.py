@@ -11,14 +11,13 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.appendix.vehicle.traction_curves import MagicFormula
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ActionError, SafeWrappersError, UnknownNameError
+from safe_wrappers.checks import Array, finite_action
+from safe_wrappers.errors import SafeWrappersError, UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED, SPIN_OUT
 
 from .goal.lidar import LIDAR_BINS, pseudo_lidar
 from .goal_env import GOAL_MET
-from .ground import Ground
+from .ground import Ground, MagicFormula
 from .rover.layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout, start_state
 from .rover.scene import Scene
 from .rover.tyres import Tyres, rolled_over
@@ -55,7 +54,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
     18 kg, 0.5 m between the axles and 0.4 m between the wheels, centre of mass 0.12 m high. Four wheels of
     0.1 m, each with 0.05 kg m^2 about its axle and a motor of its own; the front ones are steered together. MuJoCo
     gives each wheel its load; the tyre's force comes from its slip along and across, over the traction curve of
-    the ground under it (`appendix.vehicle.traction_curves.MAGIC_FORMULA`), anew at every physics substep.
+    the ground under it (`envs.ground.MAGIC_FORMULA`), anew at every physics substep.
 
     **Action**: ``Box(-1, 1, (5,), float32)``, held for 0.01 s (five physics substeps): the torques on the wheels in
     the order of `WHEELS`, 15 N m at 1, and the steering angle, 0.5 rad at 1 (left), followed by a servo within about
@@ -232,9 +231,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
             SafeWrappersError: The physics left finite numbers.
         """
-        control = np.asarray(action, dtype=np.float64)
-        if control.shape != (self.model.nu,) or not np.isfinite(control).all():
-            raise ActionError(f"action must be {self.model.nu} finite numbers; got {control.tolist()}")
+        control = finite_action(action, self.model.nu)
         before = self._goal_distance()
         self._step_mujoco_simulation(control, self.frame_skip)
         distance = self._goal_distance()

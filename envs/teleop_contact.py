@@ -12,8 +12,8 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
+from safe_wrappers.checks import Array, finite_action
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP
 
 COST_FORCE: Final = "cost_force"
@@ -215,9 +215,7 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
             SafeWrappersError: The physics left finite numbers.
         """
-        command = np.asarray(action, dtype=np.float64)
-        if command.shape != (2,) or not np.isfinite(command).all():
-            raise ActionError(f"action must be 2 finite numbers; got {command.tolist()}")
+        command = finite_action(action, 2)
         self._step_mujoco_simulation(np.clip(command, -1.0, 1.0), self.frame_skip)
         reward = self._pressing_reward() + self._sweep_reward()
         observation = self.observe()

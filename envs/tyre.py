@@ -3,14 +3,14 @@
 import math
 from typing import Final
 
-from safe_wrappers.appendix.vehicle.traction_curves import TractionCurve
+from .ground import MagicFormula
 
 SLOWEST: Final = 0.5
 """Speed below which slip counts against this speed, m/s: at rest there is no ratio."""
 
 
 def tyre_force(
-    rim: float, forward: float, sideways: float, load: float, curve: TractionCurve
+    rim: float, forward: float, sideways: float, load: float, curve: MagicFormula
 ) -> tuple[float, float, float]:
     """Force of the ground on a wheel: against the sliding of the contact point, as much as the curve gives.
 

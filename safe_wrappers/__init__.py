@@ -7,10 +7,6 @@ Importing registers the ids of our tasks and changes nothing else; it imports ne
 (`safe_wrappers.sb3` and `safe_wrappers.train` do).
 """
 
-import importlib as _importlib
-import warnings as _warnings
-from typing import Any as _Any
-
 from safe_wrappers import constraints, plants
 from safe_wrappers.control.handover.seam_limits import SeamLimits
 from safe_wrappers.diagnosis import diagnose
@@ -85,29 +81,5 @@ __all__ = [
     "protect",
     "teleop",
 ]
-
-_MOVED = {
-    **dict.fromkeys(constraints.__all__, "constraints"),
-    **dict.fromkeys(teleop.__all__, "wrappers.teleop"),
-    **dict.fromkeys(occlusion.__all__, "wrappers.occlusion"),
-    "DisplacementPlant": "plants",
-    "Projection": "filter.projection",
-}
-"""Names that were at the top once, and the module that has them."""
-
-
-def __getattr__(name: str) -> _Any:
-    """Old names, with a warning that says the new one."""
-    if name == "interventions":
-        new, found = "info", _importlib.import_module("safe_wrappers.info")
-    elif name in _MOVED:
-        new = f"{_MOVED[name].removeprefix('wrappers.')}.{name}"
-        found = getattr(_importlib.import_module(f"safe_wrappers.{_MOVED[name]}"), name)
-    else:
-        raise AttributeError(f"module 'safe_wrappers' has no attribute {name!r}")
-    message = f"safe_wrappers.{name} is deprecated; write safe_wrappers.{new}"
-    _warnings.warn(message, DeprecationWarning, stacklevel=2)
-    return found
-
 
 _register_envs()

@@ -4,15 +4,15 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.deprecation import deprecated_names
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
 
 Array = NDArray[np.float64]
+OF_NUMBERS: Final = "of numbers within float64, none of them masked"
 T = TypeVar("T")
 
 
@@ -29,8 +29,8 @@ def non_negative(name: str, value: float, unit: str) -> float:
 def _number(name: str, value: float, unit: str, bound: str, least: float) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} must be a number in {unit}, got {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ConfigurationError(f"{name} must be a number in {unit}, got {shown(value)}") from None
     if not (math.isfinite(number) and number >= least):
         raise ConfigurationError(f"{name} must be a finite number {bound} in {unit}, got {value!r}")
     return number
@@ -59,12 +59,11 @@ def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
     if not isinstance(given, Mapping):
         raise ConfigurationError(f"{name} is a {kind.__name__}, the dict of one{also}; got {given!r}")
     parameters = inspect.signature(kind).parameters
-    old = deprecated_names(kind)
     for key in given:
-        if key not in parameters and key not in old:
+        if key not in parameters:
             raise UnknownNameError(f"{name} has no {key!r}; it has {', '.join(parameters)}")
     needed = [key for key, p in parameters.items() if p.default is p.empty and key not in given]
-    if needed and not any(key in old for key in given):
+    if needed:
         raise ConfigurationError(f"{name} needs {' and '.join(needed)}; got {dict(given)!r}")
     return kind(**given)
 
@@ -78,23 +77,53 @@ def check_fields(settings: Any, check: Callable[..., float], names: Sequence[str
             object.__setattr__(settings, name, check(name, value, unit))
 
 
+def shown(value: Any) -> str:
+    """A value as a message prints it."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no whole number of more than 4,300 digits
+        text = f"a {type(value).__name__} with a number too long to print"
+    return text if len(text) <= 200 else f"{text[:200]}..."
+
+
 def numbers_of(value: Any) -> NDArray[Any] | None:
-    """A copy as an array of real numbers in their own dtype, finite or not; None where they are none."""
+    """A copy as an array of real numbers in their own dtype, finite or not.
+
+    None where they are none: texts, lists that are no array, whole numbers beyond float64, masked entries.
+    """
+    if type(value) is not np.ndarray and _is_masked(value):
+        return None
     try:
         array = np.array(value)
         if array.dtype.kind == "O":  # numbers of other libraries
             array = array.astype(np.float64)
-    except (TypeError, ValueError):  # of no numbers, or of lists that are no array
+    except (TypeError, ValueError, OverflowError):
         return None
     return array if array.dtype.kind in "fiub" else None
+
+
+def _is_masked(value: Any) -> bool:
+    return bool(np.ma.is_masked(value)) or (isinstance(value, list | tuple) and any(map(_is_masked, value)))
+
+
+def finite_action(action: Any, size: int) -> Array:
+    """A copy of an action of finite numbers, shape (size,); an `ActionError` for any other."""
+    given = numbers_of(action)
+    if given is None or given.shape != (size,) or not np.isfinite(given).all():
+        raise ActionError(
+            f"expected an action of {size} finite numbers, got {shown(action)}; the env was not stepped"
+        )
+    return given.astype(np.float64, copy=False)
 
 
 def float_array(name: str, value: ArrayLike) -> Array:
     """The value as float64, any shape, finite or not."""
     try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
+        if not _is_masked(value):
+            return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ConfigurationError(f"{name} is a number or an array {OF_NUMBERS}, got {shown(value)}")
 
 
 def finite_array(name: str, value: ArrayLike) -> Array:

@@ -102,6 +102,8 @@ CBF_MARGIN: Final = _key("cbf/margin", "float64", chunk="min")
 """The smallest barrier value h before the step, in each constraint's unit, margins not taken off; 0 without one."""
 CBF_UNSAFE: Final = _key("cbf/unsafe", "bool", chunk="any")
 """Some h was negative (by more than rounding, 1e-6) or not a number before the step."""
+CBF_MISMATCH: Final = _key("cbf/mismatch", "bool", chunk="any", log="mismatch")
+"""The env's step was not what the filter decided about: another control, time, state or model (`Plant.deviation`)."""
 CBF_REFUSED: Final = _key("cbf/refused", "bool", shape="(constraints,)", chunk="any")
 """Which constraints, in the order of `constraint_names`, refused the boxed proposal; all False where it or
 the state is not finite."""
@@ -319,6 +321,7 @@ EPISODE: Final = (
     EpisodeFigure("fallback", "count", (CBF_FALLBACK,), "interventions/fallback"),
     EpisodeFigure("nonfinite", "count", (CBF_NONFINITE,)),
     EpisodeFigure("unsafe", "count", (CBF_UNSAFE,)),
+    EpisodeFigure("mismatch", "count", (CBF_MISMATCH,)),
     EpisodeFigure("stuck", "count", (CBF_STUCK,)),
     EpisodeFigure("lease_expired", "count", (LEASE_EXPIRED,)),
     EpisodeFigure("lease_refused", "count", (LEASE_REFUSED,)),

@@ -1,18 +1,16 @@
 """protect: the recommended stack for a known env, in one call."""
 
+import difflib
 import inspect
+import textwrap
 from collections.abc import Callable
 from typing import Any, overload
 
 import gymnasium as gym
-import mujoco
 
-from safe_wrappers.constraints.limits.joints import JointSpeedLimit
+from safe_wrappers.by_hand import remedy_for
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.env_checks import check_actions
-from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS
-from safe_wrappers.plants.simulator.plant import SimulatorPlant
 from safe_wrappers.recipes import RECIPES
 from safe_wrappers.shelf import PLANTS, SHELF
 from safe_wrappers.stack import refuse_order
@@ -78,7 +76,7 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
             raise UnsupportedEnvError(
                 f"discrete actions are shielded env by env, got {env!r}; protect each env of it: {by_env(env)}"
             )
-        constraints = _recommended(envs[0], options)
+        constraints = _recommended(envs[0], options, env)
         return VectorCBFActionFilter(env, constraints, **_with_plant(envs[0], options))
     if not isinstance(env, gym.Env):
         raise UnsupportedEnvError(f"expected one env, or a vector env, got {env!r}; {_of_no_env(env)}")
@@ -105,13 +103,14 @@ def _family(env_id: str) -> str:
     return name.rpartition("-v")[0].removesuffix("Dense").removesuffix("Sparse")
 
 
-def _recommended(env: gym.Env[Any, Any], options: dict[str, Any]) -> list[Constraint]:
-    """The recipe's constraints; takes its options out of all."""
+def _recommended(
+    env: gym.Env[Any, Any], options: dict[str, Any], vector: VectorEnv | None = None
+) -> list[Constraint]:
+    """The recipe's constraints; takes its options out of all. `vector` is what the env is one of, if it is."""
     env_id = _env_id(env)
     name = recipe_of(env_id)
     if name is None:
-        known = f"there are recipes for {', '.join(recipe_names())}"
-        raise UnsupportedEnvError(f"no recipe for {env_id or env.unwrapped!r}; {known}. {_by_hand(env)}")
+        raise UnsupportedEnvError(_without_recipe(env if vector is None else vector, env))
     recipe = _EVERY[name]
     of_recipe, of_filter = _options(recipe), _options(CBFActionFilter)
     for name in options:
@@ -121,45 +120,18 @@ def _recommended(env: gym.Env[Any, Any], options: dict[str, Any]) -> list[Constr
     return recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
 
 
-def _by_hand(env: gym.Env[Any, Any]) -> str:
-    """The lines that protect an env without a recipe, tried on it, or why there are none."""
-    discrete = isinstance(env.action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
+def _without_recipe(env: gym.Env[Any, Any] | VectorEnv, single: gym.Env[Any, Any]) -> str:
+    """The lines that protect an env by hand, or why none do, and then the recipes of similar names."""
     try:
-        if not discrete:
-            check_actions(env)
-        model = getattr(env.unwrapped, "model", None)
-        if not discrete and isinstance(model, mujoco.MjModel):
-            return _limiting_joints(env, model)
-        SimulatorPlant(check_steps=0).bind(env)
+        remedy = remedy_for(env, single)
     except ConfigurationError as error:
-        return f"A filter by hand is refused, too: {error}"
-    kind = "ActionShield" if discrete else "CBFActionFilter"
-    return (
-        "It can be simulated. Say by h(observation) what must stay positive, what a backup(observation) does to keep "
-        "it, and for how many steps (horizon) to look; then it is three lines:\n"
-        "    import safe_wrappers as sw\n"
-        "    shield = sw.constraints.PredictiveShield(h, horizon, backup)\n"
-        f"    env = sw.{kind}(env, [shield])"
-    )
-
-
-def _limiting_joints(env: gym.Env[Any, Any], model: mujoco.MjModel) -> str:
-    """Lines that limit the driven joints, or else all joints that have a name."""
-    joints = ""
-    try:
-        CBFActionFilter(env, [JointSpeedLimit(limit=4.0)])
-    except ConfigurationError:
-        names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] in SCALAR_JOINTS]
-        if not names or "" in names:
-            raise
-        CBFActionFilter(env, [JointSpeedLimit(limit=4.0, joints=names)])
-        joints = f", joints={names}"
-    return (
-        "By hand it is three lines:\n"
-        "    import safe_wrappers as sw\n"
-        f"    limit = sw.constraints.JointSpeedLimit(limit=4.0{joints})  # rad/s, m/s; or another constraint\n"
-        "    env = sw.CBFActionFilter(env, [limit])"
-    )
+        by_hand = f"A filter by hand is refused, too: {error}"
+    else:
+        code = textwrap.indent(f"import safe_wrappers as sw\n{remedy.code}", "    ")
+        by_hand = f"{remedy.says}:\n{code}"
+    near = difflib.get_close_matches(_family(_env_id(single)), recipe_names(), n=3, cutoff=0.5)
+    similar = f"\nRecipes of similar names: {', '.join(near)}" if near else ""
+    return f"no recipe for {_env_id(single) or single.unwrapped!r}. {by_hand}{similar}"
 
 
 def _of_no_env(given: Any) -> str:

@@ -9,9 +9,8 @@ import numpy as np
 from safe_wrappers import constraints
 from safe_wrappers.checks import settings_from
 from safe_wrappers.constraints.obstacles import KINDS as OBSTACLES
-from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.filter.duck_typed import duck_typed
 
 _EXPORTED = [getattr(constraints, name) for name in constraints.__all__ if name != "Constraint"]
 KINDS: dict[str, type[Constraint]] = {
@@ -21,8 +20,13 @@ KINDS: dict[str, type[Constraint]] = {
 
 def constraint_from(data: Any) -> Constraint:
     """A constraint itself, or rebuilt from its `plain_data`."""
+    if isinstance(data, Constraint):
+        return data
     if not isinstance(data, dict):
-        return data if isinstance(data, Constraint) else duck_typed(data)
+        raise ConfigurationError(
+            "expected a constraint (an instance of a subclass of sw.Constraint, whose bind(plant) returns a "
+            f"sw.BoundConstraint) or the dict of one; got {data!r}"
+        )
     kind = data.get("kind", "")
     if kind not in KINDS:
         raise UnknownNameError(f"unknown constraint kind {kind!r}; the kinds are {', '.join(KINDS)}")

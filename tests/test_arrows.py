@@ -15,7 +15,6 @@ import safe_wrappers
 ROOT = Path(__file__).parents[1]
 LAYERS = {
     "control": ROOT / "safe_wrappers" / "control",
-    "appendix": ROOT / "safe_wrappers" / "appendix",
     "plants": ROOT / "safe_wrappers" / "plants",
     "drawing": ROOT / "safe_wrappers" / "drawing",
     "filter": ROOT / "safe_wrappers" / "filter",
@@ -26,12 +25,11 @@ LAYERS = {
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
-COMMON = {"checks", "deprecation", "errors", "info"}
+COMMON = {"checks", "errors", "info"}
 """Single modules at the top that every layer may use; `protect` and the package itself are the top."""
 BELOW_WRAPPERS = {"control", "plants", "drawing", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
     "control": {"control", "checks", "errors"},
-    "appendix": {"appendix", "control", "plants", "checks", "errors"},
     "plants": {"control", "plants", *COMMON},
     "drawing": {"plants", "drawing", *COMMON},
     "filter": {"control", "plants", "drawing", "filter", *COMMON},
@@ -39,13 +37,12 @@ MAY_USE = {
     "wrappers": {"wrappers", *BELOW_WRAPPERS},
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
     "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
-    "envs": {"appendix", "control", "constraints", "envs", *COMMON},
+    "envs": {"control", "constraints", "envs", *COMMON},
     "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {
     "control": LEARNERS | {"gymnasium", "mujoco"},
-    "appendix": LEARNERS | {"gymnasium"},
     "filter": LEARNERS | {"gymnasium", "mujoco"},
     "plants": LEARNERS,
     "drawing": LEARNERS,
@@ -141,12 +138,7 @@ def test_the_parser_sees_what_it_should(tmp_path):
     found = imports(path, "safe_wrappers.control")
     assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
     assert layers_used("control", LAYERS["control"] / "watchdog" / "leases.py") == {"checks", "errors"}
-    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {
-        "checks",
-        "deprecation",
-        "errors",
-        "plants",
-    }
+    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {"checks", "errors", "plants"}
 
 
 def test_control_runs_without_gymnasium_and_mujoco():

@@ -2,10 +2,7 @@
 
 import contextlib
 import copy
-import textwrap
-import threading
 import warnings
-from unittest import mock
 
 import gymnasium as gym
 import mujoco
@@ -19,7 +16,6 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsafeStateWarning, UnsupportedEnvError
-from safe_wrappers.shelf import SHELF
 
 RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
 KNOWN = {
@@ -228,46 +224,6 @@ def test_unknown_options_are_refused_with_the_list(options):
         sw.protect(gym.make("Reacher-v5"), **options)
 
 
-@pytest.fixture
-def lab():
-    """An env of MuJoCo that nobody knows, under an id of its own."""
-    gym.register("lab/Crawler-v3", entry_point="gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv")
-    yield "lab/Crawler-v3"
-    gym.registry.pop("lab/Crawler-v3")
-
-
-def test_an_unknown_env_is_refused_with_lines_that_work(lab):
-    env = gym.make(lab)
-    with pytest.raises(UnsupportedEnvError, match=rf"no recipe for '?{lab}") as caught:
-        sw.protect(env)
-    message = str(caught.value)
-    listed = message.partition("there are recipes for ")[2].partition(". By hand")[0].split(", ")
-    families = {env_id.rpartition("-v")[0].partition("_")[0].removesuffix("Dense") for env_id in KNOWN}
-    families = {
-        f.removeprefix("Safe").removesuffix("Velocity") if f.endswith("Velocity") else f for f in families
-    }
-    assert set(listed) == families | {"SafePointGoal0", "SafeCarGoal0"} | set(SHELF)
-    lines = textwrap.dedent("\n".join(message.splitlines()[1:]))
-    assert len(lines.splitlines()) == 3
-    scope = {"env": env}
-    exec(lines, scope)
-    assert isinstance(scope["env"], sw.CBFActionFilter)
-    scope["env"].reset(seed=0)
-    scope["env"].step(scope["env"].action_space.sample())
-
-
-def test_an_unknown_machine_that_is_pushed_at_a_site_gets_lines_that_name_its_joints():
-    with mock.patch.dict(gym.registry):
-        gym.register("lab/Pushed-v0", entry_point=lambda: gym.make("SafePointGoal0-v0").unwrapped)
-        env = gym.make("lab/Pushed-v0")
-        lines = textwrap.dedent("\n".join(refusal(env).splitlines()[1:]))
-    scope = {"env": env}
-    exec(lines, scope)
-    assert scope["limit"].joints == ["x", "y", "z"]
-    scope["env"].reset(seed=0)
-    scope["env"].step(scope["env"].action_space.sample())
-
-
 def test_an_env_without_a_spec_is_refused_and_not_a_crash():
     class Bare(gym.Env):
         action_space = gym.spaces.Box(-1, 1, (1,))
@@ -281,49 +237,6 @@ def refusal(env):
     with pytest.raises(ConfigurationError) as caught:
         sw.protect(env)
     return str(caught.value)
-
-
-class Slider(gym.Env):
-    """A point on a line; nobody knows it, and nothing says how long its step lasts."""
-
-    def __init__(self, discrete=False):
-        box = gym.spaces.Box(-1.0, 1.0, (1,))
-        self.action_space = gym.spaces.Discrete(3, start=-1) if discrete else box
-        self.observation_space = gym.spaces.Box(-100.0, 100.0, (2,), np.float64)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.zeros(2)
-        return self.state, {}
-
-    def step(self, action):
-        push = float(np.atleast_1d(action)[0])
-        self.state = self.state + 0.1 * np.array([self.state[1], push])
-        return self.state, 0.0, False, False, {}
-
-
-@pytest.mark.parametrize("discrete", [False, True])
-def test_an_env_without_mujoco_gets_lines_that_simulate_it(discrete):
-    env = Slider(discrete)
-    message = refusal(env)
-    assert "JointSpeedLimit" not in message
-    lines = textwrap.dedent("\n".join(message.splitlines()[1:]))
-    assert len(lines.splitlines()) == 3
-    scope = {"env": env, "h": lambda x: 1.0 - abs(x[1]), "horizon": 2}
-    scope["backup"] = lambda x: -int(np.sign(x[1])) if discrete else [-np.sign(x[1])]
-    exec(lines, scope)
-    scope["env"].reset(seed=0)
-    for _ in range(30):
-        observation, *_, info = scope["env"].step(1 if discrete else np.ones(1, np.float32))
-        assert abs(observation[1]) <= 1.0 + 1e-9
-    assert info["cbf/intervened"]
-
-
-def test_an_env_that_cannot_be_simulated_is_told_why():
-    env = Slider()
-    env.lock = threading.Lock()
-    assert "A filter by hand is refused, too: " in refusal(env)
-    assert "Slider.lock is a lock" in refusal(env)
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0", "CartPole-v1"])

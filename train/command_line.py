@@ -23,7 +23,7 @@ COMMANDS: Final = {
 }
 DIAGNOSED_STEPS: Final = 2000
 ENJOYED_EPISODES: Final = 3
-FILTERS: Final = ("trained", "none", "protect")
+FILTERS: Final = ("trained", "none", "protect", "both")
 _TAKEN_BY: Final = {
     "report": ("compare",),
     "on": ("train", "evaluate", "compare", "sweep"),
@@ -111,7 +111,8 @@ def make_parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE",
         help="of report: where to (default: report.html beside the runs; of several, overview.html); of diagnose "
-        "(default: diagnosis.html; the same as JSON beside it); of enjoy: a film of the first episode, FILM.webp",
+        "(default: diagnosis.html; the same as JSON beside it); of enjoy: a film of a typical episode "
+        "and the worst one, FILM.webp",
     )
     parser.add_argument(
         "--policy",
@@ -130,7 +131,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--filter",
         choices=FILTERS,
-        help="of enjoy: another filter than it was trained with (default: trained)",
+        help="of enjoy: another filter than it was trained with (default: trained); both: without one, then with it",
     )
     parser.add_argument("--render", action="store_true", help="of enjoy: draw in a window")
     parser.add_argument(

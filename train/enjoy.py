@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Literal
 
-import gymnasium as gym
 from rich.console import Console
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 
 from .atomic import write_bytes
-from .evaluation.step_log import is_violation
+from .evaluation.episode_selection import filmed_seeds, typical_and_worst
 from .policies import load_policy
+from .processes.parallel import environment
 from .run.policy import TrainedPolicy
-from .videos.film import Film, encode, for_film, speed_of, stride_of
+from .videos.film import film_episodes, for_film
+from .videos.rendering import find_rendering
 
-FilterName = Literal["trained", "none", "protect"]
+FilterName = Literal["trained", "none", "protect", "both"]
 
 
 def enjoy_command(
@@ -30,14 +31,16 @@ def enjoy_command(
     console: Console,
     imports: Collection[str] = (),
 ) -> None:
-    """Lets a run's policy act, and prints a line per episode.
+    """Lets a run's policy act, and prints what it comes to.
 
     Args:
         run: As `load_policy` takes it.
         episodes: How many; their env seeds are 0, 1, 2, ...
-        action_filter: The filter that it was trained with, or another.
+        action_filter: The filter that it was trained with, or another; `both`: without a filter, then with the one
+            that it was trained with, or `protect`'s if it was trained without.
         window: The task draws itself in a window.
-        film: Where to write a film of the first episode (WebP).
+        film: Where to write a film (WebP) of the episodes with the median return and with the lowest; with `both`
+            of those in the filter that it was trained with.
         console: Where to print.
         imports: As `load_policy` takes it.
 
@@ -45,23 +48,32 @@ def enjoy_command(
         ConfigurationError: No such run, or the task cannot be drawn in this way.
     """
     trained = load_policy(run, other_filter=action_filter != "trained", imports=imports)
-    env = _drawn(trained, action_filter, "human" if window else "rgb_array" if film is not None else None)
-    try:
-        for seed in range(episodes):
-            taken = _Film(env) if film is not None and seed == 0 else None
-            console.print(_episode(trained, env, seed, taken), highlight=False, soft_wrap=True)
-            if taken is not None and film is not None:
-                write_bytes(film, taken.encoded())
-                console.print(f"Film: {film}", highlight=False, soft_wrap=True)
-    finally:
-        env.close()
+    _check_modes(trained, "human" if window else "rgb_array" if film is not None else None)
+
+    def say(line: str) -> None:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    own = trained.arm.filter.kind != "none"
+    steps = trained.arm.total_steps * trained.arm.action_repeat
+    say(
+        f"{run}: {trained.arm.algorithm} on {trained.arm.env.id}, trained for {steps:,} control steps"
+        f" {'through the filter' if own else 'without a filter'}"
+    )
+    both = action_filter == "both"
+    for name in ("none", "trained" if own else "protect") if both else (action_filter,):
+        figures = _drive(trained, name, episodes, window, None if both else say)
+        on = name == "protect" or (name == "trained" and own)
+        say(f"filter {'on' if on else 'off'}, {episodes} episodes: {_mean(figures)}")
+        if film is not None and (on == own or not both):
+            returns = {seed: episode["return"] for seed, episode in enumerate(figures)}
+            say(_film(trained, name, returns, film))
 
 
-def _drawn(trained: TrainedPolicy, action_filter: FilterName, render_mode: str | None) -> gym.Env[Any, Any]:
-    env = trained.make_env(action_filter)
-    modes = env.unwrapped.metadata.get("render_modes") or []
+def _check_modes(trained: TrainedPolicy, render_mode: str | None) -> None:
     if render_mode is None:
-        return env
+        return
+    env = trained.make_env("none")
+    modes = env.unwrapped.metadata.get("render_modes") or []
     env.close()
     if render_mode not in modes:
         wanted, other = ("window", "--output FILM.webp") if render_mode == "human" else ("frames", "--render")
@@ -69,46 +81,62 @@ def _drawn(trained: TrainedPolicy, action_filter: FilterName, render_mode: str |
             f"{trained.arm.env.id} draws no {wanted} (its render modes: {', '.join(modes) or 'none'}); try {other},"
             " or leave it out"
         )
-    env = trained.make_env(action_filter, render_mode)
-    return for_film(env) if render_mode == "rgb_array" else env
 
 
-def _episode(trained: TrainedPolicy, env: gym.Env[Any, Any], seed: int, film: _Film | None) -> str:
-    """Runs an episode; returns what is to be said of it."""
-    observation, _ = env.reset(seed=seed)
-    trained.begin(env)
-    done = False
-    while not done:
-        if film is not None:
-            film.before()
-        observation, _, terminated, truncated, info = env.step(trained(observation))
-        if film is not None:
-            film.after(info)
-        done = terminated or truncated
-    figures = info[keys.EPISODE_SUMMARY]
+def _drive(
+    trained: TrainedPolicy, used: Any, episodes: int, window: bool, say: Callable[[str], None] | None
+) -> list[dict[str, Any]]:
+    """Runs episodes; returns their figures, each of which is told as it ends."""
+    env = trained.make_env(used, "human" if window else None)
+    found = []
+    try:
+        for seed in range(episodes):
+            observation, _ = env.reset(seed=seed)
+            trained.begin(env)
+            done = False
+            while not done:
+                observation, _, terminated, truncated, info = env.step(trained(observation))
+                done = terminated or truncated
+            found.append(info[keys.EPISODE_SUMMARY])
+            if say is not None:
+                say(f"episode {seed}: {_episode(found[-1])}")
+    finally:
+        env.close()
+    return found
+
+
+def _episode(figures: dict[str, Any]) -> str:
     words = [f"return {figures['return']:.2f}", f"{figures['length']} steps"]
     if "violations" in figures:
         words.append(f"{figures['violations']} in violation")
     if "intervention_rate" in figures:
         words.append(f"{100 * figures['intervention_rate']:.1f} % changed")
-    return f"episode {seed}: {', '.join(words)}"
+    return ", ".join(words)
 
 
-class _Film:
-    """Frames of one episode, and the strip below that shows when the filter acted."""
+def _mean(figures: list[dict[str, Any]]) -> str:
+    """What episodes come to, by step where steps are counted."""
+    steps = sum(episode["length"] for episode in figures)
+    words = [f"return {sum(episode['return'] for episode in figures) / len(figures):.1f} per episode"]
+    if all("violations" in episode for episode in figures):
+        words.append(f"{sum(episode['violations'] for episode in figures):,} of {steps:,} steps in violation")
+    if all("intervention_rate" in episode for episode in figures):
+        changed = sum(episode["intervention_rate"] * episode["length"] for episode in figures)
+        words.append(f"{100 * changed / steps:.1f} % changed")
+    return ", ".join(words)
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._env = env
-        self._longest = env.spec.max_episode_steps if env.spec is not None else None
-        self._film = Film(stride=stride_of(self._longest or 1))
 
-    def before(self) -> None:
-        if self._film.wants_frame:
-            self._film.add_frame(self._env.render())  # type: ignore[arg-type]
-
-    def after(self, info: dict[str, Any]) -> None:
-        self._film.add_step(bool(info.get(keys.CBF_INTERVENED, False)), is_violation(info))
-
-    def encoded(self) -> bytes:
-        fps = float(self._env.metadata.get("render_fps") or 30.0)
-        return encode(self._film, fps, speed_of(self._longest or len(self._film.changed), fps))
+def _film(trained: TrainedPolicy, used: Any, returns: dict[int, float], path: Path) -> str:
+    """Films the typical episode, and the worst beside it; the line that says so, or why there is no film."""
+    rendering = find_rendering(trained.arm.env)
+    if rendering.problem:
+        return f"No film: {rendering.problem}"
+    typical, worst = typical_and_worst(returns)
+    with environment(rendering.variables):
+        env = for_film(trained.make_env(used, "rgb_array"))
+        try:
+            write_bytes(path, film_episodes(trained, env, filmed_seeds(typical, worst))[0])
+        finally:
+            env.close()
+    beside = "" if worst == typical else f", beside it {worst}, the lowest"
+    return f"Film: {path} (episode {typical} has the median return{beside})"

@@ -12,7 +12,7 @@ from .config import ArmConfig, ExperimentConfig
 from .evaluation.evaluate import evaluate_run
 from .evaluation.intact import check_training_table
 from .evaluation.summary import Summary, summarize, write_summary
-from .hyperparameters import check_task
+from .hyperparameters import check_task, whole_rollouts
 from .policies.card import write_card
 from .processes.job import Job
 from .processes.lock import check_free
@@ -47,7 +47,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console, on: str | N
         if any(is_outgrown(arm, experiment.run_folder(arm, seed)) for seed in experiment.seeds):
             delete_videos(experiment, arm)
     try:
-        every = sum(arm.total_steps for arm in experiment.arms) * len(experiment.seeds)
+        every = sum(whole_rollouts(arm) for arm in experiment.arms) * len(experiment.seeds)
         before = 0
         for arms in generations(experiment):
             jobs = training_jobs(experiment, arms)
@@ -76,8 +76,7 @@ def check_training(experiment: ExperimentConfig) -> None:
     for arm in experiment.arms:
         env = make_training_env(arm)
         check_task(arm, env)
-        if arm.env.reset_options:
-            env.reset()  # the task alone knows its options
+        env.reset()  # the task alone knows its options, and a filter of one's own is asked here first
         check_margins(arm, env)
         check_trackers(arm)
         env.close()
@@ -92,7 +91,7 @@ def check_training(experiment: ExperimentConfig) -> None:
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
-    """Evaluates every trained run on the same episode seeds, filter off and on, and films one episode.
+    """Evaluates every trained run on the same episode seeds, filter off and on, and films two of them.
 
     Args:
         experiment: Whose runs to evaluate.
@@ -156,7 +155,7 @@ def training_jobs(experiment: ExperimentConfig, arms: Sequence[ArmConfig], of: s
     return [
         Job(
             f"{of} {arm.name} seed {seed}",
-            arm.total_steps,
+            whole_rollouts(arm),
             "steps",
             functools.partial(train_run, start=_start(experiment, arm, seed)),
             (arm, seed, experiment.run_folder(arm, seed)),

@@ -103,6 +103,16 @@ def learning_starts(arm: ArmConfig) -> int:
     return int(arm.hyperparameters.get("learning_starts", default))
 
 
+def whole_rollouts(arm: ArmConfig) -> int:
+    """Steps of all envs together that a run makes: `total_steps`, rounded up to whole rollouts."""
+    argument = "n_steps" if arm.algorithm in ON_POLICY else "train_freq"
+    default = inspect.signature(ALGORITHMS[arm.algorithm]).parameters[argument].default
+    given = arm.hyperparameters.get(argument, default)
+    count, unit = (given, "step") if isinstance(given, int) else given
+    rollout = arm.n_envs * (count if unit == "step" else 1)  # how long episodes are is not known beforehand
+    return -(-arm.total_steps // rollout) * rollout
+
+
 def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
     """Refuses an arm whose algorithm cannot learn this task, which only the task itself can tell.
 

@@ -52,7 +52,7 @@ SIMULATION = Target(
         Mutant('options = {"include_rng": True} if', "options = {} if True or"),
         Mutant("        if behind[-1][2] or behind[-1][3]:\n", "        if behind[-1][2]:\n"),
         Mutant("    raw._np_random = generator\n", ""),
-        Mutant("if one != other and not (one != one and other != other):", "if False:"),
+        Mutant("zip(names, simulated, real, strict=True)", "zip(names[:1], simulated, real)"),
         Mutant("    if a.tobytes() == b.tobytes():\n        return None\n", "    return None\n"),
         Mutant(
             "                    if not found.values[-1] >= least:",
@@ -61,7 +61,7 @@ SIMULATION = Target(
         Mutant("found.reached = until is not None and until(view)", "found.reached = False"),
         Mutant("if found.ended or found.reached:", "if found.reached:"),
         Mutant("if policy is not None and step + 1 < horizon:", "if policy is not None and step < 1:"),
-        Mutant("            if not self.same_noise:\n", "            if False:\n"),
+        Mutant("            if self.same_noise:\n", "            if True:\n"),
         Mutant("        if control is None:\n            self.simulation.start()\n", ""),
     ),
 )
@@ -70,7 +70,7 @@ DISCRETE = Target(
     "wrappers/action_shield.py",
     ("tests/wrappers/test_action_shield.py",),
     (
-        Mutant("if not self.action_space.contains(action):", "if False:"),
+        Mutant("if given is None or not self.action_space.contains(action):", "if given is None:"),
         Mutant("            admitted[int(np.argmax(slacks))] = True\n", "            pass\n"),
         Mutant("        self.observe()\n        every", "        every"),
         Mutant("table.any(axis=", "table.all(axis="),

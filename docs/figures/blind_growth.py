@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, panels
-from safe_wrappers.appendix.estimation.covariance import blind_covariance, double_integrator_covariance
-from safe_wrappers.control.estimation.covariance import blind_time
+from safe_wrappers.checks import Array
+from safe_wrappers.control.estimation.covariance import blind_time, discretise
 
 P0 = np.diag([0.05**2, 0.15**2])
 INTENSITY = 0.0225
@@ -20,7 +20,7 @@ def draw() -> Figure:
     """Left: 1, 2 and 3 sigma, and when the tolerance is reached. Right: what it is made of, and a reverting one."""
     figure, (left, right) = panels(2, height=3.2)
     times = np.linspace(0.0, LONGEST_S, 201)
-    sigma = np.sqrt(double_integrator_covariance(P0, INTENSITY, times)[:, 0, 0])
+    sigma = _sigma(A, times)
     for k in (3, 2, 1):
         left.fill_between(times, -k * sigma, k * sigma, color=ON, alpha=0.16, lw=0)
         left.text(times[-1] + 0.06, k * sigma[-1], rf"{k} $\sigma$", color=ON, va="center")
@@ -38,13 +38,18 @@ def draw() -> Figure:
     )
     for label, part, color in parts:
         right.plot(times, part, color=color, ls="--", lw=1.3, label=label)
-    both = np.sqrt(double_integrator_covariance(P0, INTENSITY, times)[:, 0, 0])
-    right.plot(times, both, color=ON, label="together")
-    slower = np.sqrt(blind_covariance(P0, REVERTING, Q, times)[:, 0, 0])
-    right.plot(times, slower, color=INK, label="velocity reverts in 2 s")
+    right.plot(times, _sigma(A, times), color=ON, label="together")
+    right.plot(times, _sigma(REVERTING, times), color=INK, label="velocity reverts in 2 s")
     right.axhline(0.0, color=GRID, lw=0.8)
     right.set_ylabel("$\\sigma$ of the position (m)")
     right.legend(loc="upper left")
     for ax in (left, right):
         ax.set_xlabel("time unseen (s)")
     return figure
+
+
+def _sigma(system: Array, times: Array) -> Array:
+    """Of the position, from P0 on."""
+    step = discretise(system, Q, times)
+    grown = step.transition @ P0 @ step.transition.swapaxes(-1, -2) + step.noise
+    return np.asarray(np.sqrt(grown[:, 0, 0]))

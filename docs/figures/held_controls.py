@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 import safe_wrappers as sw
 from _cart import Cart, run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, panels
-from safe_wrappers.appendix.filtering.barriers import kinetic_row
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 
 WALL, GAMMA = 1.0, 2.0
@@ -26,8 +25,8 @@ class BoundContinuousRow(BoundConstraint):
     def rows(self) -> sw.HalfSpaces:
         """One half-space on the acceleration; nothing at standstill."""
         x, v = self.plant.state
-        limit = np.maximum(kinetic_row(WALL - x, v, 1.0, GAMMA), -1.0)
-        return sw.HalfSpaces(np.array([[1.0]]), np.array([limit if np.isfinite(limit) else 1.0]))
+        limit = max((GAMMA * (WALL - x - v**2 / 2.0) - v) / v, -1.0) if v > 0.0 else float(x < WALL)
+        return sw.HalfSpaces(np.array([[1.0]]), np.array([limit]))
 
 
 def draw() -> Figure:

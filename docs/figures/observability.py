@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, SAFE, panels
-from safe_wrappers.appendix.estimation.covariance import blind_covariance
 from safe_wrappers.checks import Array
+from safe_wrappers.control.estimation.covariance import discretise
 from safe_wrappers.control.estimation.kalman import update
 
 RATE = 0.5
@@ -29,8 +29,9 @@ def draw() -> Figure:
     )
     for label, a, q, color in systems:
         start = 0.05**2 * np.eye(len(a))
-        grown = blind_covariance(start, a, np.diag(q), times)[:, 0, 0]
-        left.plot(times, np.sqrt(grown), color=color, label=label)
+        step = discretise(a, np.diag(q), times)
+        grown = step.transition @ start @ step.transition.swapaxes(-1, -2) + step.noise
+        left.plot(times, np.sqrt(grown[:, 0, 0]), color=color, label=label)
     left.set(ylim=(0.0, 2.6), xlabel="time unseen (s)", ylabel=r"$\sigma$")
     left.legend(loc="upper left")
     start = np.array([2.0, 1.5])

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, panels
-from safe_wrappers.appendix.teleop.waves import from_waves
 from safe_wrappers.control.teleop.passivity import ChannelLedger
 from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
 
@@ -57,9 +56,10 @@ def _made_of_waves(delay: int, impedance: complex) -> float:
 
     for n in range(TICKS):
         here, there, back = (np.exp(1j * step * (n - late)) for late in (0, delay, 2 * delay))
-        m = from_waves(here.real, (answer * back).real, 1.0)
-        s = from_waves(there.real, (answer * there).real, 1.0)
-        ledger.add(m.effort, m.flow, s.effort, s.flow, 1.0 / TICKS)
+        u_m, w_m, u_s, w_s = here.real, (answer * back).real, there.real, (answer * there).real
+        effort_m, flow_m = math.sqrt(0.5) * (u_m + w_m), math.sqrt(0.5) * (u_m - w_m)
+        effort_s, flow_s = math.sqrt(0.5) * (u_s + w_s), math.sqrt(0.5) * (u_s - w_s)
+        ledger.add(effort_m, flow_m, effort_s, flow_s, 1.0 / TICKS)
     return -ledger.net_j
 
 

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from _rover import FULL_THROTTLE, STEP_S, rover
 from _style import FORBIDDEN, GRID, INK, OFF, ON, SAFE
-from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
+from safe_wrappers.envs.ground import MAGIC_FORMULA
 
 ICE = {"ground": "ice", "center": [2.0, 0.0], "radius": 1.0}
 END = 5.0

@@ -5,8 +5,7 @@ from matplotlib.figure import Figure
 
 from _rover import FULL_THROTTLE, rover
 from _style import FORBIDDEN, INK, OFF, ON, panels
-from safe_wrappers.appendix.vehicle.burckhardt import peak
-from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
+from safe_wrappers.envs.ground import MAGIC_FORMULA
 
 GROUNDS = ("dry", "wet", "ice")
 STEPS, FIRST, EVERY = 150, 20, 10
@@ -19,8 +18,8 @@ def draw() -> Figure:
     for ground in GROUNDS:
         curve = MAGIC_FORMULA[ground]
         ax.plot(slip, curve.friction(slip), color=INK, lw=1.2)
-        top = peak(curve)
-        ax.plot(2 * [top.slip], [top.friction - 0.03, top.friction + 0.03], color=FORBIDDEN, lw=1.2)
+        around = [curve.peak_friction - 0.03, curve.peak_friction + 0.03]
+        ax.plot(2 * [curve.peak_slip], around, color=FORBIDDEN, lw=1.2)
         ax.text(0.35, curve.at(0.35) + 0.025, ground)
         for limited, color, name in ((False, OFF, "limiter off"), (True, ON, "limiter on")):
             env = rover(limited, ground=ground)

@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.appendix.vehicle.traction_curves import TractionCurve
-
+from ..ground import MagicFormula
 from ..tyre import tyre_force
 
 UPRIGHT: Final = 0.5
@@ -42,7 +41,7 @@ class Tyres:
         self._forces = [[0.0] * 6 for _ in range(self._n_bodies)]
         self.slips = [0.0] * len(wheels)
 
-    def apply(self, data: mujoco.MjData, curve_at: Callable[[float, float], TractionCurve]) -> None:
+    def apply(self, data: mujoco.MjData, curve_at: Callable[[float, float], MagicFormula]) -> None:
         """Put every tyre's force on its wheel at the contact point, and keep the slips.
 
         Needs the kinematics of the present state (`mj_step1`). With z upwards, the contact point lies `r z` under the

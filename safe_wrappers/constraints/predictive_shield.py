@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -24,7 +24,7 @@ _NOT_REACHED = -math.ulp(0.0)  # the slack of a rollout that keeps h but does no
 
 @dataclass
 class PredictiveShield(Constraint):
-    """Keep `h >= margin` at the end of every step, by simulating what a backup could do after an action.
+    """Keep `h >= margin` at every step, by simulating what a backup could do after an action.
 
     An action is admitted if after it one of the backups keeps h to the horizon, or until the episode ends, or, with a
     `terminal` set, until it has reached that set. Of a refused action's neighbours, and the first actions of the
@@ -33,8 +33,10 @@ class PredictiveShield(Constraint):
     **Proved for the copy and the terminal set**, if there is one: a state from which a backup reaches it stays such a
     state, whatever the policy does, if the simulation is the env (`SimulatorPlant` checks that), the set is invariant
     under that backup with h >= margin, and backups depend on the state alone. **Best effort: horizon**, without one:
-    what comes later is not looked at, and an admitted action may lead where every backup loses. h between the ends of
-    steps is not looked at either.
+    what comes later is not looked at, and an admitted action may lead where every backup loses.
+
+    **When h is judged**: at the ends of steps; in envs that step as Gymnasium's `MujocoEnv` does, at every physics
+    substep. A warning says where that is not possible. An info key is judged when the env judges it.
 
     Args:
         h: A function of what it `sees` that returns a number, at least 0 where all is well; or the name of an info
@@ -42,7 +44,8 @@ class PredictiveShield(Constraint):
         horizon: Steps that are simulated, the proposed action among them.
         backup: "zero" (not with discrete actions), "hold" (the action goes on), an action, a function of what it
             `sees` that returns one, anything with `predict(observation, deterministic=True)` such as an SB3 model; or
-            a list of these: any that survives admits.
+            a list of these: any that survives admits. A list of numbers is one action, if there are as many as the
+            action has, or if they are not all whole.
         terminal: A function of what it `sees`: whether the state lies in a set that the backups never leave, with
             h >= margin. None: there is none.
         sees: Whether `h`, `terminal` and `backup` take the "observation", as the env inside the filter returns it,
@@ -82,13 +85,20 @@ class PredictiveShield(Constraint):
         if self.max_decrease is not None:
             self.max_decrease = positive("max_decrease", self.max_decrease, "the unit of h")
         self.promise = "best effort" if self.terminal is None else "proved"
-        backups = self.backup if isinstance(self.backup, list | tuple) else [self.backup]
+        several = isinstance(self.backup, list | tuple) and not _is_action(self.backup)
+        backups = self.backup if several else [self.backup]
         if not backups:
             raise ConfigurationError("backup is a backup, or a list with at least one")
         self.backup = [_checked(one) for one in backups]
 
     def bind(self, plant: Plant) -> "BoundPredictiveShield":
         return BoundPredictiveShield(self, plant)
+
+
+def _is_action(backup: Sequence[Any]) -> bool:
+    """Whether a list is one action, of numbers that are not all whole. Whole ones may be discrete actions, too."""
+    numbers = all(isinstance(one, int | float | np.number) for one in backup)
+    return numbers and any(isinstance(one, float | np.floating) for one in backup)
 
 
 def _checked(backup: Any) -> Any:
@@ -146,12 +156,20 @@ class BoundPredictiveShield(BoundConstraint):
             )
         if not self.plant.exact:
             spec.promise = "best effort"  # of an unchecked, noisy or fitted model a set proves nothing
+        # The env's own judge decides by itself when it looks.
+        self._between = "" if isinstance(spec.h, str) or self.plant.substeps == 1 else spec.sees
+        if self._between and not self.plant.judges_substeps:
+            own = "this env does not step MuJoCo as Gymnasium's MujocoEnv does"
+            self.plant.warn_of_substeps(own if self.plant.simulates_env else "logs are of control steps")
         discrete = self.plant.discrete
         if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
             raise ConfigurationError(
                 "a discrete action has no zero: give as backup the action that is safe, or hold, or a function"
             )
-        self._backups = [self._prepared(one) for one in spec.backup]
+        given = spec.backup
+        if len(given) == self.plant.lower.size and all(isinstance(one, int) for one in given):
+            given = [given]  # an action that is written in whole numbers
+        self._backups = [self._prepared(one) for one in given]
         self._needed = spec.margin + self.plant.margins(self._measure, spec.horizon)
         self._points = np.random.default_rng(0).random((spec.candidates, self.plant.lower.size))
 
@@ -165,6 +183,8 @@ class BoundPredictiveShield(BoundConstraint):
         # Many envs report their cost after steps, and not after a reset.
         self._unknown = isinstance(self.spec.h, str) and self.spec.h not in view.info
         self._now = math.inf if self._unknown else self._measure(view)
+        if not self.plant.exact:  # any more
+            self.spec.promise = "best effort"
 
     def check(self) -> None:
         if np.isfinite(self.plant.state).all():
@@ -243,7 +263,9 @@ class BoundPredictiveShield(BoundConstraint):
         until = None if spec.terminal is None else self._terminal
         least = float(self._needed.min())
         try:
-            rollout = self.plant.rollout(control, spec.horizon, policy, self._measure, least, until)
+            rollout = self.plant.rollout(
+                control, spec.horizon, policy, self._measure, least, until, self._between
+            )
         except NotFiniteError:
             return -math.inf  # the backup has no answer
         values = np.array(rollout.values)

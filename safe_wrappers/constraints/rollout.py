@@ -2,7 +2,7 @@
 
 import warnings
 from abc import abstractmethod
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,6 @@ _KEPT = 10  # control steps for which a response is kept: a guess that forecasts
 _SAME_RESPONSE = 1  # linearisations of one step that use the kept response
 _RESOLUTION = 1e-6  # rounding of controls, as a share of half their range, for which rows are tightened
 RECOVERY_S = 0.1  # time constant of recovery from a violation, s
-RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}  # old names of parameters of the subclasses
 
 
 class RolloutConstraint(Constraint):
@@ -108,7 +107,7 @@ class BoundRollout(BoundSlacks):
 
     def observe(self, memory: RolloutMemory) -> None:
         self._value = self.now()
-        self._known: dict[tuple[int, bytes], Array] = {}
+        self._known: dict[bytes, Array] = {}
         self._tangents = Tangents(self.slacks, self._slopes)
         self._linear: HalfSpaces | None = None
         self._linearized = 0
@@ -142,7 +141,7 @@ class BoundRollout(BoundSlacks):
 
         In time: the least room in every control interval, bound by bound.
         """
-        key = self.plant.model_version, control.tobytes()
+        key = control.tobytes()
         if key not in self._known:
             self._known[key] = self._slacks(control)
         return self._known[key]

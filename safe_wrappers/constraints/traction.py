@@ -115,10 +115,7 @@ class BoundTraction(BoundConstraint):
                 f"({self.plant.delay_s} s) predicts instead; use delay_s=0"
             )
         self.wheels = DrivenWheels(self.plant, self.spec.wheels)
-        self._read_constants()
-
-    def _read_constants(self) -> None:
-        self._model_version = self.plant.model_version
+        self.wheels.refuse_stiff_servos(self.plant)
         self.constants = self.wheels.constants(self.plant)
         options, feedback = self.plant.model.opt, self.wheels.feedback
         hold = float(options.timestep), self.plant.substeps
@@ -135,8 +132,6 @@ class BoundTraction(BoundConstraint):
         """Take the state and measure what the last control step showed."""
         self._rows: HalfSpaces | None = None
         seen = self.seen = replace(memory, estimate=memory.estimate.copy())
-        if self.plant.model_version != self._model_version:
-            self._read_constants()
         rate, ground, sideways = self.wheels.motion(self.plant)
         published = self.plant.published()
         assert published is not None  # there is no delay

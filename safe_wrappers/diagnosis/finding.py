@@ -103,12 +103,14 @@ class Diagnosis:
         steps: Control steps of each driver.
         drivers: Names.
         findings: One per symptom.
+        idle_constraints: Those of the env's filter that have refused no action of any driver, by name.
     """
 
     env: str
     steps: int
     drivers: Sequence[str]
     findings: Sequence[Finding]
+    idle_constraints: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         ranked = sorted(
@@ -134,6 +136,7 @@ class Diagnosis:
             "env": self.env,
             "steps": self.steps,
             "drivers": list(self.drivers),
+            "idle_constraints": list(self.idle_constraints),
             "findings": [finding.as_dict() for finding in self.findings],
         }
 
@@ -141,9 +144,20 @@ class Diagnosis:
         """All of it."""
         return json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
 
+    @property
+    def idle_words(self) -> str:
+        """What to think of constraints that have refused nothing; "" where each has."""
+        if not self.idle_constraints:
+            return ""
+        names = ", ".join(self.idle_constraints)
+        may_be = "A limit may be out of reach, or in another unit; angles are in rad."
+        return f"Never acted, with any driver: {names}. {may_be}"
+
     def __str__(self) -> str:
         """A table for a terminal, and the lines to paste."""
         lines = [f"{self.env}: {self.steps:,} steps each of {', '.join(self.drivers)}"]
+        if self.idle_constraints:
+            lines.append(f"  {self.idle_words}")
         for finding in self.findings:
             lines.append(f"  {_verdict(finding):9} {finding.symptom:16} {_words(finding)}")
             if finding.present and finding.code:

@@ -14,7 +14,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.env_checks import check_timing, wrappers_of
+from safe_wrappers.plants.env_checks import check_timing, one_reward, wrappers_of
 from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 
@@ -166,25 +166,34 @@ def _declared_dt(env: Env) -> float:
         return math.nan
 
 
-@contextmanager
-def _spied(env: Env) -> Iterator[list[tuple[Array, Array | None]]]:
-    """The actions that the unwrapped env is given, and its observations, as long as this lasts."""
-    raw: Any = env.unwrapped
-    step, own, given = raw.step, vars(raw).get("step"), list[tuple[Array, Array | None]]()
+class _Spy(gym.Wrapper[Any, Any, Any, Any]):
+    """Remembers the last action that the unwrapped env was given, and its observation.
 
-    def spy(action: Any) -> Any:
+    It is a wrapper, and no function on the env, so that envs can be copied with it.
+    """
+
+    given: tuple[Array, Array | None]
+
+    def step(self, action: Any) -> Any:
         taken = np.array(action, dtype=float)
-        answer = step(action)
-        given.append((taken, _kept(answer[0])))
+        answer = self.env.step(action)
+        self.given = taken, _kept(answer[0])
         return answer
 
-    raw.step = spy
+
+@contextmanager
+def _spied(env: Env) -> Iterator[tuple[Env, _Spy]]:
+    """The env with a spy as its innermost wrapper, as long as this lasts."""
+    spy = _Spy(env.unwrapped)
+    innermost = next((layer for layer in wrappers_of(env) if layer.env is env.unwrapped), None)
+    if innermost is None:
+        yield spy, spy
+        return
+    innermost.env = spy
     try:
-        yield given
+        yield env, spy
     finally:
-        del raw.step
-        if own is not None:
-            raw.step = own
+        innermost.env = spy.env
 
 
 def _kept(observation: Any) -> Array | None:
@@ -213,7 +222,7 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
     publishes = env.has_wrapper_attr("port_effort_acted")
     observation, over, episode, control_dt, repeats = None, True, 0, _declared_dt(env), False
     begin = getattr(driver, "reset", lambda: None)
-    with _spied(env) as given, warnings.catch_warnings():
+    with _spied(env) as (env, spy), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         for _ in range(steps):
             first = over
@@ -236,11 +245,11 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
             rows.append(
                 (
                     action.astype(float),
-                    float(reward),
+                    one_reward(reward, "diagnose"),
                     info,
                     first,
                     terminated,
-                    *given[-1],
+                    *spy.given,
                     struck,
                     _kept(observation),
                 )

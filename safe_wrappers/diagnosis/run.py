@@ -7,6 +7,7 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 
+from safe_wrappers import info as keys
 from safe_wrappers.checks import whole_number
 from safe_wrappers.diagnosis.finding import Diagnosis, Finding, Series
 from safe_wrappers.diagnosis.recording import (
@@ -35,6 +36,7 @@ from safe_wrappers.diagnosis.symptoms import (
 )
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
 SYMPTOMS: Final[dict[str, Symptom]] = {
     "limits": limits.SYMPTOM,
@@ -105,7 +107,7 @@ def diagnose(
         if finding.present and finding.code:
             finding = _treated(env, finding, drivers, steps, seed)
         findings.append(finding)
-    return Diagnosis(name_of(env), steps, list(drivers), findings)
+    return Diagnosis(name_of(env), steps, list(drivers), findings, _idle_constraints(env, recordings))
 
 
 def _try(env: Env, driver: Driver) -> None:
@@ -123,6 +125,16 @@ def _try(env: Env, driver: Driver) -> None:
         raise ConfigurationError(
             f"the policy gives actions of shape {action.shape}, {name_of(env)} takes {space.shape}. Is it this env's?"
         )
+
+
+def _idle_constraints(env: Env, recordings: Recordings) -> list[str]:
+    """The constraints of the env's filter, if it has one, that have refused nothing."""
+    inside = filter_inside(env)
+    if inside is None:
+        return []
+    infos = [info for recording in recordings.values() for info in recording.infos]
+    acted = np.any([info[keys.CBF_REFUSED] for info in infos if keys.CBF_REFUSED in info], axis=0)
+    return [name for name, has in zip(inside.constraint_names, acted, strict=True) if not has]
 
 
 def _measured(env: Env, symptom: Symptom, recordings: Recordings) -> tuple[dict[str, Measured], str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from safe_wrappers.checks import Array
 Role = Literal["keep out", "limit", "way", "estimate", "proposed", "executed"]
 Shape = Literal["sphere", "ellipsoid", "capsule", "box", "arrow"]
 
-_CORNERS: Final = 20
+_CORNERS: Final = 16
 THIN: Final = 0.012
 """m: half the width of a line."""
 FLOOR: Final = 0.02
@@ -71,10 +72,14 @@ def ball(role: Role, center: ArrayLike, radius: float) -> Mark:
 
 
 def ring(role: Role, center: ArrayLike, radius: float) -> list[Mark]:
-    """A circle on the floor, m, as a polygon."""
-    angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS, endpoint=False)
+    """A circle on the floor, m, as a polygon of thin boxes: of many rings, round rods would cost most of a frame."""
+    angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1)
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return line(role, spatial(center)[:2] + radius * around, THIN, closed=True)
+    corners = [spatial(point) for point in spatial(center)[:2] + radius * around]
+    return [
+        _mark("box", role, (a + b) / 2.0, [THIN, THIN, np.linalg.norm(b - a) / 2.0], _frame(b - a))
+        for a, b in pairwise(corners)
+    ]
 
 
 def block(role: Role, center: ArrayLike, half_size: ArrayLike) -> Mark:

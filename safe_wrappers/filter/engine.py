@@ -55,20 +55,27 @@ class SafetyFilter:
         dtype: Any = np.float64,
         search: type[SafeActionSearch] = SafeActionSearch,
     ) -> None:
-        self.plant = plant
-        self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in constraints]
+        self.plant, self._constraints = plant, constraints
+        self._making = fallback, solver, low, high, dtype, search
+        self._low, self._high = low, high
+        self._narrower = not plant.bounds_are_action_space
+        self._loaded = False
+        load_compiled()
+        self._bind()
+
+    def _bind(self) -> None:
+        """Let the constraints read what they need of the plant's model."""
+        fallback, solver, low, high, dtype, search = self._making
+        plant = self.plant
+        self._model_version = plant.model_version
+        self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in self._constraints]
         self.reporting = [c for c in self.bound if c.info_keys]
         kinds = [type(c.spec).__name__ for c in self.reporting]
         for kind in kinds:
             if kinds.count(kind) > 1:
                 twice = f"{kind} is in the list {kinds.count(kind)} times"
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
-        falling_back = Fallback(fallback, self.bound)
-        load_compiled()
-        self._search = search(plant, self.bound, falling_back, solver, low, high, dtype)
-        self._low, self._high = low, high
-        self._loaded = False
-        self._narrower = not plant.bounds_are_action_space
+        self._search = search(plant, self.bound, Fallback(fallback, self.bound), solver, low, high, dtype)
         self._all_predict = all(c.predicts for c in self.bound)
 
     def start(self) -> None:
@@ -98,6 +105,10 @@ class SafetyFilter:
         """Take the env's present state, and `margin` from it."""
         plant = self.plant
         plant.observe()
+        if plant.model_version != self._model_version:  # what the constraints remember of the episode stays
+            self._bind()
+            for c in self.bound:
+                c.start()
         self.margin = math.nan
         state = float(np.add.reduce(plant.state))  # half the time of its method
         if state - state != 0.0:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array
+from safe_wrappers.checks import Array, float_array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.filter.projection import box_least_squares
@@ -53,7 +53,7 @@ class Fallback:
         """
         if callable(self._choice):
             assert plant is not None
-            control = np.asarray(self._choice(plant), dtype=np.float64)
+            control = float_array("the fallback's control", self._choice(plant))
             if control.shape != low.shape:
                 wanted = f"the fallback must return a control of shape {low.shape}"
                 raise ConfigurationError(f"{wanted}, got {control.shape}")

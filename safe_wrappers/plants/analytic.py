@@ -8,15 +8,15 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
+from safe_wrappers.arguments import tells_arguments
 from safe_wrappers.checks import Array, non_negative, positive
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.control_loop import ControlLoop, checked_loop
 from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant
 
 
-@deprecated_parameters(renamed={"hold_s": "control_dt"})
+@tells_arguments
 class AnalyticPlant(Plant):
     """`x' = f(x) + g(x) u` from plain functions.
 

@@ -18,7 +18,7 @@ _WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, Singularit
 class DisplacementPlant(MujocoPlant):
     """Actions `(dx, dy, dz, fingers)` in [-1, 1] that move a mocap body, which pulls the gripper after it.
 
-    The plant repeats the env's own step on a copy of the model: for actions in the action space's dtype forecasts are
+    The plant repeats the env's own step on data of its own: for actions in the action space's dtype forecasts are
     exact, bit for bit; others are rounded to it first. `f`, `g`, `acceleration` and `point` raise: constraints that
     forecast can be used, those that need rows cannot. Braking is a displacement of zero.
 
@@ -46,7 +46,7 @@ class DisplacementPlant(MujocoPlant):
         self.metres_per_unit = positive("metres_per_unit", metres_per_unit, "m per unit of action")
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        """Attach to an env and copy its model."""
+        """Attach to an env and its model."""
         raw: Any = env.unwrapped
         if not moves_by_displacement(raw):
             raise UnsupportedEnvError(
@@ -59,7 +59,6 @@ class DisplacementPlant(MujocoPlant):
         self._pose = np.zeros(7)
         self._body = welds(raw.model)[0][1]
         super().bind(env)
-        self._clamped = False  # all of the action space acts
         self.gripper = self.model.body(self._body).name
         delayed = self._delay_steps / self.substeps
         if delayed != int(delayed):
@@ -67,6 +66,13 @@ class DisplacementPlant(MujocoPlant):
                 f"delay_s = {self.delay_s} s is not a whole number of control intervals of {self.control_dt} s: a "
                 "displacement counts from where the gripper is when a control interval starts"
             )
+
+    def _take_model(self) -> None:
+        super()._take_model()
+        self._clamped = False  # all of the action space acts
+
+    def _other_control(self, data: mujoco.MjData, sent: Array) -> str:
+        return ""  # the control follows from where the gripper is
 
     def _bind_actions(self, env: gym.Env[Any, Any]) -> None:
         space: Any = env.action_space

@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 import gymnasium as gym
 
 from safe_wrappers.checks import Array
-from safe_wrappers.deprecation import deprecated_attribute
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.control_loop import ControlLoop
 
@@ -19,7 +18,7 @@ class Plant(ABC):
         delay_s: Evidence age plus detection plus actuation delay in s; the state that the constraints see is
             predicted over it with the commands in flight.
         observation_id: Number of observations so far.
-        model_version: Number of changes of the model, after which a constraint reads its constants again.
+        model_version: Number of changes of the model, after each of which a filter binds its constraints anew.
         loop: The loop that a controller closes through this machine, if one was declared.
     """
 
@@ -28,9 +27,6 @@ class Plant(ABC):
     observation_id: int = 0
     model_version: int = 0
     loop: ControlLoop | None = None
-    hold_s = deprecated_attribute("hold_s", "control_dt")
-    stamp = deprecated_attribute("stamp", "observation_id")
-    revision = deprecated_attribute("revision", "model_version")
     has_acceleration: ClassVar[bool] = True
     """Whether a control acts as a force, so that `f` and `g` are known."""
     bounds_are_action_space: ClassVar[bool] = False
@@ -99,17 +95,17 @@ class Plant(ABC):
 
     def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
         """Step the env with what may be executed; what `env.step` returns."""
-        self.offer_rollout()
-        try:
-            return env.step(action)
-        finally:
-            self.withdraw_rollout()
+        return env.step(action)
 
-    def offer_rollout(self) -> None:  # noqa: B027 - most plants have none
-        """Before the env's step: let it take over what has been simulated for the decision."""
+    def follow(self) -> None:  # noqa: B027 - most plants have no model of the env's
+        """Read the env's model anew if it has changed; `model_version` counts how often."""
 
-    def withdraw_rollout(self) -> None:  # noqa: B027
-        """After the env's step: nothing of the offer is left in the env."""
+    def deviation(self) -> str:
+        """How the env's last step was not what was decided, in words; "" if it was, or nothing can be compared.
+
+        Asked after `received`, before the next `observe`.
+        """
+        return ""
 
     @abstractmethod
     def executed(self, control: Array | None) -> None:

@@ -1,5 +1,6 @@
 """What a plant can do that simulates: rollouts of a control and a policy, judged step by step."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -8,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple, NoReturn
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, positive
+from safe_wrappers.checks import Array, numbers_of, positive, shown
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import check_timing, name_of, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant
@@ -37,14 +38,14 @@ class Rollout:
 
     Attributes:
         observations: After each step.
-        rewards: Of each step, shape (k,); NaN where the plant does not know them.
+        rewards: Of each step, floats, or arrays where they are vectors; NaN where the plant does not know them.
         values: What was measured after each step, shape (k,).
         ended: The episode terminated or was truncated.
         reached: The set in which it may stop was reached.
     """
 
     observations: list[Any] = field(default_factory=list)
-    rewards: list[float] = field(default_factory=list)
+    rewards: list[Any] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
     ended: bool = False
     reached: bool = False
@@ -60,6 +61,10 @@ class RolloutPlant(Plant):
     """Whether a `View` of a rollout has the env and its info; else only the observation."""
     exact: bool = False
     """Whether rollouts were checked to be what the env does, its noise included."""
+    substeps: int = 1
+    """Physics substeps of a control step that are known of."""
+    judges_substeps: bool = False
+    """Whether rollouts can be measured at each of them."""
     info_keys: ClassVar[tuple[str, ...]] = ()
     """The keys that `info` writes."""
     lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
@@ -164,31 +169,30 @@ class RolloutPlant(Plant):
         return [every[i] for i in np.argsort(distances, kind="stable") if distances[i] > 0.0]
 
     def action(self, control: Array) -> Any:
-        """The env's action for a control, shape (m,)."""
+        """The env's action for a control, shape (m,): in the space's dtype, unless it is not a number of that."""
         if isinstance(self._space, gym.spaces.Discrete):
             return int(control[0])
-        return control.astype(self._space.dtype)
+        rounded = control.astype(self._space.dtype)
+        return rounded if bool((rounded == control).all()) else control.copy()
 
     def control(self, action: Any, of: str) -> Array:
-        """The control for an action, clipped to a Box's bounds; `of` says in messages whose it is.
+        """The control for an action, inside a Box and in its dtype; `of` says in messages whose it is.
 
         Raises:
             NotFiniteError: Not finite.
             ConfigurationError: Another shape, or no action of a discrete space.
         """
-        try:
-            control = np.atleast_1d(np.asarray(action, dtype=np.float64))
-        except (TypeError, ValueError):
-            control = np.zeros(0)
-        wanted = f"{of} must be a finite action of {self._space}, got {action!r}"
-        if control.shape != self.lower.shape:
+        given = numbers_of(action)
+        wanted = f"{of} must be a finite action of {self._space}, got {shown(action)}"
+        if given is None or np.atleast_1d(given).shape != self.lower.shape:
             raise ConfigurationError(wanted)
+        control = np.atleast_1d(given).astype(np.float64)
         if not np.isfinite(control).all():
             raise NotFiniteError(wanted)
         clipped = np.clip(control, self.lower, self.upper)
         if self.discrete and bool((np.rint(clipped) != control).any()):
             raise ConfigurationError(wanted)
-        return clipped
+        return clipped.astype(self._space.dtype).astype(np.float64)
 
     @abstractmethod
     def rollout(
@@ -199,6 +203,7 @@ class RolloutPlant(Plant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
+        between: str = "",
     ) -> Rollout:
         """Simulate a control, then a policy, from the env's present state.
 
@@ -209,7 +214,19 @@ class RolloutPlant(Plant):
             measure: Takes a `View`, returns a number.
             least: A measured number below it, or NaN, ends the rollout.
             until: Takes a `View`; where it is True the rollout ends.
+            between: What the measure sees of a `View` at physics substeps ("observation", "env" or "view"), where the
+                plant `judges_substeps`; the least of a step counts. "": it is not asked there.
         """
+
+    def warn_of_substeps(self, why: str) -> None:
+        """Say that a measure is not taken at the physics substeps, and what takes it there."""
+        warnings.warn(
+            f"PredictiveShield judges h at the ends of control steps alone, since {why}: each has {self.substeps} "
+            "physics substeps, and between its ends h may be lost without a flag. Keep a margin for that, or take "
+            "JointSpeedLimit, JointPositionLimit, SpeedLimit, Workspace or another constraint that forecasts every "
+            "substep",
+            stacklevel=2,
+        )
 
     @abstractmethod
     def margins(self, measure: Measure, horizon: int) -> Array:

@@ -68,9 +68,12 @@ class Snapshot(Plant):
         """Weight of everything that moves, N; without gravity its mass in kg."""
         return of_model.weight_n(self.model)
 
-    def named(self, kind: str, name: str) -> int:
-        """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all."""
-        return of_model.named(self.model, kind, name)
+    def named(self, kind: str, name: str, argument: str = "") -> int:
+        """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all.
+
+        The error also says which `argument` has the name, where the caller may have left that at its default.
+        """
+        return of_model.named(self.model, kind, name, argument)
 
     def names(self, kind: str, pattern: str = "*") -> list[str]:
         """All names of a kind that match a shell pattern."""

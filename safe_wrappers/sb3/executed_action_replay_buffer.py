@@ -117,10 +117,12 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         if not np.isfinite(executed).all():
             raise ActionError(f"an executed action is not finite: {[i[keys.EXECUTED_ACTION] for i in infos]}")
         finite: Flags = np.asarray(np.isfinite(policy).all(axis=1))
-        chosen, given = policy[finite], self._scaled(infos, keys.PROPOSED_ACTION)[finite]
+        escaping = np.array([bool(info.get(keys.CBF_ESCAPING, False)) for info in infos])
+        judged = finite & ~escaping
+        chosen, given = policy[judged], self._scaled(infos, keys.PROPOSED_ACTION)[judged]
         if not (np.abs(chosen - given) < _SAME).all():
             raise self._foreign(f"scaled to [-1, 1], the policy chose {chosen} and the filter got {given}")
-        changed = np.array([bool(info[keys.CBF_INTERVENED]) for info in infos]) | ~finite
+        changed = np.array([bool(info[keys.CBF_INTERVENED]) for info in infos]) | escaping | ~finite
         # Unscaling and scaling again is not the identity in floating point: unchanged actions stay the policy's.
         executed = np.where(changed[:, None], executed, policy)
         if self.mode == "safe_action":

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import numbers_of, shown
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.discrete import DiscreteSearch
@@ -91,9 +92,10 @@ class ActionShield(CBFActionFilter):
 
     def step(self, action: Any) -> Step:
         """Shield the action and step the env with what may be executed."""
-        if not self.action_space.contains(action):
-            raise ActionError(f"expected an action of {self.action_space}, got {action!r}")
-        return super().step(np.atleast_1d(np.asarray(action, dtype=np.float64)))
+        given = numbers_of(action)
+        if given is None or not self.action_space.contains(action):
+            raise ActionError(f"expected an action of {self.action_space}, got {shown(action)}")
+        return super().step(np.atleast_1d(given.astype(np.float64)))
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which actions would be executed as they are in the env's present state.

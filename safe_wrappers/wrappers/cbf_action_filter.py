@@ -53,14 +53,14 @@ class CBFActionFilter(LayerWrapper):
         margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
 
     Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
-    ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe`` (bool); ``cbf/correction``, ``cbf/clipped``,
+    ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe``, ``cbf/mismatch`` (bool); ``cbf/correction``, ``cbf/clipped``,
     ``cbf/margin`` (float); ``cbf/stage`` (int); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
 
     Attributes:
         filter: The `SafetyFilter` that decides; `filter.bound` are the constraints on the plant.
         added_margin: Added to every constraint's own; `set_margin` changes it.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
-        warned: What has been warned of: "nonfinite", "clipped", and "unsafe" until the next reset.
+        warned: What has been warned of: "nonfinite", "clipped", "mismatch", and "unsafe" until the next reset.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
     Raises:
@@ -175,6 +175,7 @@ class CBFActionFilter(LayerWrapper):
         observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
         self.plant.received(observation, info)
         info |= report
+        info[keys.CBF_MISMATCH] = self.deviates()
         if self.filter.reporting:
             info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
         return observation, reward, terminated, truncated, info
@@ -244,6 +245,7 @@ class CBFActionFilter(LayerWrapper):
             keys.CBF_FALLBACK: decision.fallback,
             keys.CBF_NONFINITE: not finite,
             keys.CBF_UNSAFE: unsafe,
+            keys.CBF_MISMATCH: False,
             keys.CBF_REFUSED: none if decision.refused is None else decision.refused,
             keys.CBF_CORRECTION: correction,
             keys.CBF_CLIPPED: clipped,
@@ -252,6 +254,13 @@ class CBFActionFilter(LayerWrapper):
             keys.EXECUTED_ACTION: executed.copy(),
             keys.CBF_STAGE: int(decision.stage),
         }
+
+    def deviates(self) -> bool:
+        """`cbf/mismatch` of the step that the env has just made: whether it was not the one that was judged."""
+        found = self.plant.deviation()
+        if found:
+            self._warn_once("mismatch", f"{found}; what the filter guarantees does not hold (cbf/mismatch)")
+        return bool(found)
 
     def _margin(self) -> tuple[float, bool]:
         """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""

@@ -8,14 +8,13 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, numbers_of, settings_from
+from safe_wrappers.checks import OF_NUMBERS, Array, non_negative, numbers_of, settings_from, shown
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
-from safe_wrappers.plants.env_checks import check_actions, check_timing
+from safe_wrappers.plants.env_checks import check_actions, check_timing, reward_numbers
 from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
@@ -29,7 +28,6 @@ from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs
 
 
-@deprecated_parameters(renamed={"jerk_limit": "rate_limit", "hold_s": "control_dt"})
 class ChunkHandover(LayerWrapper, CommandReceiver):
     """Executes action chunks that come late, over seams that keep a rate limit.
 
@@ -172,7 +170,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         chunk = self._checked(action)
         clipped = self._clipped(chunk)
         refused = not self._submit(chunk)
-        total, infos, commands, latency = 0.0, [], [], -1
+        total: Any = 0.0
+        infos, commands, latency = [], [], -1
         terminated = truncated = False
         for _ in range(self.execution_horizon):
             now = self._queue.now
@@ -188,7 +187,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             self._fallback.executed(executed)
             self._executed = np.concatenate([self._executed, executed[None]])
             self._in_seam.append(self._seams_at(now, command))
-            total += float(reward)
+            total = total + reward_numbers(reward)
             infos.append(dict(info))  # the env may use the same one again
             commands.append(command)
             if terminated or truncated:
@@ -231,7 +230,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         expected = f"expected a chunk of shape {self.action_space.shape}"
         given = numbers_of(action)
         if given is None:
-            raise ActionError(f"{expected}, of numbers, got {action!r}")
+            raise ActionError(f"{expected}, {OF_NUMBERS}, got {shown(action)}")
         chunk = given.astype(np.float64)
         if self.chunk_size == 1 and chunk.shape == (self._controls,):
             return chunk[None]  # an ordinary policy's action

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.handover.smoothstep import smoothstep
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.filter.fallback import FallbackFunction
@@ -23,18 +22,9 @@ from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.layer import Env, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array, whole_steps
 from safe_wrappers.wrappers.lease.admission import Admission, Measured
-from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, StoppingBudget, budget_from
-
-_RENAMED = {
-    "longest_s": "max_lease_s",
-    "least_s": "min_lease_s",
-    "reach": "motion_limits",
-    "hold_s": "control_dt",
-}
-_MOVED = ("braking", "acceleration", "closing_speed", "top_speed")
+from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, budget_from
 
 
-@deprecated_parameters(renamed=_RENAMED, moved={"budget": StoppingBudget}, positional=_MOVED)
 class LeaseExpiry(CommandGate):
     """Grants every fresh command a lease, and brakes when nothing fresh has come before it runs out.
 

@@ -15,7 +15,7 @@ from safe_wrappers.control.estimation.observability import unobservable_directio
 from safe_wrappers.control.estimation.tracks import largest_deviation
 from safe_wrappers.control.estimation.turning_tracks import TurningTracks, tracks_of
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
-from safe_wrappers.plants.env_checks import read_attribute
+from safe_wrappers.plants.env_checks import one_reward, read_attribute, refuse_vector_rewards
 from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer
@@ -92,6 +92,7 @@ class OcclusionPenalty(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
+        refuse_vector_rewards(env, "OcclusionPenalty")
         raw: Any = env.unwrapped
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
             raise UnsupportedEnvError(f"OcclusionPenalty needs MuJoCo's .model and .data; {raw} has none")
@@ -196,7 +197,7 @@ class OcclusionPenalty(LayerWrapper):
             self.ego_motion.advance(elapsed, self._random.draw.standard_normal(9))
         info.update(self._look())
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
-        info[keys.OCCLUSION_TASK_REWARD] = float(reward)
+        info[keys.OCCLUSION_TASK_REWARD] = one_reward(reward, "OcclusionPenalty")
         info[keys.OCCLUSION_PENALTY] = penalty
         if penalty:
             reward = float(reward) - penalty

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, settings_from
 from safe_wrappers.control.teleop.wave_line import Rule
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
@@ -31,7 +30,6 @@ Missing = Literal["hold", "zero", "fallback"]
 """What acts while no command arrives."""
 
 
-@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class TeleopChannel(CommandGate):
     """Puts a network between the policy, as a remote operator, and the machine.
 

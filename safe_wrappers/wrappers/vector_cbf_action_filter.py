@@ -91,18 +91,41 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         assert isinstance(space, gym.spaces.Box)  # CBFActionFilter has refused every other space
         self._low, self._high, self._dtype = space.low.astype(float), space.high.astype(float), space.dtype
         self._last = np.zeros((self.num_envs, *self._low.shape))
-        self.constraint_batch = self._constraint_batch()
+        self._make_batch(None)
         for single in self.filters:
             single.warned = self.filters[0].warned
         self._same_step = env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
         self._next_step = env.metadata.get("autoreset_mode") is AutoresetMode.NEXT_STEP
         self._ended = np.zeros(self.num_envs, dtype=bool)
 
-    def _constraint_batch(self) -> ConstraintBatch | None:
-        bound = [single.filter.bound for single in self.filters]
-        if len(bound[0]) > 1 or not bound[0][0].decides:
-            return None
-        return bound[0][0].batch([only for (only,) in bound], self._low, self._high, np.dtype(self._dtype))
+    def _make_batch(self, before: ConstraintBatch | None) -> None:
+        """Decide for all envs at once, where their constraint can; what a batch before has remembered stays."""
+        self._batched = [single.filter.bound[0] for single in self.filters]
+        self.constraint_batch = batch = None
+        if len(self.filters[0].filter.bound) == 1 and self._batched[0].decides:
+            dtype = np.dtype(self._dtype)
+            batch = self._batched[0].batch(self._batched, self._low, self._high, dtype)
+        if batch is not None and before is not None:
+            for i in range(self.num_envs):
+                batch.restart(i, before.memory(i))
+        self.constraint_batch = batch
+
+    def _follow_models(self, envs: Mask) -> None:
+        """Read the models of these envs anew where they have changed."""
+        for i in np.flatnonzero(envs).tolist():
+            engine = self.filters[i].filter
+            version = engine.plant.model_version
+            engine.plant.follow()
+            if engine.plant.model_version != version:
+                engine.observe()
+        self._follow_constraints()
+
+    def _follow_constraints(self) -> None:
+        """A batch is of the constraints that are bound at present."""
+        if any(
+            single.filter.bound[0] is not own for single, own in zip(self.filters, self._batched, strict=True)
+        ):
+            self._make_batch(self.constraint_batch)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -128,12 +151,13 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         for single, was_judged in zip(self.filters, judged.tolist(), strict=True):
             single.filter_seconds += each * was_judged
             single.filter_calls += was_judged
-        observations, rewards, terminated, truncated, infos = self._step(sent, judged)
+        observations, rewards, terminated, truncated, infos = self.env.step(sent)
         self._ended = np.asarray(terminated | truncated)
         restarted = self._ended if self._same_step else ~judged
         if self._same_step and restarted.any():
             self._received(infos["final_obs"], infos["final_info"], restarted)
         self._received(observations, infos, ~restarted)
+        self._compare(reports, judged)
         self._report(infos, reports, judged & ~restarted)
         if self._same_step and restarted.any():
             self._report(infos["final_info"], reports, restarted)
@@ -141,17 +165,11 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         self._start(infos, restarted)
         return observations, rewards, terminated, truncated, infos
 
-    def _step(self, sent: Rows, judged: Mask) -> Any:
-        """Step the envs; what was simulated for the decisions is not simulated again."""
-        decided = () if self.constraint_batch is not None else np.flatnonzero(judged).tolist()
-        plants = [self.filters[i].plant for i in decided]
-        try:
-            for plant in plants:
-                plant.offer_rollout()
-            return self.env.step(sent)
-        finally:
-            for plant in plants:
-                plant.withdraw_rollout()
+    def _compare(self, reports: dict[str, NDArray[Any]], judged: Mask) -> None:
+        """`cbf/mismatch`; a state that another episode has replaced within the step cannot be compared."""
+        replaced = self._same_step and not self.filters[0].plant.simulates
+        for i in np.flatnonzero(judged & ~self._ended if replaced else judged).tolist():
+            reports[keys.CBF_MISMATCH][i] = self.filters[i].deviates()
 
     def _received(self, observations: Any, infos: dict[str, Any], mask: Mask) -> None:
         """Tell plants that simulate what their envs have returned."""
@@ -178,7 +196,11 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         reports[keys.PROPOSED_ACTION], reports[keys.EXECUTED_ACTION] = np.zeros((2, *given.shape))
         left = judged
         if self.constraint_batch is not None:
-            left = judged & ~self._judge_together(self.constraint_batch, given, sent, judged, reports)
+            self._follow_models(judged)
+            together = self._judge_together(self.constraint_batch, given, sent, judged, reports)
+            for i in np.flatnonzero(together).tolist():
+                self.filters[i].plant.executed(reports[keys.EXECUTED_ACTION][i])
+            left = judged & ~together
         for i in np.flatnonzero(left).tolist():
             engine = self.filters[i].filter
             if self.constraint_batch is not None:
@@ -240,8 +262,8 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         if not mask.any():
             return
         for key, values in reports.items():
-            values[~mask] = 0
-            infos[key], infos[f"_{key}"] = values.copy(), mask.copy()
+            infos[key], infos[f"_{key}"] = values.copy(), mask.copy()  # the rest goes into final_info
+            infos[key][~mask] = 0
         if self.filters[0].filter.reporting:
             actions = reports[keys.PROPOSED_ACTION], reports[keys.EXECUTED_ACTION]
             for i in np.flatnonzero(mask).tolist():
@@ -249,8 +271,12 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
 
     def _start(self, infos: dict[str, Any], restarted: Mask) -> None:
         """Take the states of new episodes, and report them."""
-        for i in np.flatnonzero(restarted).tolist():
+        started = np.flatnonzero(restarted).tolist()
+        for i in started:
             self._add_info(infos, self.filters[i].start_report(), i)
+        if self.constraint_batch is not None:
+            self._follow_constraints()
+        for i in started:
             engine = self.filters[i].filter
             self._last[i] = engine.last
             if self.constraint_batch is not None:

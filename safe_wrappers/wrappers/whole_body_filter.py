@@ -10,7 +10,6 @@ from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibi
 from safe_wrappers.constraints.contact.stance import Stance
 from safe_wrappers.constraints.contact.support_margin import SupportMargin
 from safe_wrappers.constraints.limits.joints import JointPositionLimit, refuse_uncovered_stops, stops
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
@@ -25,7 +24,6 @@ HOLDS = 3
 """Control steps to look ahead for the joints unless told otherwise."""
 
 
-@deprecated_parameters(renamed={"holds": "horizon"})
 class WholeBodyFilter(CBFActionFilter):
     """Keeps a legged robot's contact forces inside their friction cones and its joints off their stops.
 

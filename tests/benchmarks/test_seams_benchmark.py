@@ -14,9 +14,9 @@ pytest.importorskip("stable_baselines3")  # the policies are SB3's
 
 from benchmarks import chunk_policy, seam_bounds, seams
 from benchmarks.chunk_policy import TASKS, basis
+from benchmarks.flexible_joint import smoothstep_energy, step_energies
 from benchmarks.seam_bounds import Bounds, bounds_of
 from benchmarks.seams import Job, Recorder, alone, episode, faded_in, jobs, table
-from safe_wrappers.appendix.handover.flexible_joint import smoothstep_energy, step_energy
 
 FLEX, REACHER = TASKS[:2]
 TINY = tuple(dataclasses.replace(task, steps=1, rollout=64) for task in TASKS[:2])  # one rollout
@@ -132,7 +132,8 @@ def test_the_arms_bounds_keep_what_they_say():
     angles[:, 1] = np.linspace(0.0, np.pi, 50)
     constants = arm.stiffness, arm.rotor_inertia, arm.link_inertia(angles)
     for torque in ([1.0, 0.0], [0.0, 1.0], [3.0, 1.0], [3.0, -1.0]):
-        left = smoothstep_energy(torque, bounds.blend_time, *constants) / step_energy(torque, *constants)
+        stepped = step_energies(torque, *constants).sum(axis=-1)
+        left = smoothstep_energy(torque, bounds.blend_time, *constants) / stepped
         assert left.max() <= 0.1
     assert left.max() > 0.01
     # A ramp at the limit, on the arm itself: the most it stores at any moment of it and after.
@@ -158,11 +159,10 @@ def test_alone_a_held_torque_shakes_nothing_and_a_step_does_what_its_energy_says
     held = np.tile([1.0, 0.3], (6, 1))
     step = np.concatenate([held[:1], np.tile([-0.5, 0.3], (5, 1))])
     arm = env.arm
-    injected = step_energy(
-        [1.5, 0.0], arm.stiffness, arm.rotor_inertia, arm.link_inertia(np.array([0.3, 1.2]))
-    )
+    machine = arm.stiffness, arm.rotor_inertia, arm.link_inertia(np.array([0.3, 1.2]))
+    injected = step_energies([1.5, 0.0], *machine).sum()
     assert alone(env, *state, held) < 0.02 * injected
-    assert alone(env, *state, step) == pytest.approx(float(injected), rel=0.15)
+    assert alone(env, *state, step) == pytest.approx(injected, rel=0.15)
 
 
 def test_reachers_bounds_come_from_the_action_and_the_time_between_seams():

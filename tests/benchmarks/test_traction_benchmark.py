@@ -19,8 +19,7 @@ from benchmarks.traction import (
     stopping_distance,
     tables,
 )
-from safe_wrappers.appendix.vehicle.burckhardt import peak
-from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
+from safe_wrappers.envs.ground import MAGIC_FORMULA
 
 HARD = ("full throttle", "panic brake", "pulse")
 G = 9.81
@@ -67,9 +66,9 @@ def test_the_cars_wheels_slip_less_with_the_limiter():
 
 @pytest.mark.parametrize("ground", ["dry", "snow"])
 def test_stopping_distances_are_the_physics(ground):
-    top = peak(MAGIC_FORMULA[ground])
-    best = START_SPEED**2 / (2.0 * top.friction * G)
-    at_peak = constant_slip_distance(ground, top.slip)
+    top = MAGIC_FORMULA[ground]
+    best = START_SPEED**2 / (2.0 * top.peak_friction * G)
+    at_peak = constant_slip_distance(ground, top.peak_slip)
     assert at_peak == pytest.approx(best, rel=0.03)
     # Locked wheels slide on what is left of the friction behind the peak.
     locked = START_SPEED**2 / (2.0 * MAGIC_FORMULA[ground].at(1.0) * G)
@@ -112,7 +111,7 @@ def test_the_command_prints_every_driver_and_ground_and_keeps_the_rows(tmp_path,
             assert f"| {driver} | {arm} | 40 |" in printed
     assert len(kept["car"]) == 2 * 2 and "| limiter on | 40 |" in printed
     assert [row["ground"] for row in kept["stopping"]] == ["dry"]
-    assert kept["stopping"][0]["best_slip"] == pytest.approx(peak(MAGIC_FORMULA["dry"]).slip, abs=0.03)
+    assert kept["stopping"][0]["best_slip"] == pytest.approx(MAGIC_FORMULA["dry"].peak_slip, abs=0.03)
 
 
 def test_parts_of_a_driver_are_added_up():

@@ -10,7 +10,7 @@ from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.backup.base import Detour
-from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsafeStateWarning, UnsupportedEnvError
 
 FULL = np.array([1.0, 1.0])
 BACK = -FULL
@@ -250,3 +250,24 @@ def test_a_plant_without_a_model_is_refused():
     plant = sw.AnalyticPlant(f=lambda x: -x, g=lambda x: np.eye(1), state=lambda env: np.zeros(1))
     with pytest.raises(UnsupportedEnvError, match="needs a MujocoPlant"):
         sw.constraints.CoastingClearance(keep_out=[sw.constraints.Disc([0, 0], 1)]).bind(plant)
+
+
+def test_an_outline_that_no_obstacle_meets_is_refused():
+    square = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
+    disc = sw.constraints.Disc([0.0, 0.0], 0.2)
+    with pytest.raises(ConfigurationError, match="outline is kept out of untouched"):
+        sw.constraints.CoastingClearance(keep_out=[disc], outline=square)
+    sw.constraints.CoastingClearance(untouched=[disc], outline=square)
+
+
+@pytest.mark.parametrize(
+    "constraint",
+    [
+        sw.constraints.CoastingClearance([sw.constraints.Disc([0.0, 0.0], 0.2)]),
+        sw.constraints.HeadingDriveClearance([sw.constraints.Disc([0.0, 0.0], 0.2)]),
+        sw.constraints.Upright(tilt=0.3),
+    ],
+)
+def test_a_body_that_was_left_at_its_default_is_asked_for(constraint):
+    with pytest.raises(UnknownNameError, match=r"no body '\w+'; give another by body=; it has: world, body0"):
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [constraint])

@@ -1,5 +1,7 @@
 """JointPositionLimit: attacked closed loops judged at every substep, ranges, and what is refused."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -81,7 +83,7 @@ def test_a_margin_covers_a_wrong_mass():
 
 
 def test_far_inside_the_actions_pass_bit_for_bit():
-    check_inactive("Reacher-v5", sw.constraints.JointPositionLimit(-20.0, 20.0, ["joint0"]), 1.0, 50)
+    check_inactive("Reacher-v5", sw.constraints.JointPositionLimit(-6.0, 6.0, ["joint0"]), 1.0, 50)
 
 
 @pytest.mark.parametrize("start", [[1.7, 0.5], [-1.7, -1.65]])
@@ -233,3 +235,30 @@ def test_a_slide_is_measured_in_metres_and_a_machine_without_ranges_asks_for_the
         sw.CBFActionFilter(sliders(), [sw.constraints.JointPositionLimit()])
     env = sliders()
     assert value(env, sw.constraints.JointPositionLimit(-1.0, 2.0), [0.5]).tolist() == [1.5, 1.5]
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "joint", "warned"),
+    [
+        (-90, 90, "joint0", True),
+        (None, 170.0, "joint1", True),
+        (-np.pi, np.pi, "joint0", False),
+        (-7.0, np.inf, "joint0", True),
+        (-90, 90, "slider", False),
+    ],
+)
+def test_bounds_of_a_hinge_beyond_a_full_turn_are_warned_of_as_degrees(lower, upper, joint, warned):
+    env = gym.make("InvertedPendulum-v5" if joint == "slider" else "Reacher-v5")
+    limit = sw.constraints.JointPositionLimit(lower, upper, [joint])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sw.CBFActionFilter(env, [limit])
+    said = [str(one.message) for one in caught]
+    assert any("np.deg2rad" in one and repr(joint) in one for one in said) == warned
+
+
+def test_a_hinge_that_the_model_lets_turn_often_is_not_warned_of():
+    env = gym.make("Reacher-v5")
+    env.unwrapped.model.jnt_limited[0], env.unwrapped.model.jnt_range[0] = 1, (-30.0, 30.0)
+    with warnings.catch_warnings(action="error"):
+        sw.CBFActionFilter(env, [sw.constraints.JointPositionLimit(-20.0, 20.0, ["joint0"])])

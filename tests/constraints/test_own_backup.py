@@ -121,8 +121,9 @@ def test_constants_are_read_at_binding_and_when_the_model_has_changed():
     assert bound.constants == 1
     env.plant.model_version += 1
     env.step(np.zeros(1, np.float32))
+    anew = env.filter.bound[0]
     env.step(np.zeros(1, np.float32))
-    assert bound.constants == 2
+    assert anew is not bound and anew is env.filter.bound[0]
 
 
 def test_one_that_says_neither_how_much_is_left_nor_what_is_admitted_is_refused():

@@ -74,6 +74,40 @@ def test_any_backup_of_a_list_admits():
         assert found.admits(np.array([0.0])) == expected
 
 
+class Settable(gym.Env):
+    """The state is the last action."""
+
+    observation_space = gym.spaces.Box(-9.0, 9.0, (2,), np.float64)
+
+    def __init__(self, space):
+        self.action_space = space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2), {}
+
+    def step(self, action):
+        return np.ravel(action).astype(float)[:2], 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("backup", [[0, 0, 1.0], [0, 0, 1], (0.0, 0.0, 1.0), np.array([0, 0, 1])])
+def test_numbers_as_many_as_the_action_has_are_one_backup(backup):
+    space = gym.spaces.Box(-1.0, 1.0, (3,), np.float64)
+    found = asked(shield(h=lambda o: 1.0, backup=backup, terminal=None), env=Settable(space))
+    np.testing.assert_array_equal(found.backup(), [0.0, 0.0, 1.0])
+
+
+def test_whole_numbers_are_one_action_of_many_parts_or_several_of_one():
+    parts = gym.spaces.MultiDiscrete([2, 3])
+    several = shield(h=lambda o: 1.0 if o[0] == 1.0 else -1.0, backup=[0, 1], terminal=None)
+    env = sw.ActionShield(Settable(gym.spaces.Discrete(3)), [several])
+    env.reset(seed=0)
+    assert env.step(2)[4]["executed_action"] == [1]
+    one = sw.ActionShield(Settable(parts), [shield(h=lambda o: float(o[1]), backup=[0, 2], terminal=None)])
+    one.reset(seed=0)
+    np.testing.assert_array_equal(one.filter.bound[0].backup(), [0.0, 2.0])
+
+
 def test_the_survivor_of_the_last_step_is_asked_first():
     calls = []
 
@@ -359,6 +393,9 @@ def test_backups_that_do_not_fit_are_refused():
         sw.CBFActionFilter(Cart(), [shield(backup=lambda o: [0.5, 0.5])]).reset(seed=0)
     with pytest.raises(ConfigurationError, match="the backup must be a finite action"):
         sw.CBFActionFilter(Cart(), [shield(backup=np.array([np.nan]))])
+    for no_number in ([10**400], np.ma.masked_array([0.0], True)):
+        with pytest.raises(ConfigurationError, match="the backup must be a finite action"):
+            sw.CBFActionFilter(Cart(), [shield(backup=lambda o, u=no_number: u)]).reset(seed=0)
     with pytest.raises(ConfigurationError, match="discrete action has no zero"):
         sw.ActionShield(Grid(), [PredictiveShield("cost", 2)])
     with pytest.raises(UnsupportedEnvError, match=r"take plant=SimulatorPlant\(\)"):

@@ -35,7 +35,7 @@ def still_plant():
     plant = SimpleNamespace(
         has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1, observation_id=0
     )
-    plant.left, plant.gain, plant.asked, plant.model_version = 0.5, 1.0, [], 0
+    plant.left, plant.gain, plant.asked = 0.5, 1.0, []
 
     def forecast(control, horizon, euler=False):
         plant.asked.append(np.array(control))

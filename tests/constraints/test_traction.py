@@ -9,9 +9,8 @@ import pytest
 from vehicles import FULL, OPEN, Trolley, rover
 
 import safe_wrappers as sw
-from safe_wrappers.appendix.vehicle.burckhardt import peak
-from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.control.vehicle.slip import slip_ratio
+from safe_wrappers.envs.ground import MAGIC_FORMULA
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 
@@ -24,14 +23,14 @@ def drive(env, action, steps, **layout):
 @pytest.mark.parametrize("throttle", [1.0, -1.0])
 def test_full_throttle_stays_on_the_stable_side(ground, throttle):
     infos = drive(rover(), throttle * FULL, 150, ground=ground)
-    top = peak(MAGIC_FORMULA[ground])
+    top = MAGIC_FORMULA[ground]
     slips = np.array([info["slip"] for info in infos])
     assert max(info["slip_max"] for info in infos) < 0.16
     # The estimate is of a peak that is flat: within a sixth of where it is, less than a hundredth of force is lost.
-    assert np.abs(slips).max() < max(1.17 * top.slip, 0.135)
-    assert (np.abs(slips[60:]) > 0.6 * top.slip).all()  # and it uses what there is
+    assert np.abs(slips).max() < max(1.17 * top.peak_slip, 0.135)
+    assert (np.abs(slips[60:]) > 0.6 * top.peak_slip).all()  # and it uses what there is
     estimate = infos[-1]["slip/mu_estimate"]
-    np.testing.assert_allclose(estimate, top.friction, rtol=0.2)
+    np.testing.assert_allclose(estimate, top.peak_friction, rtol=0.2)
 
 
 @pytest.mark.parametrize("ground", ["dry", "wet", "snow", "ice"])
@@ -50,7 +49,7 @@ def test_a_panic_brake_stops_within_the_physics(ground, longest):
     raw = env.unwrapped
     while raw.forward_speed > 0.02:
         env.step(-FULL)
-    assert raw.agent_position[0] < longest * 9.0 / (2.0 * peak(MAGIC_FORMULA[ground]).friction * 9.81)
+    assert raw.agent_position[0] < longest * 9.0 / (2.0 * MAGIC_FORMULA[ground].peak_friction * 9.81)
 
 
 def test_another_ground_costs_a_step_or_two():

@@ -16,7 +16,7 @@ from vehicles import FULL, MOTORS, OPEN, WHEEL, Trolley, rover
 import safe_wrappers as sw
 from safe_wrappers.constraints import traction as traction_module
 from safe_wrappers.control.vehicle.slip import slip_ratio
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 
 
 def start(env, **layout):
@@ -226,15 +226,13 @@ def test_a_tendon_that_drives_a_limited_wheel_is_refused():
         sw.SlipLimiter(Trolley(actuators=alone), wheels=["left", "right"])
 
 
-def test_a_drive_of_the_plants_model_that_changes_is_read_anew():
+def test_a_drive_that_changes_is_read_anew():
     env = sw.SlipLimiter(Trolley(0.15), wheels=["left", "right"])
     env.reset(seed=0)
-    traction, plant = env.filter.bound[0], env.plant
-    before = traction.rows().normals
-    plant.model.actuator_gear[:, 0] *= 2.0
-    plant.model_version += 1
+    before = env.filter.bound[0].rows().normals
+    env.unwrapped.model.actuator_gear[:, 0] *= 2.0
     env.filter.observe()
-    np.testing.assert_allclose(traction.rows().normals, 2.0 * before)
+    np.testing.assert_allclose(env.filter.bound[0].rows().normals, 2.0 * before)
 
 
 @pytest.mark.parametrize("change", ["geoms more", "geoms less", "cone"])
@@ -265,6 +263,7 @@ def test_loads_are_the_envs_whatever_the_plants_model_looks_like(change):
     np.testing.assert_allclose(filtered.filter.bound[0].seen.load, expected, rtol=1e-6)
 
 
+LEFT_RIGHT = ["left", "right"]
 SERVOS = "".join(f'<velocity joint="{side}" kv="{{kv}}" ctrlrange="-40 40"/>' for side in ("left", "right"))
 
 
@@ -301,6 +300,29 @@ def test_a_servo_faster_than_the_hold_still_drives(kv, substeps):
     assert np.abs(slips).max() < 0.17
     assert np.abs(slips).max() > 0.09
     assert env.unwrapped.data.qvel[0] > 0.3
+
+
+@pytest.mark.parametrize("clamp", ["", 'forcerange="-1 1"'])
+@pytest.mark.parametrize("integrator", ["EULER", "IMPLICITFAST"])
+def test_a_servo_too_stiff_to_be_limited_is_refused_with_one_that_works(integrator, clamp):
+    def limited(kv):
+        servos = "".join(
+            f'<velocity joint="{side}" kv="{kv}" ctrlrange="-40 40" {clamp}/>' for side in LEFT_RIGHT
+        )
+        raw = Trolley(0.9, actuators=servos)
+        raw.model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+        return sw.SlipLimiter(raw, wheels=LEFT_RIGHT)
+
+    with pytest.raises(UnsupportedEnvError, match=r"speed servo 'left' is too stiff") as caught:
+        limited(30.0)
+    kv = float(str(caught.value).rpartition("at most ")[2])
+    env = limited(kv)
+    env.reset(seed=0)
+    changed = 0
+    for step in range(200):  # to 20 rad/s within a second: the ground has ten times what that takes
+        info = env.step(np.full(2, 20.0 * min(1.0, step / 100.0), dtype=np.float32))[4]
+        changed += info["cbf/intervened"]
+    assert changed == 0 and env.unwrapped.data.qvel[0] > 1.9
 
 
 def test_dry_friction_of_an_axle_leaves_the_limit_where_it_is():

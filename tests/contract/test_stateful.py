@@ -124,6 +124,8 @@ FORMS = {
     "objects that are none": lambda a: np.full(a.shape, None),
     "dates": lambda a: np.full(a.shape, "2020-01-01", dtype="datetime64[D]"),
     "mapping": lambda a: {"action": a},
+    "beyond float64": lambda a: np.full(a.shape, 10**400, dtype=object),
+    "masked": lambda a: np.ma.masked_array(a, True),
 }
 MARGINS = st.sampled_from([0.0, 0.05, 0.2, -0.1, 1e9, math.nan, math.inf, "wide", None])
 SEEDS = st.one_of(st.none(), st.integers(0, 5))

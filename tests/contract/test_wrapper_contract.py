@@ -339,6 +339,32 @@ def test_inactive_is_bit_identical(name, case):
             assert action.tobytes() == before
 
 
+def no_array_of_numbers(action):
+    """By name: what NumPy makes no numbers of, or other numbers than were given."""
+    masked = np.ma.masked_array(np.ones_like(action), np.arange(action.size).reshape(action.shape) == 0)
+    rest = action.ravel()[1:].tolist()
+    return {
+        "beyond float64": np.array([10**400, *rest], dtype=object).reshape(action.shape).tolist(),
+        "too long to print": np.array([10**5000, *rest], dtype=object).reshape(action.shape).tolist(),
+        "masked": masked,
+        "a list with a masked entry": list(masked),
+        "text": np.full(action.shape, "0.1"),
+    }
+
+
+@every_wrapper
+def test_what_is_no_array_of_numbers_is_refused_and_does_not_get_through(name, case):
+    env_id, arguments = example(name, case)
+    witness = Witness(made(name, env_id))
+    env = getattr(sw, name)(inside(name, witness), **arguments())
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, env.action_space.dtype)
+    for bad in no_array_of_numbers(np.atleast_1d(action)).values():
+        with pytest.raises(sw.errors.ActionError, match="expected"):
+            env.step(bad[0] if env_id == DISCRETE and isinstance(bad, list) else bad)
+        assert not hasattr(witness, "action")
+
+
 @every_wrapper
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_non_finite_action_does_not_get_through(name, case, bad):

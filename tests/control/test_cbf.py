@@ -1,11 +1,10 @@
-"""Lie derivatives, class-K decay, Nagumo's test and relative degree: against differences and textbook systems."""
+"""Lie derivatives and relative degree: against differences and textbook systems."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.appendix.filtering.barriers import best_rate, nagumo_holds, power_decay
 from safe_wrappers.control.filtering.cbf import (
     cbf_rows,
     lie_derivatives,
@@ -50,29 +49,8 @@ def test_batches_of_any_shape():
     one, row = lie_derivatives(dh[1, 2], fs[1, 2], gs[1, 2])
     assert drift[1, 2] == pytest.approx(one)
     np.testing.assert_allclose(effect[1, 2], row)
-    best = best_rate(drift, effect, -np.ones(2), np.ones(2))
-    np.testing.assert_allclose(best, drift + np.abs(effect).sum(-1))
     normals, offsets = cbf_rows(drift, effect, 2.0 * drift)
     assert normals.shape == (4, 5, 2) and offsets.shape == (4, 5)
-
-
-@given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 10))
-def test_decay_is_class_k(a, b, alpha):
-    for decay in (
-        lambda v: power_decay(v, alpha, 1.0),
-        lambda v: power_decay(v, alpha, 3.0),
-        lambda v: power_decay(v, alpha, 0.5),
-    ):
-        assert decay(0.0) == 0.0
-        if a < b:
-            assert decay(a) <= decay(b)
-        assert decay(-a) == pytest.approx(-decay(a))
-    assert power_decay(a, alpha, 1.0) == pytest.approx(alpha * a)
-
-
-@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
-def test_an_unsafe_state_is_driven_back(power):
-    assert power_decay(-0.3, 2.0, power) < 0.0  # h' >= positive
 
 
 @given(st.integers(0, 1000))
@@ -83,35 +61,6 @@ def test_rows_say_the_same_as_the_condition(seed):
     normals, offsets = cbf_rows(drift, effect, 1.5 * h(x))
     left = drift + effect @ u + 1.5 * h(x)
     assert offsets - normals @ u == pytest.approx(left, abs=1e-12)
-
-
-@given(st.integers(0, 1000))
-def test_best_rate_is_reached_at_a_corner(seed):
-    rng = np.random.default_rng(seed)
-    effect, low = rng.normal(size=3), -rng.uniform(0, 2, 3)
-    high = low + rng.uniform(0, 2, 3)
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-    assert best_rate(0.7, effect, low, high) == pytest.approx(0.7 + (corners @ effect).max())
-
-
-def test_best_rate_ignores_an_infinite_bound_without_effect():
-    assert best_rate(0.5, [0.0, 1.0], [-np.inf, -1.0], [np.inf, 1.0]) == 1.5
-    assert best_rate(0.5, [1.0, 0.0], [-np.inf, -1.0], [np.inf, 1.0]) == np.inf
-
-
-def test_nagumo_at_the_boundary():
-    # v' = u in [-1, 1], h = 1 - v^2, at v = 1: h' = -2 u, so braking keeps it.
-    arguments = dict(lf_h=0.0, lg_h=[-2.0], lower=[-1.0], upper=[1.0])
-    assert nagumo_holds(0.0, **arguments)
-    assert nagumo_holds(0.0, **{**arguments, "lf_h": -2.0})  # just
-    assert not nagumo_holds(0.0, **{**arguments, "lf_h": -2.1})  # the drift is stronger
-    assert nagumo_holds(0.5, **{**arguments, "lf_h": -9.0})  # inside there is nothing to hold
-    assert not nagumo_holds(-0.5, **{**arguments, "lf_h": 9.0})  # outside it is lost
-    assert nagumo_holds(-1e-10, **arguments) and nagumo_holds(1e-10, **arguments)
-    assert nagumo_holds(0.05, lf_h=-9.0, lg_h=[0.0], lower=[-1], upper=[1], boundary=0.01)
-    assert not nagumo_holds(0.05, lf_h=-9.0, lg_h=[0.0], lower=[-1], upper=[1], boundary=0.1)
-    both = nagumo_holds([0.0, 0.0], [0.0, -3.0], [[-2.0], [-2.0]], [-1.0], [1.0])
-    np.testing.assert_array_equal(both, [True, False])
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from oracles import blind_covariance, double_integrator_covariance
 from scipy.optimize import brentq
 
-from safe_wrappers.appendix.estimation.covariance import blind_covariance, double_integrator_covariance
 from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.errors import ConfigurationError
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from safe_wrappers.appendix.vehicle.traction_curves import MagicFormula
 from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
+from safe_wrappers.envs.ground import MagicFormula
 
 NOISE = 0.02
-EARLY = MagicFormula.from_peak(peak_friction=0.3, peak_slip=0.05)
-LATE = MagicFormula.from_peak(peak_friction=0.9, peak_slip=0.15)
+EARLY = MagicFormula(peak_friction=0.3, peak_slip=0.05)
+LATE = MagicFormula(peak_friction=0.9, peak_slip=0.15)
 
 
 def drive(estimate, curve, count, rng):

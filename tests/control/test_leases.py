@@ -1,6 +1,5 @@
 """Leases: the inequality in exact fractions, and machines that stop at the margin or hit."""
 
-from dataclasses import fields
 from fractions import Fraction
 
 import numpy as np
@@ -8,8 +7,6 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from safe_wrappers.appendix.watchdog.lease_delays import LeaseDelays
-from safe_wrappers.appendix.watchdog.reachability import stopping_distance
 from safe_wrappers.control.watchdog.leases import longest_lease, longest_lease_of_room
 from safe_wrappers.errors import ConfigurationError
 
@@ -76,8 +73,7 @@ def test_the_lease_is_the_longest_that_keeps_the_inequality(d, v, b, delays, loc
 
 def test_the_appendix_formula():
     # (10 - 0.3 - 0.2 - 4 / 4) / 2 - 0.6, by hand
-    delays = LeaseDelays(detect_s=0.1, hold_s=0.2, age_s=0.05, act_s=0.25)
-    assert longest_lease(10.0, 2.0, 2.0, delays.total_s, 0.3, 0.2) == pytest.approx(3.65, abs=1e-9)
+    assert longest_lease(10.0, 2.0, 2.0, 0.1 + 0.2 + 0.05 + 0.25, 0.3, 0.2) == pytest.approx(3.65, abs=1e-9)
     assert longest_lease(1.2, 2.0, 2.0, 0.1, 0.1, 0.1) == pytest.approx(-0.1, abs=1e-9)
     # 8 m of budget instead of 10 lost to a speed of 4 instead of 2
     assert longest_lease(10.0, 6.0, 2.0, 0.0, 0.5, 0.5) == pytest.approx(0.0, abs=1e-9)
@@ -106,7 +102,7 @@ def test_a_lease_of_the_formula_stops_at_the_margin_and_five_percent_more_hits(a
     rng = np.random.default_rng(seed)
     speed, braking, delays = rng.uniform(0.3, 2.0), rng.uniform(1.0, 4.0), rng.uniform(0.0, 0.2)
     reserve = rng.uniform(0.5, 2.0)
-    clearance = float(stopping_distance(speed + 3.0, braking)) + reserve
+    clearance = (speed + 3.0) ** 2 / (2.0 * braking) + reserve
     rest = (speed, braking, delays)
     lease = float(longest_lease(clearance, *rest, 0.05, 0.1, acceleration, top))
     assert lease > 0.0
@@ -158,7 +154,6 @@ def test_only_the_top_speed_may_be_infinite(top, lease):
 @pytest.mark.parametrize("braking", [0.0, -1.0])
 def test_without_brakes_there_is_no_lease(braking):
     assert longest_lease(5.0, [1.0, 0.0, -1.0], braking, 0.1).tolist() == [-np.inf] * 3
-    assert stopping_distance(1.0, braking) == np.inf
 
 
 @pytest.mark.parametrize("name", ["delays_s", "localisation", "margin", "acceleration", "top_speed"])
@@ -201,17 +196,6 @@ def test_more_of_anything_bad_shortens_the_lease(d, v, b, delays, a, more):
         assert shorter <= lease + 1e-9 * abs(lease) or lease <= 0.0
 
 
-@given(st.floats(-3, 30), POSITIVE)
-def test_stopping_distance_is_braking_to_rest(speed, braking):
-    time = max(speed, 0.0) / braking
-    assert stopping_distance(speed, braking) == pytest.approx(max(speed, 0.0) * time / 2)
-
-
-@pytest.mark.parametrize("speed, braking", [(np.nan, 1.0), (np.inf, 1.0), (1.0, np.nan), (1.0, np.inf)])
-def test_stopping_distance_of_the_unknown_is_infinite(speed, braking):
-    assert stopping_distance(speed, braking) == np.inf
-
-
 @given(st.floats(-10, 100), st.floats(-1, 10), SMALL)
 @example(1.0, 5e-324, 0.1)
 def test_a_lease_of_room_is_used_up_exactly(room, closing, delays):
@@ -233,14 +217,3 @@ def test_a_lease_of_unknown_room_is_revoked(bad):
     assert longest_lease_of_room([bad, 1.0], [1.0, bad], 0.1).tolist() == [-np.inf, -np.inf]
     with pytest.raises(ConfigurationError, match="delays_s"):
         longest_lease_of_room(1.0, 1.0, -0.1)
-
-
-def test_delays():
-    assert LeaseDelays().total_s == 0.0
-    assert LeaseDelays(0.1, 0.2, 0.3, 0.4).total_s == pytest.approx(1.0)
-    for field in fields(LeaseDelays):
-        for bad in (-1e-9, np.nan, np.inf):
-            with pytest.raises(
-                ConfigurationError, match=f"{field.name} must be a finite time of at least 0 s"
-            ):
-                LeaseDelays(**{field.name: bad})

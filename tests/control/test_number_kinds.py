@@ -3,19 +3,6 @@
 import numpy as np
 import pytest
 
-from safe_wrappers.appendix.contact import forces, lemke
-from safe_wrappers.appendix.estimation import consistency, sigma_coverage
-from safe_wrappers.appendix.estimation import covariance as appendix_covariance
-from safe_wrappers.appendix.estimation import observability as appendix_observability
-from safe_wrappers.appendix.filtering import barriers
-from safe_wrappers.appendix.filtering import manipulability as appendix_manipulability
-from safe_wrappers.appendix.handover import blends, flexible_joint
-from safe_wrappers.appendix.handover import splines as appendix_splines
-from safe_wrappers.appendix.legged import balance
-from safe_wrappers.appendix.teleop import energy_ledger, passivity_controller, waves
-from safe_wrappers.appendix.vehicle import slip as appendix_slip
-from safe_wrappers.appendix.watchdog import lease_delays
-from safe_wrappers.appendix.watchdog import reachability as appendix_reachability
 from safe_wrappers.control.contact import contact, friction_cone, impact
 from safe_wrappers.control.estimation import covariance, kalman, observability
 from safe_wrappers.control.filtering import cbf, manipulability
@@ -35,24 +22,13 @@ CORNERS = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
 
 CALLS = {
     "lie_derivatives": (cbf.lie_derivatives, [[1, 2], [3, 4], EYE]),
-    "power_decay": (barriers.power_decay, [2, 3, 2]),
     "cbf_rows": (cbf.cbf_rows, [2, [3, 1], 2]),
-    "best_rate": (barriers.best_rate, [2, [3, -1], [-1, -1], [1, 1]]),
-    "nagumo_holds": (barriers.nagumo_holds, [0, 2, [3, -1], [-1, -1], [1, 1]]),
     "numerical_gradient": (lambda x: cbf.numerical_gradient(lambda y: y @ y, x), [[3, 4]]),
     "complementarity_residuals": (contact.complementarity_residuals, [[1, 0], [0, 2]]),
     "discretise": (covariance.discretise, [CHAIN, EYE, 2]),
     "discretise_drift": (covariance.discretise_drift, [CHAIN, [1, 2], 2]),
-    "blind_covariance": (appendix_covariance.blind_covariance, [EYE, CHAIN, EYE, 2]),
-    "seen_covariance": (appendix_covariance.seen_covariance, [EYE, CHAIN, EYE, [[1, 0]], [[1]], 2]),
-    "double_integrator_covariance": (appendix_covariance.double_integrator_covariance, [EYE, 2, 3]),
-    "steady_state": (appendix_covariance.steady_state, [CHAIN, EYE, [[1, 0]], [[1]]]),
     "blind_time": (covariance.blind_time, [EYE, CHAIN, EYE, [1, 0], 9, 1, 60]),
-    "resonances": (flexible_joint.resonances, [[100, 50], [2, 1], EYE]),
-    "damping_ratios": (flexible_joint.damping_ratios, [[100, 50], [2, 1], EYE, 3, 1]),
     "normal_and_tangential": (friction_cone.normal_and_tangential, [[1, 2, 3], UP]),
-    "friction_ratio": (forces.friction_ratio, [[1, 2, 3], UP, 1]),
-    "in_cone": (forces.in_cone, [[1, 2, 3], UP, 1]),
     "cone_excess": (friction_cone.cone_excess, [[1, 2, 3], UP, 1]),
     "tangents": (friction_cone.tangents, [UP]),
     "restitution_velocity": (impact.restitution_velocity, [-3, 1]),
@@ -68,78 +44,42 @@ CALLS = {
     "braked_peak_force": (impact.braked_peak_force, [2, 4, 100, 3, 1]),
     "predict": (kalman.predict, [[1, 2], EYE, CHAIN, EYE]),
     "update": (kalman.update, [[1, 2], EYE, [1], [[1, 0]], [[1]]]),
-    "normalised_error_squared": (consistency.normalised_error_squared, [[1, 2], EYE]),
-    "lease_delays": (lambda *late: lease_delays.LeaseDelays(*late).total_s, [1, 0, 2, 3]),
-    "stopping_distance": (appendix_reachability.stopping_distance, [2, 1]),
     "longest_lease": (leases.longest_lease, [1, 1, 1, 0]),
     "longest_lease, all": (leases.longest_lease, [9, 2, 1, 1, 1, 1, 1, 4]),
     "longest_lease, jerk": (leases.longest_lease, [9, 2, 1, 1, 1, 1, 1, 4, 3]),
     "longest_lease_of_room": (leases.longest_lease_of_room, [9, 2, 1]),
     "round_trip_ceiling": (leases.round_trip_ceiling, [9, 1, 1, 0, 1, 1]),
-    "solve_lcp": (lambda m, q: lemke.solve_lcp(m, q)[:2], [EYE, [-1, 2]]),
     "manipulability": (manipulability.manipulability, [[[1, 2], [0, 3]]]),
-    "joint_rates": (appendix_manipulability.joint_rates, [[[1, 2], [0, 3]], [1, 1]]),
     "worst_joint_rates": (manipulability.worst_joint_rates, [[[1, 2], [0, 3]]]),
-    "observability_matrix": (appendix_observability.observability_matrix, [CHAIN, [[1, 0]]]),
     "unobservable_directions": (
         lambda a, c: len(observability.unobservable_directions(a, c)),
         [CHAIN, [[1, 0]]],
     ),
-    "linear_observability": (
-        lambda a, c: appendix_observability.linear_observability(a, c).rank,
-        [CHAIN, [[1, 0]]],
-    ),
-    "port_power": (waves.port_power, [2, 3]),
     "to_waves": (passivity.to_waves, [2, 3, 4]),
-    "from_waves": (waves.from_waves, [2, 3, 4]),
     "effort_and_outgoing": (passivity.effort_and_outgoing, [2, 3, 4]),
-    "flow_and_outgoing": (waves.flow_and_outgoing, [2, 3, 4]),
-    "wave_power": (waves.wave_power, [2, 3]),
-    "EnergyLedger": (lambda *a: filled(energy_ledger.EnergyLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1]),
     "ChannelLedger": (lambda *a: filled(passivity.ChannelLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1, 2]),
-    "PassivityObserver": (lambda *a: observed(*a), [1, 2, 3, 1]),
     "differentiate": (splines.differentiate, [[1, 2, 3]]),
     "extrema": (polynomials.extrema, [[0, 3, -1], 2]),
     "largest_acceleration": (predicted_positions.largest_acceleration, [2, 1, 1]),
     "project, one row": (lambda *a: projection.project(*a)[0], [[1, 1], [[1, 1]], [1], -1, 1]),
     "project, rows": (lambda *a: projection.project(*a)[0], [[1, 1], [[2, 1], [1, 2]], [1, 1], -1, 1]),
-    "transit_time": (appendix_reachability.transit_time, [9, 2, 3]),
-    "reachable_distance": (appendix_reachability.reachable_distance, [9, 2, 3]),
     "hold_lag_s": (sampling.hold_lag_s, [2]),
     "phase_lag": (sampling.phase_lag, [2, 1, 1]),
     "slip_ratio": (slip.slip_ratio, [3, 2, 1]),
-    "piecewise_slip_ratio": (appendix_slip.piecewise_slip_ratio, [3, 2]),
-    "normalized_slip": (appendix_slip.normalized_slip, [1]),
-    "spins_out": (appendix_slip.spins_out, [3, 1, 2]),
     "smoothstep": (smoothstep.smoothstep, [1]),
-    "blend": (blends.blend, [[1, 2], [3, 4], 1]),
     "shortest_latched_blend": (smoothstep.shortest_latched_blend, [2, 3]),
-    "quintic_system": (appendix_splines.quintic_system, [2]),
-    "evaluate": (appendix_splines.evaluate, [[1, 2, 3, 4, 5, 6], 2]),
     "hermite_series": (splines.hermite_series, [[0, 1, 3], [0, 2, 1], [1, 0, 1], 2]),
-    "kinetic_inset": (barriers.kinetic_inset, [5, 2, 1]),
-    "kinetic_row": (barriers.kinetic_row, [5, 2, 1, 3]),
     "support_polygon": (support.support_polygon, [SQUARE]),
-    "support_margin": (balance.support_margin, [[1, 1], SQUARE]),
     "support_rows": (
         lambda p, o, n, i: support.support_rows(p, support.plane(o, n), i),
         [CORNERS, [0, 0, 0], UP, 0],
     ),
-    "gaussian_tail": (sigma_coverage.gaussian_tail, [2]),
-    "unimodal_tail": (sigma_coverage.unimodal_tail, [2]),
-    "chebyshev_tail": (sigma_coverage.chebyshev_tail, [2]),
 }
 
 
 def filled(ledger, step):
     ledger.add(*step)
     return ledger.created_j, ledger.passive
-
-
-def observed(*given):
-    observer = passivity_controller.PassivityObserver(given[0])
-    observer.add(*given[1:])
-    return observer.observed_j
 
 
 def as_kind(value, kind):

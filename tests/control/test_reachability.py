@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from safe_wrappers.appendix.watchdog.reachability import jerk_limited_reach, reachable_distance, transit_time
 from safe_wrappers.control.watchdog import reachability
 from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, furthest, jerk_limited_time
 from safe_wrappers.errors import ConfigurationError
@@ -28,7 +27,7 @@ def ruckig_time(start, end, acceleration, speed, jerk):
     return trajectory.duration
 
 
-def most(time, v0, a0, a_max, v_max, jerk, at_rest=False, count=160, sign=1.0):
+def most(time, v0, a0, a_max, v_max, jerk, count=160, sign=1.0):
     """The largest displacement at the end of the time, by a linear program over piecewise constant jerk."""
     h = time / count
     n = count
@@ -41,67 +40,14 @@ def most(time, v0, a0, a_max, v_max, jerk, at_rest=False, count=160, sign=1.0):
     pos = (h * before_v + 0.5 * h * h * before_a + np.eye(n) * h**3 / 6).sum(axis=0)
     pos0 = v0 * time + 0.5 * a0 * time**2
     upper = np.concatenate([a_max - acc0, a_max + acc0, v_max - vel0, v_max + vel0])
-    equal = (np.array([vel[-1], acc[-1]]), np.array([-vel0[-1], -a0])) if at_rest else (None, None)
     done = linprog(
         -sign * pos,
         A_ub=np.vstack([acc, -acc, vel, -vel]),
         b_ub=upper + 1e-12,
-        A_eq=equal[0],
-        b_eq=equal[1],
         bounds=(-jerk, jerk),
         method="highs",
     )
     return pos0 + pos @ done.x if done.status == 0 else None
-
-
-# Rest to rest, idealised.
-
-
-@given(st.floats(-20, 20), POSITIVE, POSITIVE)
-def test_transit_time_is_ruckigs_without_a_limit_on_the_jerk(distance, acceleration, speed):
-    expected = ruckig_time((0, 0, 0), (distance, 0, 0), acceleration, speed, np.inf)
-    assert transit_time(distance, acceleration, speed) == pytest.approx(expected, abs=1e-6, rel=1e-9)
-
-
-@given(st.floats(0, 30), POSITIVE, POSITIVE)
-def test_reach_is_the_inverse_of_the_transit_time(time, acceleration, speed):
-    assert transit_time(reachable_distance(time, acceleration, speed), acceleration, speed) == pytest.approx(
-        time, abs=1e-6
-    )
-
-
-@pytest.mark.parametrize("time, distance", [(1.0, 0.5), (2.0, 2.0), (4.0, 6.0), (0.0, 0.0)])
-def test_both_regimes_by_hand(time, distance):
-    # 2 m/s^2, 2 m/s: triangular up to 2 s and 2 m, then 2 m per second
-    assert reachable_distance(time, 2.0, 2.0) == pytest.approx(distance)
-    assert transit_time([distance, -distance], 2.0, 2.0) == pytest.approx([time, time])
-
-
-def test_bang_bang_gets_as_far_as_reach():
-    for time, speed in ((1.7, 0.6), (1.7, 5.0)):
-        steps, x, v = 20000, 0.0, 0.0
-        h = time / steps
-        for k in range(steps):
-            left = time - (k + 0.5) * h
-            faster = min(v + 1.3 * h, speed, max(0.0, 1.3 * (left - 0.5 * h)))
-            x, v = x + 0.5 * h * (v + faster), faster
-        assert reachable_distance(time, 1.3, speed) == pytest.approx(x, rel=1e-3)
-        assert v == pytest.approx(0.0, abs=1e-3)
-
-
-@given(st.floats(-5, 5), POSITIVE, POSITIVE, POSITIVE)
-def test_the_idealised_time_is_a_lower_bound(distance, acceleration, speed, jerk):
-    limits = MotionLimits(acceleration, speed, jerk)
-    constrained = jerk_limited_time((0, 0, 0), (distance, 0, 0), limits)
-    assert transit_time(distance, acceleration, speed) <= constrained * (1 + 1e-9) + 1e-6
-
-
-def test_times_and_reaches_of_the_unknown():
-    with np.errstate(all="raise"):
-        assert transit_time([np.nan, np.inf, -np.inf], 1.0).tolist() == [np.inf] * 3
-        assert transit_time([np.inf, 3.0], 1.0, 1.0).tolist() == [np.inf, 4.0]
-        assert reachable_distance([np.nan, -1.0, 0.0, np.inf], 1.0, 2.0).tolist() == [0.0, 0.0, 0.0, np.inf]
-        assert reachable_distance(4.0, 1.0) == 4.0
 
 
 # With limited jerk.
@@ -114,16 +60,6 @@ def test_times_and_reaches_of_the_unknown():
 def test_seven_and_four_phases_by_hand(distance, time):
     limits = MotionLimits(max_acceleration=1.0, max_speed=2.0, max_jerk=0.5)
     assert float(jerk_limited_time((0, 0, 0), (distance, 0, 0), limits)) == pytest.approx(time, rel=1e-9)
-
-
-def test_the_trapezoid_plus_an_offset_is_no_substitute():
-    # 0.1 m: a_max / j_max added to the idealised time would be too much, half of it for both ramps too little.
-    limits = MotionLimits(1.0, 2.0, 0.5)
-    ideal, true = float(transit_time(0.1, 1.0, 2.0)), float(jerk_limited_time((0, 0, 0), (0.1, 0, 0), limits))
-    assert ideal < true < ideal + 2.0 - 0.5
-    assert float(transit_time(10, 1.0, 2.0)) + 2.0 == pytest.approx(
-        float(jerk_limited_time((0, 0, 0), (10, 0, 0), limits))
-    )  # where it happens to be right
 
 
 states = st.tuples(st.floats(-3, 3), SHARE, SHARE)
@@ -187,45 +123,6 @@ def test_a_start_outside_the_limits_is_led_back_inside():
     # 2 m/s with a limit of 1: braked for a second (1.5 m), then 0.5 m back
     time = float(jerk_limited_time((0, 2, 0), (1, 0, 0), MotionLimits(1.0, 1.0)))
     assert time == pytest.approx(2.0 + 2.0)
-
-
-@settings(max_examples=12)
-@given(st.floats(0.2, 4.0), SHARE, SHARE, st.floats(0.5, 3), st.floats(0.5, 3), st.floats(0.5, 6))
-def test_jerk_limited_reach_is_the_optimum_of_a_linear_program(time, v, a, acceleration, speed, jerk):
-    _, v, a = inside((0, v, a), acceleration, speed, jerk)
-    lowest, highest = jerk_limited_reach(time, v, a, MotionLimits(acceleration, speed, jerk))
-    for found, sign in ((float(lowest), -1.0), (float(highest), 1.0)):
-        expected = most(time, v, a, acceleration, speed, jerk, at_rest=True, sign=sign)
-        # The program's jerk is constant over 1/160 of the time, so it gets a little less far.
-        room = 8 * (speed + acceleration * time) * time / 160
-        if expected is None:
-            assert not np.isfinite(found) or float(highest - lowest) < room
-        else:
-            assert sign * found >= sign * expected - 1e-4 * time
-            assert sign * found <= sign * expected + room
-
-
-def test_what_is_within_reach_takes_no_longer_and_what_is_beyond_does():
-    rng = np.random.default_rng(5)
-    limits = MotionLimits(1.2, 0.9, 3.0)
-    for _ in range(50):
-        v, a = inside((0, *rng.uniform(-1, 1, 2)), 1.2, 0.9, 3.0)[1:]
-        time = rng.uniform(0.2, 4.0)
-        lowest, highest = (float(x) for x in jerk_limited_reach(time, v, a, limits))
-        if lowest > highest:
-            continue
-        for goal in (lowest, highest, rng.uniform(lowest, highest)):
-            assert ruckig_time((0, v, a), (goal, 0, 0), 1.2, 0.9, 3.0) <= time + 1e-9
-        for goal in (lowest - 1e-6, highest + 1e-6):
-            assert ruckig_time((0, v, a), (goal, 0, 0), 1.2, 0.9, 3.0) > time
-
-
-def test_no_time_to_stop_is_an_empty_reach():
-    limits = MotionLimits(1.0, 2.0, 100.0)
-    lowest, highest = jerk_limited_reach([0.9, 1.2, np.nan, np.inf, -1.0], 1.0, 0.0, limits)
-    assert (lowest > highest).tolist() == [True, False, True, True, True]
-    # a tenth of a second faster by 0.1 m/s, then braking from 1.1 m/s: a little less with ramps
-    assert 0.69 < highest[1] < 0.1 * 1.05 + 1.1**2 / 2
 
 
 # The bound with a free end.
@@ -390,13 +287,10 @@ def test_batches_and_axes_are_element_by_element():
     time, v, a = rng.uniform(0, 2, (4, 1)), rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
     speed, acceleration, jerk = rng.uniform(0.5, 2, 3), rng.uniform(0.5, 2, 3), np.array([1.0, 5.0, np.inf])
     low, high = furthest(time, v, a, speed, acceleration, jerk)
-    near, far = jerk_limited_reach(time, v, 0.0, MotionLimits(acceleration, speed, jerk))
-    assert low.shape == high.shape == near.shape == (4, 3)
+    assert low.shape == high.shape == (4, 3)
     for i, k in np.ndindex(4, 3):
         one = furthest(time[i, 0], v[i, k], a[i, k], speed[k], acceleration[k], jerk[k])
         assert (low[i, k], high[i, k]) == one
-        limits = MotionLimits(acceleration[k], speed[k], jerk[k])
-        assert (near[i, k], far[i, k]) == jerk_limited_reach(time[i, 0], v[i, k], 0.0, limits)
 
 
 # Mistakes.
@@ -410,11 +304,6 @@ def test_limits_must_be_positive(name, bad):
         MotionLimits(**(good | {name: bad}))
     with pytest.raises(ConfigurationError, match=name):
         furthest(1.0, 0.0, 0.0, **(good | {name: bad}))
-
-
-def test_an_acceleration_limit_must_be_finite():
-    with pytest.raises(ConfigurationError, match="max_acceleration must be positive and finite, got inf"):
-        transit_time(1.0, np.inf)
 
 
 def test_shapes_that_do_not_fit():

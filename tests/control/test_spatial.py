@@ -8,10 +8,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from safe_wrappers.appendix.estimation.lever_arm import (
-    centre_acceleration_from_imu,
-    imu_specific_force,
-)
 from safe_wrappers.control.estimation.lever_arm import (
     centre_acceleration,
     lever_arm_acceleration,
@@ -85,9 +81,10 @@ def test_mujocos_velocimeter_reads_the_lever_arms_velocity(spinning, seed):
 def test_mujocos_accelerometer_reads_the_specific_force(spinning, seed):
     model, _ = spinning
     s, mount = thrown(spinning, seed), extrinsics(spinning[0])
-    found = imu_specific_force(
-        s["acceleration"], s["turning"], s["speeding"], s["orientation"], mount, model.opt.gravity
+    at_sensor = lever_arm_acceleration(
+        s["acceleration"], s["turning"], s["speeding"], s["orientation"].apply(mount.translation)
     )
+    found = (s["orientation"] * mount.rotation).apply(at_sensor - model.opt.gravity, inverse=True)
     np.testing.assert_allclose(found, s["sensors"][0], atol=1e-10)
 
 
@@ -95,12 +92,11 @@ def test_mujocos_accelerometer_reads_the_specific_force(spinning, seed):
 def test_mujocos_imu_gives_the_centres_acceleration_back(spinning, seed):
     model, _ = spinning
     s, mount = thrown(spinning, seed), extrinsics(spinning[0])
-    force, gyro, _ = s["sensors"]
-    gyro_rate = (s["orientation"] * mount.rotation).apply(s["speeding"], inverse=True)
-    found = centre_acceleration_from_imu(force, gyro, gyro_rate, s["orientation"], mount, model.opt.gravity)
+    sensor, (force, gyro, _) = s["orientation"] * mount.rotation, s["sensors"]
+    read = sensor.apply(force) + model.opt.gravity, sensor.apply(gyro), s["speeding"]
+    found = centre_acceleration(*read, s["orientation"].apply(mount.translation))
     np.testing.assert_allclose(found, s["acceleration"], atol=1e-10)
-    no_arm = RigidTransform.from_components(np.zeros(3), mount.rotation)
-    wrong = centre_acceleration_from_imu(force, gyro, gyro_rate, s["orientation"], no_arm, model.opt.gravity)
+    wrong = centre_acceleration(*read, np.zeros(3))
     assert np.linalg.norm(wrong - s["acceleration"]) > 0.5, "without the lever arm it would be wrong"
 
 
@@ -115,12 +111,6 @@ def test_the_derivative_of_the_gyro_is_the_angular_acceleration(spinning):
     found = (data.sensordata[3:6] - before) / step
     expected = (s["orientation"] * mount.rotation).apply(s["speeding"], inverse=True)
     np.testing.assert_allclose(found, expected, atol=1e-3)
-
-
-def test_at_rest_an_accelerometer_reads_gravity_upwards():
-    still, mount = np.zeros(3), RigidTransform.from_translation([0.1, 0.2, 0.3])
-    found = imu_specific_force(still, still, still, Rotation.identity(), mount)
-    np.testing.assert_allclose(found, [0.0, 0.0, 9.81])
 
 
 def test_the_terms_are_the_derivatives_of_the_points_position():
@@ -165,12 +155,6 @@ def test_leading_axes_broadcast():
     assert many.shape == (4, 2, 3)
     np.testing.assert_allclose(many[3, 1], lever_arm_acceleration(a, w, dw, arms[3, 1]))
     np.testing.assert_allclose(lever_arm_velocity(a, w, arms)[2, 0], lever_arm_velocity(a, w, arms[2, 0]))
-    turns, mount = Rotation.random(5, rng=rng), RigidTransform.from_translation([0.1, 0.0, 0.2])
-    forces = imu_specific_force(rng.normal(size=(5, 3)), w, dw, turns, mount)
-    rates = turns.apply(np.tile(w, (5, 1)), inverse=True), turns.apply(np.tile(dw, (5, 1)), inverse=True)
-    back = centre_acceleration_from_imu(forces, *rates, turns, mount)
-    one = centre_acceleration_from_imu(forces[4], rates[0][4], rates[1][4], turns[4], mount)
-    np.testing.assert_allclose(back[4], one, atol=1e-12)
 
 
 @given(arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), VECTORS, VECTORS, VECTORS)
@@ -235,11 +219,3 @@ def test_what_is_no_vector_is_refused_wherever_it_is_given(bad, at):
     if at < 3:
         with pytest.raises(ConfigurationError, match=words):
             lever_arm_velocity(*given[:3])
-
-
-def test_imu_readings_that_are_not_finite_are_named():
-    still, mount = np.zeros(3), RigidTransform.identity()
-    with pytest.raises(ConfigurationError, match="rate must be finite"):
-        centre_acceleration_from_imu(still, [0, np.nan, 0], still, Rotation.identity(), mount)
-    with pytest.raises(ConfigurationError, match="gravity must be finite"):
-        imu_specific_force(still, still, still, Rotation.identity(), mount, gravity=[0, 0, -np.inf])

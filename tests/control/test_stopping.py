@@ -5,40 +5,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from safe_wrappers.appendix.filtering.barriers import kinetic_inset, kinetic_row
 from safe_wrappers.control.backup.stopping import held_limit, held_stop
 
 POSITIVE = st.floats(0.05, 5.0)
-
-
-@given(st.floats(-1, 10), st.floats(-3, 3), POSITIVE)
-def test_kinetic_inset_is_the_room_left_after_braking(clearance, speed, brake):
-    if speed <= 0:
-        assert kinetic_inset(clearance, speed, brake) == clearance
-        return
-    time = speed / brake
-    way = speed * time - 0.5 * brake * time**2  # braking to rest
-    assert kinetic_inset(clearance, speed, brake) == pytest.approx(clearance - way, abs=1e-9)
-
-
-@given(st.floats(0.1, 10), st.floats(0.05, 3), POSITIVE, st.floats(0.1, 5), st.floats(-5, 5))
-def test_kinetic_row_is_the_barrier_condition(clearance, speed, brake, gamma, accel):
-    step = 1e-6
-    ahead = kinetic_inset(clearance - speed * step, speed + accel * step, brake)
-    behind = kinetic_inset(clearance + speed * step, speed - accel * step, brake)
-    condition = (ahead - behind) / (2 * step) + gamma * kinetic_inset(clearance, speed, brake)
-    room = kinetic_row(clearance, speed, brake, gamma) - accel
-    # same sign, same zero: condition = room * speed / brake
-    assert condition == pytest.approx(room * speed / brake, abs=1e-4 * (1 + abs(condition)))
-
-
-def test_standstill_has_its_own_rule():
-    assert kinetic_row(1.0, 0.0, 1.0, 2.0) == np.inf
-    assert kinetic_row(1.0, -0.3, 1.0, 2.0) == np.inf
-    assert kinetic_row(0.0, 0.0, 1.0, 2.0) == 0.0
-    assert kinetic_row(-0.1, 0.0, 1.0, 2.0) == 0.0
-    with np.errstate(all="raise"):
-        kinetic_row(np.array([1.0, 0.0]), np.array([0.0, 0.0]), 1.0, 2.0)
 
 
 def simulate(
@@ -143,7 +112,7 @@ def test_the_limit_is_the_largest(clearance, speed, brake, hold):
 
 @given(st.floats(0, 5), st.floats(0, 3), POSITIVE, st.floats(0.005, 0.5))
 def test_held_braking_takes_little_more_than_continuous(clearance, speed, brake, hold):
-    continuous = float(kinetic_inset(clearance, speed, brake))
+    continuous = clearance - speed**2 / (2.0 * brake)
     sampled = clearance - held_stop(speed, brake, hold)
     assert continuous - brake * hold**2 / 8 - 1e-9 <= sampled <= continuous + 1e-9
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles import support_margin
 
-from safe_wrappers.appendix.legged.balance import balance
 from safe_wrappers.control.contact.friction_cone import tangents
-from safe_wrappers.control.legged.support import common_plane, support_polygon
 from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError
 
@@ -21,10 +20,7 @@ def one_by_one(instant, points, normals, forces):
     found = []
     for when in np.unique(instant):
         here = instant == when
-        ground = common_plane(points[here], normals[here])
-        if ground is None or len(support_polygon(ground.flat(points[here]))) < 3:
-            continue
-        margin = balance(points[here], normals[here], forces[here]).margin
+        margin = support_margin(points[here], normals[here], forces[here])
         if np.isfinite(margin):
             found.append(margin)
     return np.array(found)

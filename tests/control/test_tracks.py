@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import blind_covariance, double_integrator_covariance
 
-from safe_wrappers.appendix.estimation.covariance import blind_covariance, double_integrator_covariance
 from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
 
 MOTIONS = [
@@ -24,7 +24,7 @@ def started(motions=MOTIONS, seed=0):
     return tracks
 
 
-def test_a_double_integrator_has_the_appendix_s_closed_form():
+def test_a_double_integrator_has_its_closed_form():
     tracks = started(MOTIONS[:1])
     before = tracks.covariance[0, ::2, ::2].copy()  # position and velocity along x
     tracks.advance(1.7)

@@ -8,9 +8,9 @@ import pytest
 import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import in_cone
 from scipy.optimize import lsq_linear, minimize
 
-from safe_wrappers.appendix.contact.forces import in_cone
 from safe_wrappers.control.contact.friction_cone import friction_pyramid
 from safe_wrappers.control.legged import whole_body
 from safe_wrappers.control.legged.support import plane, support_rows

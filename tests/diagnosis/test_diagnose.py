@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -109,6 +110,48 @@ def test_the_env_is_left_as_it_was_and_two_diagnoses_are_the_same():
     assert np.array_equal(observation, plain.reset(seed=5)[0])
     action = np.array([0.3, -0.2], np.float32)
     assert np.array_equal(env.step(action)[0], plain.step(action)[0])
+
+
+class Drifting(gym.Env):
+    """An env of one's own: a cost beyond 1 m; nothing says how long its step lasts."""
+
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = np.array([self.np_random.uniform(-0.5, 0.5), 0.0])
+        return self.at.copy(), {}
+
+    def step(self, action):
+        speed = np.clip(self.at[1] + 0.1 * float(action[0]), -0.2, 0.2)
+        self.at = np.array([self.at[0] + 0.1 * speed, speed])
+        return self.at.copy(), 0.0, False, False, {"cost": float(abs(self.at[0]) > 1.0)}
+
+
+def test_constraints_that_never_acted_with_any_driver_are_named():
+    limits = [sw.constraints.JointSpeedLimit(4.0), sw.constraints.JointPositionLimit(-6.0, 6.0, ["joint0"])]
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
+    still = diagnose(env, lambda seen: np.zeros(2), steps=60, symptoms=["limits"])
+    assert still.idle_constraints == ["JointPositionLimit"], "others than the policy made the first act"
+    assert "Never acted, with any driver: JointPositionLimit." in str(still)
+    assert still.as_dict()["idle_constraints"] == ["JointPositionLimit"]
+    assert diagnose(gym.make("Reacher-v5"), steps=20, symptoms=["limits"]).idle_constraints == []
+
+
+def test_an_env_of_ones_own_is_simulated_while_it_is_diagnosed_and_nothing_leaks():
+    env = Drifting()
+    with warnings.catch_warnings(action="error"):
+        finding = diagnose(env, steps=300).finding("limits")
+    assert "PredictiveShield" in finding.code and finding.after < finding.figure
+    assert "step" not in vars(env)
+    stopping = lambda seen: [np.clip(-10.0 * seen[1], -1.0, 1.0)]  # noqa: E731
+    shield = sw.constraints.PredictiveShield("cost", horizon=10, backup=stopping)
+    filtered = sw.CBFActionFilter(gym.wrappers.TimeLimit(Drifting(), 100), [shield])
+    diagnosis = diagnose(filtered, steps=200)
+    assert diagnosis.finding("limits").figure == 0.0
+    assert diagnosis.finding("late_commands").missing or diagnosis.finding("late_commands").figure == 0.0
+    assert filtered.env.env is filtered.unwrapped, "what looked on is gone"
 
 
 def test_an_env_without_physics_says_what_is_missing_and_judges_commands_and_costs():

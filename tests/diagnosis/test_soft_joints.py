@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from safe_wrappers.appendix.handover.flexible_joint import manifold
+from benchmarks.flexible_joint import manifold
 from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.diagnosis.recording import record
 from safe_wrappers.diagnosis.symptom import NotMeasuredError

@@ -148,18 +148,16 @@ def test_what_is_said_not_to_be_consistent_has_numbers_of_the_page(page):
     assert [number for number in re.findall(r"\d+\.\d+", told) if number not in shown] == []
 
 
-def modules(top):
-    for path in sorted((PACKAGE / top).rglob("*.py")):
-        if path.stem != "__init__":
-            yield ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
-
-
+MODULES = [
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+    for path in sorted((PACKAGE / "control").rglob("*.py"))
+    if path.stem != "__init__"
+]
 ALL = "".join(path.read_text(encoding="utf-8") for path in FOLDER.glob("*.md"))
 
 
-@pytest.mark.parametrize("top", ["control", "appendix"])
-def test_every_module_of_control_and_appendix_is_named(top):
-    assert [name for name in modules(top) if not re.search(rf"\b{re.escape(name)}\b", ALL)] == []
+def test_every_module_of_control_is_named():
+    assert [name for name in MODULES if not re.search(rf"\b{re.escape(name)}\b", ALL)] == []
 
 
 def resolved(name):
@@ -178,7 +176,7 @@ def resolved(name):
 def test_every_role_names_something_that_can_be_imported(page):
     text = text_of(page)
     roles = re.findall(r"\{(?:func|class|mod)\}`~?([\w.]+)`", text)
-    plain = re.findall(r"(?<!\})`((?:control|appendix|plants)\.[\w.]+)`", text)
+    plain = re.findall(r"(?<!\})`((?:control|plants)\.[\w.]+)`", text)
     assert roles or plain
     for name in [*roles, *(f"safe_wrappers.{name}" for name in plain)]:
         resolved(name)

@@ -53,20 +53,14 @@ def test_there_are_all_26_systems():
 
 @pytest.mark.parametrize("row", ROWS, ids=[row[0] for row in ROWS])
 def test_the_formulas_of_a_system_are_used_by_what_the_table_says(row):
-    (formulas,), (user,), kept = named(row[2]), named(row[3]), named(row[4] if len(row) > 4 else "")
+    (formulas,), (user,) = named(row[2]), named(row[3])
     assert formulas.startswith("control.") and formulas in GRAPH
-    assert user in GRAPH and not user.startswith(("control.", "appendix."))
+    assert user in GRAPH and not user.startswith("control.")
     assert formulas in reached(user)
-    for module in kept:
-        assert module in GRAPH
-        users = [
-            name for name, found in GRAPH.items() if module in found and not name.startswith("appendix.")
-        ]
-        assert not users, f"{module} is used by {users}: it belongs to control"
 
 
 def test_no_module_of_control_is_on_the_shelf():
-    outside = [name for name in GRAPH if not name.startswith(("control.", "appendix.")) and name != "control"]
+    outside = [name for name in GRAPH if not name.startswith("control.") and name != "control"]
     used = set().union(*(reached(name) for name in outside))
     files = {
         name

@@ -12,8 +12,8 @@ sizes = st.floats(0.01, 5.0)
 
 
 def ends(mark):
-    """Of a rod, by its own axes."""
-    way = mark.size[1] * mark.axes[:, 2]
+    """Of a rod, by its own axes; a box has two more numbers across."""
+    way = mark.size[2 if mark.shape == "box" else 1] * mark.axes[:, 2]
     return mark.position - way, mark.position + way
 
 

@@ -7,16 +7,14 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from oracles import damping_ratios
 from scipy.stats import kstest
 
-from safe_wrappers.appendix.handover.flexible_joint import (
-    accelerations,
-    boundary_layer_energy,
-    damping_ratios,
+from benchmarks.flexible_joint import (
     manifold,
     resonances,
     smoothstep_energy,
-    step_energy,
+    step_energies,
     torque_slew_limit,
 )
 from safe_wrappers.envs import FLEX_JOINT_REACH_ID, REACH_EPISODE_STEPS
@@ -68,9 +66,10 @@ def independent_energy(bare, qpos, qvel, torque):
     arm = bare.arm
     q, q_dot = qpos[MOTORS] + qpos[SPRINGS], qvel[MOTORS] + qvel[SPRINGS]
     m = arm.link_inertia(q)
-    friction = arm.motor_damping * qvel[MOTORS]
-    z0 = manifold(torque, arm.rotor_inertia, m, bias=arm.link_bias(q, q_dot), motor_friction=friction)
-    return float(boundary_layer_energy(-qpos[SPRINGS], -qvel[SPRINGS], z0, *machine(bare, m)))
+    z0 = manifold(torque - arm.motor_damping * qvel[MOTORS], arm.rotor_inertia, m, arm.link_bias(q, q_dot))
+    away, rate = -qpos[SPRINGS] - z0 / arm.stiffness, -qvel[SPRINGS]
+    mobility = np.diag(1.0 / arm.rotor_inertia) + np.linalg.inv(m)
+    return 0.5 * (arm.stiffness @ away**2 + rate @ np.linalg.solve(mobility, rate))
 
 
 # The machine: Spong's model ------------------------------------------------------------------------------
@@ -84,17 +83,9 @@ def test_mujoco_moves_as_the_two_mass_model(bare):
         bare.data.qpos[:], bare.data.qvel[:], bare.data.ctrl[:] = qpos, qvel, torque
         mujoco.mj_forward(bare.model, bare.data)
         q, q_dot = qpos[MOTORS] + qpos[SPRINGS], qvel[MOTORS] + qvel[SPRINGS]
-        motors, links = accelerations(
-            qpos[MOTORS],
-            q,
-            qvel[MOTORS],
-            q_dot,
-            torque,
-            *machine(bare, arm.link_inertia(q)),
-            bias=arm.link_bias(q, q_dot),
-            motor_damping=arm.motor_damping,
-            joint_damping=arm.joint_damping,
-        )
+        carried = arm.stiffness * (qpos[MOTORS] - q) + arm.joint_damping * (qvel[MOTORS] - q_dot)
+        motors = (torque - arm.motor_damping * qvel[MOTORS] - carried) / arm.rotor_inertia
+        links = np.linalg.solve(arm.link_inertia(q), carried - arm.link_bias(q, q_dot))
         found = bare.data.qacc
         np.testing.assert_allclose(found[MOTORS], motors, rtol=1e-9, atol=1e-7)
         np.testing.assert_allclose(found[MOTORS] + found[SPRINGS], links, rtol=1e-9, atol=1e-7)
@@ -135,7 +126,7 @@ def test_resonances_and_damping_measured_are_those_declared(bare, elbow, which):
     k, j, _ = machine(bare, m)
     assert frequency == pytest.approx(resonances(k, j, m)[which] / (2 * math.pi), rel=0.01)
     assert 10.0 < frequency < 19.0
-    declared = damping_ratios(k, j, m, bare.arm.motor_damping, bare.arm.joint_damping)[which]
+    declared = damping_ratios(bare.arm, m)[which]
     assert ratio == pytest.approx(declared, rel=0.03)
     assert 0.005 < ratio < 0.02
 
@@ -189,7 +180,7 @@ def test_info_judges_every_substep(env, bare):
 def test_a_torque_step_injects_what_the_formula_says(bare, elbow, torque):
     m = pose(bare, elbow)
     info = bare.step(np.array(torque))[4]
-    assert info["vibration_energy"] == pytest.approx(float(step_energy(torque, *machine(bare, m))), rel=0.01)
+    assert info["vibration_energy"] == pytest.approx(step_energies(torque, *machine(bare, m)).sum(), rel=0.01)
 
 
 def play(bare, torques):
@@ -214,7 +205,7 @@ def test_a_smoothstep_over_two_periods_injects_a_tenth_of_a_step_at_most(bare, e
 def test_ramps_within_the_slew_limit_stay_below_the_energy(bare, elbow):
     m = pose(bare, elbow)
     allowed = 1e-3
-    limit = torque_slew_limit(allowed, *machine(bare, m), weights=[3.0, 1.0], control_dt=bare.dt)
+    limit = torque_slew_limit(allowed, *machine(bare, m), weights=np.array([3.0, 1.0]), control_dt=bare.dt)
     worst = 0.0
     for signs in itertools.product((1.0, -1.0), repeat=2):
         pose(bare, elbow)

@@ -191,7 +191,12 @@ def test_episode_is_truncated_at_its_length_and_never_terminated():
         assert truncated == (t == EPISODE_STEPS - 1)
 
 
-@pytest.mark.parametrize("action", [np.zeros(3), np.array([0.0, np.nan]), np.array([np.inf, 0.0]), 0.5])
+NO_NUMBERS = [[10**400, 0], np.ma.masked_array([0.0, 0.0], [True, False]), ["0.1", "0.1"]]
+
+
+@pytest.mark.parametrize(
+    "action", [np.zeros(3), np.array([0.0, np.nan]), np.array([np.inf, 0.0]), 0.5, *NO_NUMBERS]
+)
 def test_bad_actions_are_refused_and_the_env_not_stepped(make_env, action):
     env = make_env(1)
     env.reset(seed=0)

@@ -11,11 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from safe_wrappers.appendix.vehicle.burckhardt import peak
-from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.envs import EPISODE_STEPS, SAFE_ROVER_ID
-from safe_wrappers.envs.ground import GROUNDS, Ground, Patch
+from safe_wrappers.envs.ground import GROUNDS, MAGIC_FORMULA, Ground, Patch
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.envs.tyre import SLOWEST, tyre_force
 from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
@@ -264,19 +262,19 @@ def test_locked_wheels_stop_in_the_sliding_frictions_distance(env, ground):
 
 @pytest.mark.parametrize("ground", GROUNDS)
 def test_the_best_slip_brakes_with_the_peak_friction_and_moves_the_load_forward(env, ground):
-    best = peak(MAGIC_FORMULA[ground])
+    best = MAGIC_FORMULA[ground]
     start(env, ground=ground, speed=6.0)
     lock(env)
     env.frame_skip = 1
     speeds, loads = [], []
     for _ in range(150):
-        env.data.qvel[[7, 9, 10, 11]] = (1.0 - best.slip) * env.forward_speed / RADIUS
+        env.data.qvel[[7, 9, 10, 11]] = (1.0 - best.peak_slip) * env.forward_speed / RADIUS
         env.step(throttle(0.0))
         speeds.append(env.forward_speed)
         loads.append(env.wheel_loads)
     # The pitching that the brake's onset causes has settled by then.
     deceleration = (speeds[49] - speeds[149]) / (100 * 0.002)
-    assert deceleration == pytest.approx(best.friction * G, rel=0.01)
+    assert deceleration == pytest.approx(best.peak_friction * G, rel=0.01)
     moved = MASS * deceleration * (0.12 - 8.5e-5) / WHEELBASE
     load = np.mean(loads[50:], axis=0)
     assert load[:2].sum() == pytest.approx(MASS * G / 2 + moved, rel=0.01)

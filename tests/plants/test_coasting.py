@@ -100,7 +100,7 @@ def test_the_machine_alone_takes_over_what_the_plant_has_wrong_on_purpose():
     plant.perturb(mass=2.0, damping=0.5)
     plant.model.geom_friction[:, 0] *= 0.5
     plant.observe()
-    wrong = alone.run(np.ones(2), 12, RADIUS).places
+    wrong = Coasting(plant, "agent", env.robot_model).run(np.ones(2), 12, RADIUS).places
     k = min(len(right), len(wrong))
     assert np.abs(right[:k] - wrong[:k]).max() > 5e-3
     whole = Coasting(plant, "agent").run(np.ones(2), 12, RADIUS).places

@@ -328,6 +328,24 @@ def test_an_action_that_is_not_finite_is_never_stored():
     assert torch.isfinite(both.sample(50).actions).all()
 
 
+def test_what_an_escape_executed_is_stored_in_place_of_the_policys_action():
+    env = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
+    env = sw.StuckEscape(env, after_s=0.5, progress=0.05, escape_s=0.5)
+    layout = {"agent": [0, 0, 0], "hazards": [[0.5, 0.0]], "goal": [1.3, 0.0]}
+    observation, _ = env.reset(seed=0, options={"layout": layout})
+    buffer = ExecutedActionReplayBuffer(200, env.observation_space, env.action_space, device="cpu")
+    push, executed, replaced = np.array([1.0, 0.0], np.float32), [], []
+    for _ in range(200):
+        following, reward, _, _, info = env.step(push)
+        arguments = (np.array([value]) for value in (observation, following, push, reward, False))
+        buffer.add(*arguments, [info])
+        executed.append(info[keys.EXECUTED_ACTION])
+        replaced.append(info["cbf/escaping"] and not info[keys.CBF_INTERVENED])
+        observation = following
+    assert sum(replaced) > 10
+    np.testing.assert_allclose(buffer.actions[:, 0], executed, atol=1e-6)
+
+
 def test_an_executed_action_that_is_not_finite_is_refused():
     with pytest.raises(sw.SafeWrappersError, match="executed action is not finite"):
         add(buffer(), [[0.0, 0.0]], [1.0], [info([0.5, 5.0], [np.nan, 5.0])])

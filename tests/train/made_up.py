@@ -18,7 +18,7 @@ def write_training(experiment, arm, seed, rows):
     folder = experiment.run_folder(experiment.arms[arm], seed)
     write_rows(folder / "episodes.csv", EPISODE_COLUMNS, [{"env": 0, **row} for row in rows])
     (folder / "finished.json").write_text(
-        json.dumps({"timesteps": 100, "filter_time_us": 50.0 if arm else None})
+        json.dumps({"timesteps": experiment.arms[arm].total_steps, "filter_time_us": 50.0 if arm else None})
     )
 
 

@@ -21,9 +21,12 @@ from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig
 from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, MASKED, OFF_POLICY, ON_POLICY
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.experiment import training_jobs
 from safe_wrappers.train.hyperparameters import check_task, constructor_arguments
 from safe_wrappers.train.policies import load_policy
+from safe_wrappers.train.report.origin import about
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.folder import finished_facts
 from safe_wrappers.train.run.policy import SpacesEnv
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
@@ -332,3 +335,32 @@ def test_unknown_noise_is_refused_with_the_nearest(fake_experiment):
 def test_training_in_episodes_as_yaml_writes_it(fake_experiment):
     (arm,) = one_arm(fake_experiment, "TD3", FILTERED, "hyperparameters.train_freq=[1, episode]").arms
     assert constructor_arguments(arm, make_vec_env(arm))["train_freq"] == (1, "episode")
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "hyperparameters", "steps"),
+    [
+        ("PPO", "{n_steps: 64, batch_size: 64, n_epochs: 1}", 256),
+        ("A2C", "{}", 140),
+        ("SAC", "{learning_starts: 1000, train_freq: 8}", 144),
+        ("SAC", "{learning_starts: 1000, train_freq: [1, episode]}", None),
+    ],
+)
+def test_the_steps_that_are_announced_and_reported_are_those_that_are_trained(
+    fake_experiment, algorithm, hyperparameters, steps
+):
+    experiment = fake_experiment(
+        "total_steps=134",
+        f"algorithm={algorithm}",
+        f"hyperparameters={hyperparameters}",
+        "arms={one: {filter: none}}",
+        "seeds=[0]",
+        *(["n_envs=1"] if "episode" in hyperparameters else []),
+    )
+    (arm,), folder = experiment.arms, experiment.run_folder(experiment.arms[0], 0)
+    (job,) = training_jobs(experiment, [arm])
+    train_run(arm, 0, folder, Reports().progress)
+    trained = finished_facts(folder)["timesteps"]
+    assert f", {trained:,} steps, " in about(experiment)
+    if steps is not None:  # of whole episodes nobody knows the steps beforehand
+        assert trained == steps == job.total

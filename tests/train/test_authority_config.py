@@ -58,6 +58,7 @@ def test_they_are_read_and_change_the_runs_fingerprint_only_where_they_are():
         ),
         ("Reacher-v5", {"protect": {}, "lease": {"budget": 1.0}}, ConfigurationError, "lease.budget"),
         ("Reacher-v5", {"protect": {}, "lease": {"plant": 1}}, UnknownNameError, "unknown name 'plant'"),
+        ("Reacher-v5", {"protect": {}, "lease": {"closing_speed": 3.0}}, UnknownNameError, "closing_speed"),
         ("Reacher-v5", {"lease": LEASE}, ConfigurationError, "beside it"),
     ],
 )
@@ -93,17 +94,6 @@ def test_the_leases_room_is_the_filters_unless_it_is_given():
         make_stack(EnvConfig("Pusher-v5"), two)
     budget = {"clearance": {"kind": "JointSpeedLimit", "limit": 6.0}, "closing_speed": 100.0}
     assert make_stack(EnvConfig("Pusher-v5"), FilterConfig(protect={}, lease={"budget": budget}))
-
-
-def test_a_lease_as_it_was_written_before_there_were_budgets_is_read():
-    clearance = {"kind": "JointSpeedLimit", "limit": 4.0}
-    for old in (
-        {"closing_speed": 3.0, "least_s": 0.02},
-        {"clearance": clearance, "closing_speed": 3.0, "least_s": 0.02},
-    ):
-        (arm,) = parsed(env="Reacher-v5", a={"filter": {"protect": {}, "lease": old}}).arms
-        with pytest.warns(DeprecationWarning, match=r"min_lease_s=..., budget=StoppingBudget\(clearance"):
-            assert make_stack(arm.env, arm.filter).env.spec is not None
 
 
 def test_arguments_that_are_missing_are_named():

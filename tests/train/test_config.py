@@ -69,7 +69,7 @@ def test_an_evaluation_may_name_its_own_filter():
 
 def test_the_repo_has_the_promised_configs():
     demo = parse_experiment(read_config(CONFIGS / "demo.yaml"))
-    assert len(demo.arms) * len(demo.seeds) == 4
+    assert len(demo.arms) * len(demo.seeds) == 2  # one for each of two cores
     long = parse_experiment(read_config(CONFIGS / "pointgoal1_300k.yaml"))
     assert {arm.total_steps for arm in long.arms} == {300_000}
     assert len(long.seeds) == 5

@@ -130,9 +130,8 @@ def test_only_data_is_found(tmp_path, text):
         read_pickle(tmp_path / "x.pkl")
 
 
-@pytest.mark.parametrize("module", ["info", "wrappers.record_interventions"])
-def test_a_mark_is_found_wherever_it_was(tmp_path, module):
-    (tmp_path / "x.pkl").write_bytes(f"csafe_wrappers.{module}\nNOT_JUDGED\n.".encode())
+def test_what_nobody_judged_is_found(tmp_path):
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(keys.NOT_JUDGED))
     assert read_pickle(tmp_path / "x.pkl") is keys.NOT_JUDGED
 
 
@@ -149,13 +148,3 @@ def test_random_states_go_on_where_they_stood(run):
     random.seed(1), np.random.seed(1), torch.manual_seed(1)
     assert drawn() == first
     assert len(set(first)) == 3
-
-
-def test_a_checkpoint_without_them_goes_on_too(run):
-    arm, folder, checkpoint = run  # older ones have pickled states, which are left
-    state = json.loads((checkpoint / "state.json").read_text())
-    del state["files"]["random.json"]
-    (checkpoint / "state.json").write_text(json.dumps(state))
-    (checkpoint / "random.json").unlink()
-    found = latest_checkpoint(folder / "checkpoints", pytest.fail)
-    assert found.load_model("SAC", make_vec_env(arm), "cpu").num_timesteps == 32

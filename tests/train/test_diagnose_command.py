@@ -1,6 +1,9 @@
 """safe-wrappers diagnose: what it writes, whose policies it takes, and what it refuses."""
 
 import json
+import re
+import shutil
+import subprocess
 
 import gymnasium as gym
 import numpy as np
@@ -53,6 +56,19 @@ def test_the_command_prints_and_writes_page_and_json(tmp_path, capsys):
     assert [row["step"] for row in rows] == list(range(60))
     slipping = np.mean([row["value"] > 0.2 for row in rows])
     assert slipping == pytest.approx(there["findings"][0]["figure"]) and slipping > 0.0
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no browser")
+@pytest.mark.parametrize("width", [1200, 600])
+def test_nothing_of_the_page_is_beyond_the_window(tmp_path, width):
+    page = tmp_path / "rover.html"
+    assert main(["diagnose", "SafeRover-v0", "--steps", "40", "--output", str(page)]) == 0
+    page.write_text(
+        page.read_text() + "<script>document.title = document.documentElement.scrollWidth</script>"
+    )
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900"]
+    shown = subprocess.run([*command, "--dump-dom", str(page)], capture_output=True, text=True, timeout=60)
+    assert int(re.search(r"<title>(\d+)</title>", shown.stdout)[1]) <= width
 
 
 def test_the_policy_of_a_run_acts_as_it_was_trained(run, tmp_path):

@@ -4,36 +4,31 @@ from made_up import episode, write_evaluation
 from safe_wrappers.train.evaluation.episode_selection import compared_pairs, shown_episode
 
 
-def evaluated(experiment, violations=(0, 0, 0), changed=(0.0, 0.0, 0.0)):
-    write_evaluation(experiment, 0, 0, "filter_off", [episode(violations=count) for count in violations])
-    write_evaluation(experiment, 1, 0, "filter_on", [episode(intervention_rate=rate) for rate in changed])
-    return shown_episode(experiment)
-
-
 @pytest.mark.parametrize(
-    ("violations", "changed", "episode_seed", "reason"),
+    ("returns", "typical", "worst"),
     [
-        ((1, 9, 9), (0.9, 0, 0), 101, "with most violations of “unfiltered” with the filter off"),
-        ((0, 0, 0), (0.1, 0.1, 0.5), 102, "in which the filter changed most steps of “filtered”"),
-        ((0, 0, 0), (0, 0, 0), 100, "the first of the 3 evaluation episodes"),
+        ((1.0, 9.0, 5.0), 102, 100),
+        ((4.0, 3.0, 1.0, 2.0), 103, 102),
+        ((2.0, 2.0), 100, 100),
+        ((7.0,), 100, 100),
     ],
 )
-def test_the_episode_that_shows_most(fake_experiment, violations, changed, episode_seed, reason):
-    shown = evaluated(fake_experiment(), violations, changed)
-    assert (shown.seed, shown.episode_seed) == (0, episode_seed)
-    assert shown.reason.startswith(f"Episode seed {episode_seed}, policies of training seed 0: ")
-    assert reason in shown.reason
-
-
-def test_policies_of_several_tasks_are_shown_where_all_of_them_hurt_most(fake_experiment):
-    experiment = fake_experiment(
-        "arms={one: {filter: none}, two: {filter: none}}", "evaluation.filter={factory: 'fake_task:shield'}"
-    )
-    for arm, counts in ((0, (4, 3, 0)), (1, (0, 3, 4))):
-        write_evaluation(experiment, arm, 0, "filter_off", [episode(violations=count) for count in counts])
+def test_a_typical_episode_is_shown_and_the_worst_beside_it(fake_experiment, returns, typical, worst):
+    experiment = fake_experiment()
+    write_evaluation(experiment, 1, 0, "filter_on", [{**episode(), "return": value} for value in returns])
     shown = shown_episode(experiment)
-    assert shown.episode_seed == 101
-    assert "with most violations of “one” and “two” together" in shown.reason
+    assert (shown.seed, shown.episode_seed, shown.worst_seed) == (0, typical, worst)
+    assert shown.reason.startswith(f"Episode seed {typical}, policies of training seed 0: ")
+    assert "the median return of “filtered” with the filter on" in shown.reason
+    assert list(shown.filmed.values()) == list(dict.fromkeys([typical, worst]))
+
+
+def test_where_nothing_is_filtered_it_is_the_first_arms(fake_experiment):
+    experiment = fake_experiment("arms={one: {filter: none}, two: {filter: none}}")
+    write_evaluation(
+        experiment, 0, 0, "filter_off", [{**episode(), "return": value} for value in (3.0, 1.0, 2.0)]
+    )
+    assert shown_episode(experiment).episode_seed == 102
 
 
 def test_before_any_evaluation_there_is_none(fake_experiment):

@@ -83,7 +83,12 @@ def test_constraints():
     assert {"JointSpeedLimit", "Clearance<2>", "10 %", "20 %"} <= set(texts(check(picture)))
     alone = constraints_picture({"safe": steps(refused=refused[:, :1])}, ARMS)
     assert (alone.svg, alone.reading) == ("", "Of 200 actions refused by Clearance 10 %.")
-    assert constraints_picture({"safe": steps()}, ARMS).reading == "No constraint refused any of 200 actions."
+    idle = constraints_picture({"safe": steps()}, ARMS).reading
+    assert idle.startswith("No constraint refused any of 200 actions; never acted: Clearance (")
+    names = np.array(["JointSpeedLimit", "Clearance<2>", "Upright"])
+    one = steps(refused=np.column_stack([refused, flags(200)]), constraint_names=names)
+    said = constraints_picture({"safe": one}, ARMS).reading
+    assert "JointSpeedLimit 10 %" in said and "; never acted: Upright (" in said and "Upright 0 %" not in said
     silent = steps(refused=np.zeros((200, 0), dtype=bool), constraint_names=np.array([], dtype=str))
     assert "does not say which" in constraints_picture({"safe": silent}, ARMS).reading
 

@@ -5,7 +5,16 @@ import pytest
 from PIL import Image
 
 from safe_wrappers.train.videos import film
-from safe_wrappers.train.videos.film import HEIGHT, STRIP, Film, encode, first_frame, speed_of, stride_of
+from safe_wrappers.train.videos.film import (
+    HEIGHT,
+    STRIP,
+    WIDTH,
+    Film,
+    encode,
+    first_frame,
+    speed_of,
+    stride_of,
+)
 
 
 def shot(steps, changed=(), violated=(), stride=1):
@@ -47,14 +56,14 @@ def test_an_episode_takes_four_to_ten_seconds(steps, fps, speed):
 
 def test_the_playing_time_is_what_the_speed_says():
     made = shot(1000, stride=20)
-    _, durations = played(encode(made, fps=50, speed=2.0))
+    _, durations = played(encode([made], fps=50, speed=2.0))
     assert sum(durations) == pytest.approx(10_000, rel=0.05)
 
 
 def test_the_strip_shows_when_the_filter_acted_and_where_it_is_now():
     made = shot(100, changed=range(40, 60), violated=[80])
-    frames, _ = played(encode(made, fps=10, speed=1.0))
-    width = 640
+    frames, _ = played(encode([made], fps=10, speed=1.0))
+    width = WIDTH
     assert frames[0].shape == (HEIGHT + STRIP, width, 3)
 
     def strip(frame, step):
@@ -72,7 +81,7 @@ def test_the_strip_shows_when_the_filter_acted_and_where_it_is_now():
 
 def test_one_step_that_hurt_is_seen_in_a_long_episode():
     made = shot(1000, violated=[501], stride=50)
-    frames, _ = played(encode(made, fps=50, speed=2.0))
+    frames, _ = played(encode([made], fps=50, speed=2.0))
     red = frames[0][HEIGHT + STRIP // 2]
     assert ((red[:, 0] > 150) & (red[:, 1] < 90)).any()
 
@@ -84,17 +93,31 @@ def test_a_film_that_is_too_large_loses_every_other_frame(monkeypatch):
         made.add_frame(rng.integers(0, 255, (240, 320, 3), dtype=np.uint8))
         made.add_step(False, False)
     monkeypatch.setattr(film, "MOST_BYTES", 100_000_000)
-    whole = encode(made, fps=10, speed=1.0)
+    whole = encode([made], fps=10, speed=1.0)
     monkeypatch.setattr(film, "MOST_BYTES", int(0.3 * len(whole)))
-    small = encode(made, fps=10, speed=1.0)
+    small = encode([made], fps=10, speed=1.0)
     assert len(small) <= 0.3 * len(whole)
     (frames, durations), (_, before) = played(small), played(whole)
     assert len(frames) == 4
     assert sum(durations) == pytest.approx(sum(before))  # as long as before
 
 
+def test_episodes_are_side_by_side_and_the_shorter_one_waits_at_its_end():
+    long, short = shot(60), shot(20)
+    long.title = short.title = "an episode"
+    frames, _ = played(encode([long, short], fps=10, speed=1.0))
+    assert len(frames) == 60
+    height = film.TITLE + HEIGHT + STRIP
+    assert frames[0].shape[0] == height and frames[0].shape[1] > 2 * WIDTH
+    middle = film.TITLE + HEIGHT // 2
+    seen = [frame[middle, [WIDTH // 2, -WIDTH // 2]].mean(axis=-1) for frame in frames]
+    assert seen[15] == pytest.approx([15, 15], abs=4)
+    assert seen[50] == pytest.approx([50, 19], abs=4)
+    assert np.ptp(frames[0][: film.TITLE]) > 150  # words on paper
+
+
 def test_the_still_is_the_first_frame():
-    data = encode(shot(30), fps=10, speed=1.0)
+    data = encode([shot(30)], fps=10, speed=1.0)
     still = Image.open(io.BytesIO(first_frame(data)))
     assert still.n_frames == 1
     assert np.asarray(still.convert("RGB"), dtype=int) == pytest.approx(played(data)[0][0], abs=12)

@@ -1,7 +1,7 @@
 """The first sentences of the report must not say more than the numbers do."""
 
 import pytest
-from made_up import episode, fill, steps, write_evaluation
+from made_up import episode, fill, steps, write_evaluation, write_training
 
 from safe_wrappers.train.evaluation.summary import summarize
 from safe_wrappers.train.report.headline import cards
@@ -47,7 +47,8 @@ def told(experiment, **more):
         (
             {"violations": 1},
             {"intervention_rate": 0.25, "infeasible": 2, "fallback": 3},
-            "The filter changed 25 % of the evaluation steps; 48 steps were infeasible and 72 ran the fallback.",
+            "The filter changed 25 % of the evaluation steps; 8 steps were infeasible and 12 ran the fallback."
+            " In training 40 steps were infeasible and 60 ran the fallback, of 2,000.",
         ),
         (
             {"violations": 1},
@@ -65,6 +66,20 @@ def told(experiment, **more):
 )
 def test_verdicts(fake_experiment, off, on, sentence):
     assert sentence in told(fake_experiment(), off=off, on=on)
+
+
+def test_what_was_infeasible_in_training_alone_is_not_told_of_the_evaluation(fake_experiment):
+    experiment = fake_experiment()
+    fill(experiment, {"violations": 1}, {"intervention_rate": 0.5})
+    write_training(experiment, 1, 0, [{"timesteps": 100, **episode(infeasible=1)}])
+    said = " ".join(verdict(experiment, summarize(experiment)))
+    assert (
+        "of the evaluation steps; no step was infeasible and none ran the fallback. In training 1 step was"
+        in said
+    )
+    assert "where no action was admissible, of training and evaluation" in cards(
+        experiment, summarize(experiment)
+    )
 
 
 def four_ways(experiment, spread=0.0):
@@ -92,7 +107,7 @@ def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filte
         "Trained through the filter, the policy returned per evaluation episode 9.4 [8.9, 9.9] with it taken off"
         " (6 of 200 steps in violation, 3 %) and 5.03 [4.53, 5.53] with it (no step in violation).",
         "With the filter on, the policy trained without it returned more (2 seeds say little)."
-        " In brackets the range over 2 seeds, which is not an interval.",
+        " In brackets the range over 2 seeds, which is not an interval. Trained for 512 control steps each.",
     ]
     page = cards(experiment, numbers)
     for title, value, what, hurt in (

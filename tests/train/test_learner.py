@@ -229,7 +229,7 @@ def test_a_film_has_the_map_as_well(fake_experiment, monkeypatch, tmp_path):
     monkeypatch.setattr(record_module, "make_stack", stack)
     with pytest.raises(MadeError):
         record_module.record_video(
-            arm, ShownEpisode(0, 7, ""), folder, arm.filter, tmp_path / "film", Reports().progress
+            arm, ShownEpisode(0, 7, 7, ""), folder, arm.filter, tmp_path / "film", Reports().progress
         )
     assert made[1:] == [arm.filter, arm.learner]
     assert [

@@ -1,17 +1,22 @@
 """safe-wrappers list and init: names that exist, and a config that works, with each comment taken away, too."""
 
 import re
+import sys
+import textwrap
 
 import gymnasium as gym
 import pytest
 import yaml
 
 import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import recipe_names, recipe_of
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.config import parse_experiment, read_config
+from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment, read_config
 from safe_wrappers.train.config.algorithms import ALGORITHMS
+from safe_wrappers.train.experiment import check_training
 from safe_wrappers.train.listing import LISTS
+from safe_wrappers.train.run.stack import make_stack
 
 
 def listed(capsys, *kinds):
@@ -86,12 +91,15 @@ def test_what_init_writes_is_an_experiment(tmp_path, monkeypatch, capsys):
     assert "'experiment.yaml' is there already; give another name" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("algorithm", ["PPO", "SAC", "TD3", "DQN"])
-def test_env_and_algorithm_are_filled_in(tmp_path, algorithm):
+@pytest.mark.parametrize(
+    ("env_id", "algorithm"),
+    [("CartPole-v1", "PPO"), ("Pendulum-v1", "SAC"), ("Pendulum-v1", "TD3"), ("CartPole-v1", "DQN")],
+)
+def test_env_and_algorithm_are_filled_in(tmp_path, env_id, algorithm):
     path = tmp_path / "mine.yaml"
-    assert main(["init", str(path), "env=CartPole-v1", f"algorithm={algorithm}"]) == 0
+    assert main(["init", str(path), f"env={env_id}", f"algorithm={algorithm}"]) == 0
     arm = parse_experiment(read_config(path)).arms[0]
-    assert (arm.env.id, arm.algorithm) == ("CartPole-v1", algorithm)
+    assert (arm.env.id, arm.algorithm) == (env_id, algorithm)
 
 
 def test_every_comment_that_is_taken_away_leaves_an_experiment(tmp_path):
@@ -112,6 +120,9 @@ def test_every_comment_that_is_taken_away_leaves_an_experiment(tmp_path):
         (["env=Reachr-v5"], "Did you mean 'Reacher-v5'"),
         (["algorithm=PPPO"], "Did you mean 'PPO'"),
         (["steps=3"], "init: unknown name 'steps'"),
+        (["env=fake_task:shield"], "give fake_task:shield-v0"),
+        (["env=no_such_module:Some-v0"], "No module named 'no_such_module'"),
+        (["env=CartPole-v1", "algorithm=SAC"], "SAC needs continuous actions"),
     ],
 )
 def test_what_would_not_work_is_not_written(tmp_path, words, message, capsys):
@@ -125,3 +136,78 @@ def test_it_writes_one_file(capsys):
     with pytest.raises(SystemExit):
         main(["init", "a.yaml", "b.yaml"])
     assert "init takes one CONFIG.yaml" in capsys.readouterr().err
+
+
+MINE = """
+import gymnasium as gym
+import numpy as np
+
+
+class Swing(gym.Env):
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = np.zeros(2)
+        return self.at.copy(), {}
+
+    def step(self, action):
+        self.at = self.at + 0.1 * np.array([self.at[1], float(action[0])])
+        return self.at.copy(), 0.0, False, False, {}
+
+
+gym.register("MySwing-v0", entry_point=Swing, max_episode_steps=20)
+gym.register("MySwimmer-v0", entry_point="gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv", max_episode_steps=20)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """A folder with a module of envs that no recipe knows."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "my_envs.py").write_text(MINE)
+    yield tmp_path
+    for name in ("my_envs", "a_1_filter", "my_filter"):
+        sys.modules.pop(name, None)
+    for name in ("MySwing-v0", "MySwimmer-v0"):
+        gym.registry.pop(name, None)
+
+
+def test_an_env_without_a_recipe_gets_a_module_with_its_filter(mine, capsys):
+    assert main(["init", "a-1.yaml", "env=my_envs:MySwimmer-v0"]) == 0
+    assert "a_1_filter.py" in capsys.readouterr().out
+    experiment = parse_experiment(read_config(mine / "a-1.yaml"))
+    assert [arm.filter.kind for arm in experiment.arms] == ["none", "factory"]
+    filtered = make_stack(experiment.arms[1].env, experiment.arms[1].filter)
+    filtered.reset(seed=0)
+    assert "cbf/margin" in filtered.step(filtered.action_space.sample())[4]
+    assert main(["init", "a 1.yaml", "env=my_envs:MySwimmer-v0"]) == 1, "the module is there already"
+    assert not (mine / "a 1.yaml").exists()
+
+
+def test_what_only_the_user_knows_is_asked_for_before_anything_is_trained(mine, capsys):
+    assert main(["init", "a-1.yaml", "env=my_envs:MySwing-v0"]) == 0
+    experiment = parse_experiment(read_config(mine / "a-1.yaml", ["total_steps=8"]))
+    with pytest.raises(ConfigurationError, match=r"say in a_1_filter.py what must stay positive"):
+        check_training(experiment)
+    module = mine / "a_1_filter.py"
+    given = re.sub(r"    raise .*", "    return 0.5 - abs(observation[1])", module.read_text())
+    module.write_text(given)
+    sys.modules.pop("a_1_filter")
+    check_training(experiment)
+
+
+@pytest.mark.parametrize("env_id", ["MySwimmer-v0", "MySwing-v0"])
+def test_protect_without_a_recipe_is_refused_with_what_a_config_takes_instead(mine, env_id):
+    with pytest.raises(ConfigurationError, match=r"protect has no recipe for") as caught:
+        make_stack(EnvConfig(id=f"my_envs:{env_id}"), FilterConfig(protect={}))
+    message = str(caught.value)
+    module = textwrap.dedent("\n".join(line for line in message.splitlines() if line.startswith("    ")))
+    (mine / "my_filter.py").write_text(
+        "horizon, backup = 2, 'zero'\ndef h(seen):\n    return 1.0\n" * (env_id == "MySwing-v0") + module
+    )
+    chosen = yaml.safe_load(re.search(r"filter: \{.*?\}", message)[0])["filter"]
+    filtered = make_stack(EnvConfig(id=f"my_envs:{env_id}"), FilterConfig(**chosen))
+    assert "cbf/margin" in filtered.reset(seed=0)[1]

@@ -94,6 +94,9 @@ def test_it_acts_as_the_checkpoint_does_and_nothing_is_unpickled(settings, tmp_p
         action = of_run(observation)
         np.testing.assert_array_equal(of_folder(observation), action)
         observation = env.step(action)[0]
+    of_folder.model.policy.load_state_dict(of_run.model.policy.state_dict())  # the same networks
+    for name in np.load(run / "policy" / "model.npz").files:
+        assert "target" not in name, "a policy that acts needs no lagging copies"
     assert {path.suffix for path in (run / "policy").iterdir()} <= {".npz", ".json", ".md"}
     for path in (run / "policy").glob("*.npz"):
         np.load(path, allow_pickle=False)

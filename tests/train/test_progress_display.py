@@ -1,6 +1,7 @@
 """What is shown while runs are at work, by a clock of the test's own."""
 
 import io
+import math
 
 import pytest
 from rich.console import Console
@@ -90,6 +91,34 @@ def test_what_went_before_and_what_comes_later_is_part_of_the_whole():
     assert shown.lines()[1] == "Training: 46 %, 4,600/10,000 steps, 20 steps/s, 0:04:30 left"
 
 
+def test_the_whole_is_not_done_before_its_slowest_run():
+    shown = Shown(terminal=False, totals={"fast": 1000, "slow": 1000})
+    for name in ("fast", "slow"):
+        shown.display.start(name)
+        shown.display.steps(name, 0)
+    shown.now = 30.0
+    shown.display.steps("fast", 800)
+    shown.display.steps("slow", 200)
+    shown.display.tick()
+    assert shown.lines()[2].endswith(
+        ", 0:02:00 left"
+    )  # not 0:00:30, all that is left at both speeds together
+    assert shown.lines()[4].endswith(", 0:02:00 left")
+
+
+def test_random_actions_before_learning_are_soon_forgotten():
+    shown = Shown(terminal=False, totals={"one": 10_000})
+    shown.display.start("one")
+    for second, done in ((0.0, 0), (1.0, 2000)):  # without updates
+        shown.now = second
+        shown.display.steps("one", done)
+    for second in range(2, 31):
+        shown.now = float(second)
+        shown.display.steps("one", 2000 + 100 * (second - 1))
+    shown.display.tick()
+    assert shown.lines()[1].endswith(", 0:00:51 left")  # 5,100 steps at 100 steps/s
+
+
 @pytest.mark.parametrize(
     ("speed", "text"),
     [(0.0, ""), (0.4, "2.5 s/episode"), (1.0, "1 episodes/s"), (1234.4, "1,234 episodes/s")],
@@ -98,9 +127,9 @@ def test_what_is_slow_is_told_in_seconds(speed, text):
     assert speed_text(speed, "episodes") == text
 
 
-def test_a_pace_is_of_the_last_half_minute_and_over_all():
+def test_a_pace_is_of_the_last_seconds_and_over_all():
     pace = Pace()
-    assert (pace.lately, pace.overall, left_text(5, pace.lately)) == (0.0, 0.0, "")
+    assert (pace.lately, pace.overall, left_text(math.inf)) == (0.0, 0.0, "")
     pace.report(0.0, 500)
     assert (pace.lately, pace.overall) == (0.0, 0.0)
     for second in range(1, 101):

@@ -171,7 +171,7 @@ def test_a_file_without_statistics_does_not_fit_an_arm_that_scales(fake_experime
 
 def test_a_run_that_begins_elsewhere_has_a_folder_of_its_own(fake_experiment):
     plain, tuned = fake_experiment().arms[1], fake_experiment(TUNED).arms[1]
-    assert "start_from" not in plain.fingerprint()  # as in the folders of older runs
+    assert "start_from" not in plain.fingerprint()
     assert tuned.fingerprint() == plain.fingerprint() | {"start_from": "unfiltered"}
 
 

@@ -12,11 +12,12 @@ from safe_wrappers.train.evaluation.episode_selection import shown_episode
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.evaluation.scene import load_scenes
 from safe_wrappers.train.processes.parallel import RunsFailedError
+from safe_wrappers.train.report.film_section import films
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.tables import read_rows
 from safe_wrappers.train.videos import film
 from safe_wrappers.train.videos import record as videos
-from safe_wrappers.train.videos.film import HEIGHT
+from safe_wrappers.train.videos.film import HEIGHT, TITLE, WIDTH
 from safe_wrappers.train.videos.record import load_video, record_videos, video_path, video_problem
 from safe_wrappers.train.videos.rendering import Rendering
 
@@ -90,23 +91,31 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
         for condition in ("filter_off", "filter_on"):
             video = load_video(video_path(experiment, arm, condition))
             rows = read_rows(evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.csv")
-            (row,) = [row for row in rows if row["episode_seed"] == shown.episode_seed]
-            # The film is of the very episode that was evaluated.
-            assert (video.steps, video.violations) == (row["length"], row["violations"])
-            assert video.changed == pytest.approx(row.get("intervention_rate", 0) * row["length"])
-            changed += video.changed
             frames = Image.open(io.BytesIO(video.animation))
-            assert frames.n_frames == 20
             scenes = load_scenes(evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.npz")
-            start = (scenes[shown.episode_seed].agent[0] * (20, 15) + (40, 30)).astype(int) * 8 + 4
-            red, green, _ = np.moveaxis(np.asarray(frames.convert("RGB"), dtype=int)[:HEIGHT], -1, 0)
-            dot = np.argwhere(red - green > 100).mean(axis=0)[::-1]
-            # Where this episode starts, to half a pixel of the task's.
-            assert dot == pytest.approx(start, abs=4)
+            seeds = (shown.episode_seed, shown.worst_seed)
+            for side, (episode, seed) in enumerate(zip(video.episodes, seeds, strict=True)):
+                (row,) = [row for row in rows if row["episode_seed"] == seed]
+                # The film is of the very episode that was evaluated.
+                title = f"{('typical', 'worst')[side]}: episode {seed}, return {row['return']:.1f}"
+                assert (episode.title, episode.steps, episode.violations) == (
+                    title,
+                    row["length"],
+                    row["violations"],
+                )
+                assert episode.changed == pytest.approx(row.get("intervention_rate", 0) * row["length"])
+                changed += episode.changed
+                frames.seek(0)
+                pixels = np.asarray(frames.convert("RGB"), dtype=int)[TITLE : TITLE + HEIGHT]
+                red, green, _ = np.moveaxis(pixels[:, -WIDTH:] if side else pixels[:, :WIDTH], -1, 0)
+                dot = np.argwhere(red - green > 100).mean(axis=0)[::-1]
+                # Where this episode starts, to half a pixel of the task's.
+                start = ((scenes[seed].agent[0] * (20, 15) + (40, 30)).astype(int) + 0.5) * HEIGHT / 60
+                assert dot == pytest.approx(start, abs=4)
+            assert frames.n_frames == 20
             frames.seek(19)
-            background = np.asarray(frames.convert("RGB"))[10, 10]
+            background = np.asarray(frames.convert("RGB"))[TITLE + 10, 10]
             assert background == pytest.approx([5 * 19] * 3, abs=6)
-            assert frames.height > HEIGHT
             assert video.speed == 0.5  # 20 steps at 10 a second take 2 s; shown in 4
     assert changed > 0
     assert video_problem(experiment) == ""
@@ -156,6 +165,12 @@ def test_a_crash_while_filming_does_not_fail_the_evaluation(evaluated, inline, m
     )
 
 
+def test_nothing_is_filmed_that_the_config_does_not_want(evaluated, inline):
+    experiment = evaluated("evaluation.films=false")
+    assert said(experiment) == "" and inline == []
+    assert "The config wants none (evaluation.films)" in films(experiment)
+
+
 def test_nothing_is_filmed_before_the_evaluation(fake_experiment, inline):
     assert said(fake_experiment(ENV)) == ""
     assert inline == []
@@ -167,7 +182,7 @@ def test_in_processes_of_its_own_with_the_variables_of_the_rendering(evaluated, 
     monkeypatch.setattr(videos, "find_rendering", lambda env: Rendering({"FILMED_BLUE": "1"}))
     assert "video unfiltered filter off: done" in said(experiment)
     video = load_video(video_path(experiment, experiment.arms[0], "filter_off"))
-    pixel = np.asarray(Image.open(io.BytesIO(video.animation)).convert("RGB"))[10, 10]
+    pixel = np.asarray(Image.open(io.BytesIO(video.animation)).convert("RGB"))[TITLE + 10, 10]
     assert pixel[2] > 200 > 50 > pixel[0]  # black, but for the blue that the variable asks for
     assert "FILMED_BLUE" not in os.environ
 
@@ -186,6 +201,6 @@ def test_what_a_filter_knows_is_drawn_into_its_film_and_into_no_other(evaluated,
             frames = Image.open(io.BytesIO(video.animation))
             frames.seek(19)
             lower[condition] = np.asarray(frames.convert("RGB"))[
-                390:430, 300:350
+                310:340, 225:260
             ].mean()  # of the lowest fifth
         assert lower["filter_on"] < 0.5 * lower["filter_off"]

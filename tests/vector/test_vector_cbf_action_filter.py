@@ -14,7 +14,7 @@ import gymnasium_robotics
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from vector_worlds import AtHazard, ScheduledCart, drift, push, read
+from vector_worlds import AtHazard, ScheduledCart, drift, push, read, slow
 
 import safe_wrappers as sw
 from safe_wrappers.wrappers.faults import Outages
@@ -293,3 +293,33 @@ def test_what_leaves_actions_alone_may_be_inside_or_outside():
     for _ in range(3):
         *_, infos = envs.step(envs.action_space.sample())
     assert all("episode" in info and "cbf/margin" in info for info in infos)
+
+
+def test_actions_that_are_no_numbers_are_refused_and_no_env_is_stepped():
+    envs = sw.protect(SyncVectorEnv([functools.partial(made, "SafePointGoal1-v0")] * 2))
+    envs.reset(seed=0)
+    masked = np.ma.masked_array(np.zeros((2, 2)), [[False, False], [False, True]])
+    for actions in ([[0.0, 0.0], [10**400, 0.0]], masked, list(masked)):
+        with pytest.raises(sw.errors.ActionError, match="none of them masked"):
+            envs.step(actions)
+    assert envs.filters[0].unwrapped.data.time == 0.0
+
+
+def test_the_last_step_of_an_episode_is_reported_beside_envs_that_go_on():
+    # SB3's adapter asks for SAME_STEP: there a buffer of executed actions reads final_info.
+    makers = [functools.partial(ScheduledCart, index) for index in range(2)]
+    limit = [sw.constraints.Barrier(slow)]
+    plant = functools.partial(sw.AnalyticPlant, drift, push, read)
+    filtered = [lambda make=make: sw.CBFActionFilter(make(), limit, plant()) for make in makers]
+    same = AutoresetMode.SAME_STEP
+    alike = SyncVectorEnv(filtered, autoreset_mode=same)
+    together = sw.VectorCBFActionFilter(SyncVectorEnv(makers, autoreset_mode=same), limit, plant())
+    start = {"start": [0.0, 0.45], "ends": [[3], [100]]}
+    for envs in (alike, together):
+        envs.reset(seed=0, options=start)
+    for _ in range(3):
+        infos, others = (envs.step(np.ones((2, 1), np.float32))[4] for envs in (alike, together))
+    finals = others["final_info"]
+    np.testing.assert_array_equal(finals["_executed_action"], [True, False])
+    assert finals["cbf/intervened"][0] and finals["executed_action"][0] != 0.0
+    assert_same(infos, others)

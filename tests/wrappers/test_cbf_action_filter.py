@@ -7,6 +7,7 @@ belongs to a wrapper of a later release and is left out here.
 import copy
 import re
 import warnings
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -242,7 +243,12 @@ def test_unknown_names_and_bad_margins_are_refused(options, error, message):
 @pytest.mark.parametrize(
     ("constraint", "message"),
     [
-        (lambda: "fast", r"a constraint \(a sw.Constraint\)"),
+        (lambda: "fast", "a constraint .an instance of a subclass of sw.Constraint, .* got 'fast'"),
+        (lambda: SpeedRow, "an instance of a subclass of sw.Constraint, .* got <class 'worlds.SpeedRow'>"),
+        (
+            lambda: SimpleNamespace(rows=lambda plant: sw.HalfSpaces.none(1)),
+            r"a subclass of sw.Constraint, whose bind\(plant\) returns a sw.BoundConstraint.*got namespace",
+        ),
         (
             lambda: {"kind": "Clearence"},
             "unknown constraint kind 'Clearence'; the kinds are Barrier, Clearance",
@@ -546,6 +552,13 @@ def test_the_users_fallback_sees_the_plant_and_nonsense_from_it_is_replaced():
     info = filtered.step(np.array([0.9], np.float32))[4]
     np.testing.assert_array_equal(seen[-1], [1.0, 0.5])
     np.testing.assert_array_equal(info["executed_action"], [0.0])
+    for no_number in (["fast"], [10**400], np.ma.masked_array([0.0], True)):
+        filtered = cart([CONTRADICTION], fallback=lambda plant, u=no_number: u)
+        filtered.reset(seed=0)
+        with pytest.raises(
+            ConfigurationError, match="the fallback's control is a number or an array of numbers"
+        ):
+            filtered.step(np.zeros(1))
     filtered = cart([CONTRADICTION], fallback=lambda plant: [0.0, 0.0])
     filtered.reset(seed=0)
     with pytest.raises(

@@ -806,7 +806,7 @@ def test_the_longest_blend_time_that_fits_is_accepted():
     assert handover(Line(), blend_time=0.5, inference_delay=3, rate_limit=None).chunk_size == 8
 
 
-def test_an_env_that_does_not_say_how_long_a_step_lasts_needs_hold_s():
+def test_an_env_that_does_not_say_how_long_a_step_lasts_needs_control_dt():
     class Timeless(Line):
         def __init__(self):
             super().__init__()

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from occlusion_world import STILL, WALL, Turning, straight
+from oracles import blind_covariance, double_integrator_covariance
 
 import safe_wrappers as sw
-from safe_wrappers.appendix.estimation.covariance import blind_covariance, double_integrator_covariance
 from safe_wrappers.errors import (
     ConfigurationError,
     SafeWrappersError,

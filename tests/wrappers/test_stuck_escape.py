@@ -46,32 +46,47 @@ def test_reporting_alone_changes_nothing():
         assert all(np.array_equal(info[key], same[key]) for key in same)
 
 
-def test_a_drawn_action_is_held_filtered_and_reported_as_a_change_of_the_policys():
+def test_a_drawn_action_is_held_filtered_and_not_counted_as_the_filters_change():
     infos, _, _ = pushing(escape_s=0.5)
     escaping = [i[keys.CBF_ESCAPING] for i in infos]
     began = escaping.index(True)
     assert infos[began - 1][keys.CBF_STUCK]
     assert escaping[began : began + 25] == [True] * 25
     assert not escaping[began + 25]
+    drawn = infos[began][keys.PROPOSED_ACTION]
+    assert not np.array_equal(drawn, PUSH)
     for info in infos[began : began + 25]:
-        assert info[keys.CBF_INTERVENED]
-        np.testing.assert_array_equal(info[keys.PROPOSED_ACTION], PUSH)
-        away = np.linalg.norm(info[keys.EXECUTED_ACTION] - PUSH)
+        np.testing.assert_array_equal(info[keys.PROPOSED_ACTION], drawn)
+        away = np.linalg.norm(info[keys.EXECUTED_ACTION] - drawn)
         assert info[keys.CBF_CORRECTION] == pytest.approx(away, abs=1e-12)
+        assert info[keys.CBF_INTERVENED] == (away > 0.0)
+    free = [i for i in infos if i[keys.CBF_ESCAPING] and not i[keys.CBF_INTERVENED]]
+    assert len(free) > 10
     assert not any(i["cost_substep"] for i in infos)
     alone = pushing(escape_s=0.0)[0]
     assert sum(i[keys.CBF_STUCK] for i in infos) < sum(i[keys.CBF_STUCK] for i in alone)
+
+
+def test_a_learner_is_told_that_its_action_was_replaced():
+    """The penalty is by how far the executed action is from the policy's, as where the filter changed it."""
+    env = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
+    env = sw.StuckEscape(env, after_s=1.0, progress=0.05, escape_s=0.5)
+    env = sw.AdaptionPenalty(env, penalty=0.1, per_correction=2.0)
+    env.reset(seed=0, options={"layout": BEFORE_A_HAZARD})
+    infos = [env.step(PUSH)[4] for _ in range(200)]
+    escaping = [i for i in infos if i[keys.CBF_ESCAPING]]
+    assert escaping
+    for info in escaping:
+        away = np.linalg.norm(info[keys.EXECUTED_ACTION] - PUSH)
+        assert info[keys.ADAPTION_PENALTY] == pytest.approx(0.1 + 2.0 * away)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_policy_that_is_not_finite_while_it_acts_is_counted(bad):
     _, _, env = pushing(escape_s=2.0, steps=100)
     info = env.step(np.array([bad, 0.5], dtype=np.float32))[4]
-    assert info[keys.CBF_ESCAPING] and info[keys.CBF_NONFINITE] and info[keys.CBF_INTERVENED]
-    np.testing.assert_array_equal(info[keys.PROPOSED_ACTION], [0.0, 0.5])
+    assert info[keys.CBF_ESCAPING] and info[keys.CBF_NONFINITE]
     assert np.isfinite(info[keys.EXECUTED_ACTION]).all()
-    away = np.linalg.norm(info[keys.EXECUTED_ACTION] - [0.0, 0.5])
-    assert info[keys.CBF_CORRECTION] == pytest.approx(away, abs=1e-12)
 
 
 def test_the_same_seed_draws_the_same():
@@ -112,7 +127,7 @@ def test_what_has_no_value_is_not_chosen():
 
     infos, _, _ = pushing(escape_s=0.5, value=only_the_first)
     escaping = [i for i in infos if i[keys.CBF_ESCAPING]]
-    assert escaping and all(i[keys.CBF_INTERVENED] for i in escaping)
+    assert escaping and not any(i[keys.CBF_INTERVENED] for i in escaping)
     infos, _, _ = pushing(escape_s=0.5, value=lambda _, actions: np.full(len(actions), np.nan))
     alone = pushing(escape_s=0.0)[0]
     for info, same in zip(infos, alone, strict=True):  # the policy's own action is proposed

@@ -9,7 +9,6 @@ from typing import Any
 
 from pydantic import AfterValidator
 
-from safe_wrappers.deprecation import deprecated_names
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
@@ -36,8 +35,8 @@ def arguments(of: Callable[..., Any], *not_in_yaml: str) -> list[str]:
 
 
 def check_lease(given: Any) -> Any:
-    """Arguments of a LeaseExpiry; those of its budget may stand beside it, as they once did."""
-    valid = (*arguments(LeaseExpiry, "plant", "measured"), *deprecated_names(LeaseExpiry))
+    """Arguments of a LeaseExpiry, and the fields of its budget."""
+    valid = arguments(LeaseExpiry, "plant", "measured")
     for name in given or {}:
         check_name(name, valid)
     budget = (given or {}).get("budget")

@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import re
-from typing import Final
+import sys
+from collections.abc import Mapping
+from typing import Any, Final
 
 import gymnasium as gym
 
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 
 from .names import check_name
 
@@ -41,6 +43,29 @@ def check_env_id(env_id: str) -> str:
             " pip install 'safe-wrappers[robotics]'"
         )
     return check_name(env_id, gym.registry)
+
+
+def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    """Makes an env by the id and the arguments of a config.
+
+    Raises:
+        ConfigurationError: It cannot be made; whatever its own constructor says of its arguments.
+    """
+    check_env_id(env_id)  # a spawned process has not yet registered what the first one did
+    try:
+        return gym.make(env_id, **kwargs)
+    except SafeWrappersError:
+        raise
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}"
+        module, _, name = env_id.partition(":")
+        if name.isidentifier() and callable(getattr(sys.modules.get(module), name, None)):
+            why = (
+                f"that is a function or a class, and env takes an id. Register it in the module {module}, "
+                f"gymnasium.register({name + '-v0'!r}, entry_point={name}), and give {module}:{name}-v0"
+            )
+        of = f" with kwargs {dict(kwargs)}" if kwargs else ""
+        raise ConfigurationError(f"env: {env_id}{of} cannot be made: {why}") from error
 
 
 def _registered(env_id: str) -> bool:

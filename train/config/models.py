@@ -99,7 +99,8 @@ class EnvConfig(Section):
 
     id: Annotated[str, AfterValidator(check_env_id)]
     """As for `gymnasium.make`; ids of gymnasium-robotics too, if it is installed (`pip install
-    'safe-wrappers[robotics]'`). `module:Id-v0` imports the module first."""
+    'safe-wrappers[robotics]'`). `module:Id-v0` imports the module first, which has to
+    register the id."""
     kwargs: Options = Field(default_factory=dict)
     """Passed to `gymnasium.make`."""
     faults: Annotated[dict[str, Options], AfterValidator(check_faults)] = Field(default_factory=dict)
@@ -147,6 +148,8 @@ class EvaluationConfig(Section):
     filter: FilterConfig | None = None
     """As `filter` of an arm: what is put on, in the evaluation with the filter on, where an arm has no filter of
     its own. By default the first filtered arm's."""
+    films: StrictBool = True
+    """Two of the episodes are filmed, in every arm and condition, where the task can draw frames."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +164,8 @@ class ArmConfig(Section):
     `TRPO`, `RecurrentPPO`, `QRDQN`, `MaskablePPO`. The last two and `DQN` are for discrete actions; filtered, those
     have an [ActionShield](wrappers/action-shield.md), and `MaskablePPO` learns from its masks."""
     total_steps: Count
-    """Steps of all envs together; whole rollouts, so PPO may make a few more. May be [raised
+    """Steps of all envs together, rounded up to whole rollouts: PPO with its default of `n_steps: 2048` and four
+    envs trains 8,192 steps if 4,000 are asked for. Progress and report say how many were trained. May be [raised
     later](cli.md#training-for-longer)."""
     hyperparameters: Options = Field(default_factory=dict)
     """Arguments of the algorithm's class, by SB3's names. An arm's are added to those at the top, if the algorithm
@@ -204,7 +208,7 @@ class ArmConfig(Section):
         for harmless in ("name", "checkpoint_every", "device", "vec_env", "trackers"):
             del values[harmless]
         without_default_buffer_size(values)
-        # As in the folders of runs that were made before there was a choice.
+        # What is as by default is left out: a setting that is added later does not change the folders of today.
         if self.learner == NAIVE:
             del values["learner"]
         else:

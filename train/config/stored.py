@@ -17,7 +17,7 @@ def stored_arm(name: str, fingerprint: Mapping[str, Any]) -> ArmConfig:
 
     Args:
         name: The arm's.
-        fingerprint: As JSON gave it back, of this version or an older one.
+        fingerprint: As JSON gave it back.
 
     Returns:
         The arm. What a fingerprint leaves out (`checkpoint_every`, `device`, `vec_env`) has its default.

@@ -6,12 +6,11 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 from rich.console import Console
 
 from safe_wrappers.diagnosis import Diagnosis, diagnose
 
-from ..config.env_ids import check_env_id
+from ..config.env_ids import make_env
 from ..figures.plot_files import PlotFiles
 from .page import diagnosis_page
 from .trained import of_file, of_run
@@ -41,7 +40,7 @@ def diagnose_command(
     if policy is not None and policy.suffix != ".zip":
         env, acts = of_run(policy, env_id, imports)
     else:
-        env = gym.make(check_env_id(env_id))
+        env = make_env(env_id, {})
         acts = acts if policy is None else of_file(policy)
     found = diagnose(env, acts, steps)
     env.close()

@@ -26,11 +26,13 @@ def diagnosis_page(diagnosis: Diagnosis, command: str, files: PlotFiles) -> str:
     head = (
         f"<header><h1>{text(diagnosis.env)}</h1><p>{diagnosis.steps:,} control steps each of the drivers: "
         f'{text(drivers)}.</p></header><p class="verdict">{text(verdict)}</p>'
+        + (f"<p>{text(diagnosis.idle_words)}</p>" if diagnosis.idle_words else "")
     )
     found = [section(finding.title, *_parts(finding, files)) for finding in there]
     rest = [finding for finding in diagnosis.findings if not finding.present]
     rows = "".join(f"<tr><td>{text(one.title)}</td><td>{text(_why_not(one))}</td></tr>" for one in rest)
-    others = section("Not found, or not measured", f"<table><tbody>{rows}</tbody></table>") if rest else ""
+    table = f'<table class="words"><tbody>{rows}</tbody></table>'
+    others = section("Not found, or not measured", table) if rest else ""
     made = section("This page", f"<pre>{text(command)}</pre>")
     return document(f"Diagnosis of {diagnosis.env}", "\n".join([head, *found, others, made]))
 

@@ -1,7 +1,8 @@
-"""What of an experiment is shown first: which two arms are compared, and which episode is looked at."""
+"""What of an experiment is shown first: which two arms are compared, and which episodes are looked at."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ..config import ArmConfig, ExperimentConfig
@@ -29,13 +30,21 @@ class Pair:
 
 @dataclass(frozen=True)
 class ShownEpisode:
-    """One evaluation episode, looked at in every arm and condition."""
+    """The evaluation episode that is looked at in every arm and condition, and the worst one beside it on film."""
 
     seed: int
     """The training seed of the policies."""
     episode_seed: int
+    """Of the typical episode."""
+    worst_seed: int
+    """Of the one with the lowest return."""
     reason: str
-    """How it was chosen, for the page."""
+    """How they were chosen, for the page."""
+
+    @property
+    def filmed(self) -> dict[str, int]:
+        """What is on film, as `filmed_seeds` returns it."""
+        return filmed_seeds(self.episode_seed, self.worst_seed)
 
 
 def compared_pairs(experiment: ExperimentConfig) -> list[Pair]:
@@ -56,47 +65,33 @@ def compared_pairs(experiment: ExperimentConfig) -> list[Pair]:
 
 
 def shown_episode(experiment: ExperimentConfig) -> ShownEpisode | None:
-    """The evaluation episode with most violations without the filter; None before any evaluation.
+    """The evaluation episode with the median return of the headline's policy; None before any evaluation.
 
-    Where there is no violation, the one in which the filter changed most. Not an arbitrary one, which may show
-    nothing at all, and not the best one: the page says which it is.
+    The policy is that of the first filtered arm with the filter on, or of the first arm where nothing is filtered.
     """
-    pairs = compared_pairs(experiment)
+    pair = next(iter(compared_pairs(experiment)), None)
+    arm, condition = (experiment.arms[0], "filter_off") if pair is None else (pair.filtered, "filter_on")
     seed = experiment.seeds[0]
-    bare = [pair.bare for pair in pairs] or list(experiment.arms)
-    violations = _totals(experiment, bare, seed, "filter_off", "violations")
-    if not violations:
+    rows = read_rows(evaluation_folder(experiment.run_folder(arm, seed)) / f"{condition}.csv")
+    if not rows:
         return None
-    acting = [pair.filtered for pair in pairs]
-    changes = _totals(experiment, acting, seed, "filter_on", "intervention_rate")
-    of = f"of the {len(violations)} evaluation episodes"
-    if any(violations.values()):
-        episode_seed = max(violations, key=violations.__getitem__)  # the first of equals
-        chosen = f"{of} the one with most violations of {_named(bare)} with the filter off"
-    elif any(changes.values()):
-        episode_seed = max(changes, key=changes.__getitem__)
-        chosen = f"{of} the one in which the filter changed most steps of {_named(acting)}"
-    else:
-        episode_seed = next(iter(violations))
-        chosen = f"the first {of}"
+    typical, worst = typical_and_worst({int(row["episode_seed"]): row["return"] for row in rows})
+    words = f"“{arm.name}” with the {condition.replace('_', ' ')}"
     return ShownEpisode(
-        seed, episode_seed, f"Episode seed {episode_seed}, policies of training seed {seed}: {chosen}."
+        seed,
+        typical,
+        worst,
+        f"Episode seed {typical}, policies of training seed {seed}: of the {len(rows)} evaluation episodes the one"
+        f" with the median return of {words}. The worst, {worst}, is the one with its lowest return.",
     )
 
 
-def _totals(
-    experiment: ExperimentConfig, arms: list[ArmConfig], seed: int, condition: str, column: str
-) -> dict[int, float]:
-    """A column's sum over arms, by episode seed; what was not judged or reported moves no choice."""
-    totals: dict[int, float] = {}
-    for arm in arms:
-        path = evaluation_folder(experiment.run_folder(arm, seed)) / f"{condition}.csv"
-        for row in read_rows(path):
-            episode_seed = int(row["episode_seed"])
-            totals[episode_seed] = totals.get(episode_seed, 0.0) + row.get(column, 0.0)
-    return totals
+def typical_and_worst(returns: Mapping[int, float]) -> tuple[int, int]:
+    """The episode seeds with the median return (of an even number the lower one) and with the lowest."""
+    ordered = sorted(returns, key=lambda seed: (returns[seed], seed))
+    return ordered[(len(ordered) - 1) // 2], ordered[0]
 
 
-def _named(arms: list[ArmConfig]) -> str:
-    names = [f"“{arm.name}”" for arm in arms]
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]} together"
+def filmed_seeds(typical: int, worst: int) -> dict[str, int]:
+    """Episode seeds by title; of a single episode there is one film."""
+    return {"typical": typical} | ({"worst": worst} if worst != typical else {})

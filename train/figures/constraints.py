@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,6 +12,8 @@ from ..evaluation.step_log import StepLog
 from ..tables import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted, per_arm
+
+_IDLE: Final = "if that is a surprise: a limit may be out of reach, or in another unit; angles are in rad"
 
 
 def constraints_picture(logs: Mapping[str, StepLog], arms: list[str]) -> Picture:
@@ -61,9 +64,15 @@ def constraints_picture(logs: Mapping[str, StepLog], arms: list[str]) -> Picture
 
 
 def _told(log: StepLog, shares: Mapping[str, float]) -> str:
+    idle = ", ".join(name for name, share in shares.items() if share == 0.0)
+    never = f"; never acted: {idle} ({_IDLE})" if idle else ""
     if not log.refused.any():
-        return f"no constraint refused any of {len(log):,} actions"
-    parts = [f"{name} {share:.2g} %" for name, share in sorted(shares.items(), key=lambda item: -item[1])]
+        return f"no constraint refused any of {len(log):,} actions{never}"
+    parts = [
+        f"{name} {share:.2g} %"
+        for name, share in sorted(shares.items(), key=lambda item: -item[1])
+        if share > 0.0
+    ]
     both = 100 * float((log.refused.sum(axis=1) > 1).mean())
     overlap = f"; in {both:.2g} % more than one did" if len(parts) > 1 else ""
-    return f"of {len(log):,} actions refused by {', '.join(parts)}{overlap}"
+    return f"of {len(log):,} actions refused by {', '.join(parts)}{overlap}{never}"

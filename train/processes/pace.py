@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from datetime import timedelta
 from typing import Final
 
-_WINDOW_S: Final = 30.0
+_WINDOW_S: Final = 15.0
+"""Shorter than the first lines come: an off-policy learner's random actions are soon forgotten."""
 
 
 class Pace:
@@ -30,7 +32,7 @@ class Pace:
 
     @property
     def lately(self) -> float:
-        """Units per second over the last half minute; 0 while unknown."""
+        """Units per second over the last 15 s; 0 while unknown."""
         return _rate(self._reports[0], self._reports[-1]) if self._reports else 0.0
 
     @property
@@ -57,6 +59,6 @@ def speed_text(per_second: float, unit: str) -> str:
     return f"{per_second:,.0f} {unit}/s"
 
 
-def left_text(left: float, per_second: float) -> str:
-    """Time left, `0:03:20`; empty while unknown."""
-    return str(timedelta(seconds=round(left / per_second))) if per_second > 0 else ""
+def left_text(seconds: float) -> str:
+    """Time left, `0:03:20`; empty while unknown, which is inf."""
+    return str(timedelta(seconds=round(seconds))) if math.isfinite(seconds) else ""

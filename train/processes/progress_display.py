@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,6 +30,12 @@ class _Row:
     running: bool = False
     pace: Pace = field(default_factory=Pace)
     figures: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def left_s(self) -> float:
+        """Time left at its own speed, s; inf while that is unknown."""
+        speed = self.pace.lately
+        return (self.total - self.done) / speed if speed > 0 else math.inf
 
 
 class ProgressDisplay:
@@ -106,11 +113,11 @@ class ProgressDisplay:
         if self._console.is_terminal or now - self._said_at < max(_EVERY_S, _RARER * (now - self._begun)):
             return
         self._said_at = now
-        done, total, speed = self._all()
-        self.say(self._line(self._title, done, total, speed, [f"{done:,}/{total:,} {self._unit}"]))
+        done, total, speed, left = self._all()
+        self.say(self._line(self._title, done, total, speed, left, [f"{done:,}/{total:,} {self._unit}"]))
         for name, row in self._running().items():
             told = [f"{key} {value}" for key, value in row.figures.items()]
-            self.say("  " + self._line(name, row.done, row.total, row.pace.lately, told))
+            self.say("  " + self._line(name, row.done, row.total, row.pace.lately, row.left_s, told))
 
     def table(self) -> Table:
         """The live table."""
@@ -120,28 +127,33 @@ class ProgressDisplay:
         table.add_column("")
         for heading in (self._unit, "", "speed", "left", *figures):
             table.add_column(heading, justify="right", no_wrap=True)
-        done, total, speed = self._all()
-        table.add_row(*self._cells(self._title, done, total, speed), *("" for _ in figures))
+        done, total, speed, left = self._all()
+        table.add_row(*self._cells(self._title, done, total, speed, left), *("" for _ in figures))
         for name, row in running.items():
             told = [row.figures.get(key, "") for key in figures]
-            table.add_row(*self._cells(name, row.done, row.total, row.pace.lately), *told)
+            table.add_row(*self._cells(name, row.done, row.total, row.pace.lately, row.left_s), *told)
         return table
 
-    def _cells(self, name: str, done: int, total: int, speed: float) -> Sequence[str | ProgressBar]:
+    def _cells(
+        self, name: str, done: int, total: int, speed: float, left: float
+    ) -> Sequence[str | ProgressBar]:
         bar = ProgressBar(total, done, width=10)
         counted = f"{100 * done // total} %"
-        return name, bar, counted, speed_text(speed, self._unit), left_text(total - done, speed)
+        return name, bar, counted, speed_text(speed, self._unit), left_text(left)
 
-    def _line(self, name: str, done: int, total: int, speed: float, told: Sequence[str]) -> str:
-        left = left_text(total - done, speed)
-        pace = (speed_text(speed, self._unit), f"{left} left" if left else "")
+    def _line(self, name: str, done: int, total: int, speed: float, left: float, told: Sequence[str]) -> str:
+        words = left_text(left)
+        pace = (speed_text(speed, self._unit), f"{words} left" if words else "")
         return f"{name}: " + ", ".join(filter(None, (f"{100 * done // total} %", *told, *pace)))
 
-    def _all(self) -> tuple[int, int, float]:
+    def _all(self) -> tuple[int, int, float, float]:
+        """Units done, of how many, units per second, and the time left, s: not less than the slowest run's."""
         rows = self._rows.values()
         speed = sum(row.pace.lately for row in rows if row.running)
         done, total = sum(row.done for row in rows), sum(row.total for row in rows)
-        return self._before + done, self._others + total, speed
+        done, total = self._before + done, self._others + total
+        slowest = max((row.left_s for row in rows if row.running and math.isfinite(row.left_s)), default=0.0)
+        return done, total, speed, max((total - done) / speed, slowest) if speed > 0 else math.inf
 
     def _running(self) -> dict[str, _Row]:
         return {name: row for name, row in self._rows.items() if row.running}

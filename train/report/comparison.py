@@ -57,6 +57,8 @@ class Comparison:
     pairs: tuple[Pair, ...]
     off: Side
     on: Side
+    evaluated: Side
+    """Of the side with the filter, evaluation alone."""
     outcomes: tuple[Outcome, ...]
     """In evaluation, of each arm of the pairs with the filter off and on, as far as it is there."""
 
@@ -82,7 +84,9 @@ def compare(experiment: ExperimentConfig, summary: Summary) -> Comparison | None
         return None
     training = not pairs[0].same_policy
     off = side(summary, [pair.bare for pair in pairs], "filter_off", training)
-    on = side(summary, [pair.filtered for pair in pairs], "filter_on", training)
+    filtered = [pair.filtered for pair in pairs]
+    on = side(summary, filtered, "filter_on", training)
+    evaluated = side(summary, filtered, "filter_on", training=False)
     arms = dict.fromkeys(arm.name for pair in pairs for arm in (pair.bare, pair.filtered))
     of_name = {arm.name: arm for arm in experiment.arms}
     outcomes = tuple(
@@ -91,7 +95,7 @@ def compare(experiment: ExperimentConfig, summary: Summary) -> Comparison | None
         for filter_on in (False, True)
         if (found := _outcome(summary, of_name[name], filter_on)) is not None
     )
-    return Comparison(pairs, off, on, outcomes) if off.steps and on.steps else None
+    return Comparison(pairs, off, on, evaluated, outcomes) if off.steps and on.steps else None
 
 
 def _outcome(summary: Summary, arm: ArmConfig, filter_on: bool) -> Outcome | None:

@@ -1,10 +1,10 @@
-"""The same episode on film, without and with the filter."""
+"""The same episodes on film, without and with the filter."""
 
 from __future__ import annotations
 
 from ..config import ArmConfig, ExperimentConfig
-from ..videos.film import HEIGHT, STRIP, first_frame
-from ..videos.record import Video, load_video, video_path, video_problem
+from ..videos.film import first_frame
+from ..videos.record import Filmed, Video, load_video, video_path, video_problem
 from .markup import data_uri, keys, text
 
 _CONDITIONS = {"filter_off": "filter off", "filter_on": "filter on"}
@@ -29,6 +29,8 @@ def films(experiment: ExperimentConfig) -> str:
             problem
             or "nothing has been filmed yet; safe-wrappers evaluate does, where the task can draw frames."
         )
+        if not experiment.evaluation.films:
+            why = "the config wants none (evaluation.films); safe-wrappers enjoy RUN --output FILM.webp makes one."
         return f'<p class="line"><b>No videos.</b> {text(why[:1].upper() + why[1:])}</p>'
     marks = keys(
         {
@@ -45,16 +47,21 @@ def films(experiment: ExperimentConfig) -> str:
 
 def _film(arm: ArmConfig, words: str, video: Video) -> str:
     title = f"{arm.name}, {words}"
-    hurt = "" if video.violations is None else f"{video.violations:,} in violation, "
-    said = f"Of {video.steps:,} steps {hurt}{video.changed:,} changed; shown {_speed(video.speed)}."
+    said = f"{' '.join(map(_episode, video.episodes))} Shown {_speed(video.speed)}."
     still = data_uri("image/webp", first_frame(video.animation))
     moving = data_uri("image/webp", video.animation)
     return (
         f"<figure><h3>{text(title)}</h3><picture>"
         f'<source media="(prefers-reduced-motion: reduce), print" srcset="{still}">'
-        f'<img src="{moving}" height="{HEIGHT + STRIP}" alt="{text(f"Video: {title}. {said}")}"></picture>'
+        f'<img src="{moving}" alt="{text(f"Video: {title}. {said}")}"></picture>'
         f"<figcaption>{text(said)}</figcaption></figure>"
     )
+
+
+def _episode(episode: Filmed) -> str:
+    hurt = "" if episode.violations is None else f"{episode.violations:,} in violation, "
+    title = episode.title[:1].upper() + episode.title[1:]
+    return f"{title}: of {episode.steps:,} steps {hurt}{episode.changed:,} changed."
 
 
 def _speed(times: float) -> str:

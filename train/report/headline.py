@@ -21,7 +21,9 @@ def cards(experiment: ExperimentConfig, summary: Summary) -> str:
     if on.changed is not None:
         parts.append(card("Steps changed", percent(on.changed), "by the filter, in evaluation"))
     fallback = f"fallback: {on.fallback:,} steps"
-    parts.append(card("Infeasible steps", f"{on.infeasible:,}", "where no action was admissible", fallback))
+    parts.append(
+        card("Infeasible steps", f"{on.infeasible:,}", f"where no action was admissible, {scope}", fallback)
+    )
     time_us = filter_time_us(experiment, found.pairs)
     if time_us is not None:
         parts.append(card("Filter time per step", f"{time_us:,.0f} µs", "mean, on the machine that ran it"))

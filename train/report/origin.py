@@ -11,7 +11,8 @@ from typing import Final
 import yaml
 
 from ..checksums import read_facts
-from ..config import ExperimentConfig
+from ..config import ArmConfig, ExperimentConfig
+from ..run.folder import finished_facts
 from ..run.start import START_FILE
 from .markup import details, table, text
 
@@ -54,7 +55,7 @@ def settings(experiment: ExperimentConfig) -> str:
 def about(experiment: ExperimentConfig) -> str:
     """What was trained on what, for how long, and how it was judged; one sentence."""
     kinds = ", ".join(dict.fromkeys(f"{arm.algorithm} on {arm.env.id}" for arm in experiment.arms))
-    steps = sorted({arm.total_steps * arm.action_repeat for arm in experiment.arms})
+    steps = sorted({_trained(experiment, arm, seed) for arm in experiment.arms for seed in experiment.seeds})
     how_long = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
     seeds = len(experiment.seeds)
     begun = "".join(f" {sentence}" for sentence in _begun(experiment))
@@ -62,6 +63,12 @@ def about(experiment: ExperimentConfig) -> str:
         f"{kinds}, {how_long} steps, {seeds} seed{'s' * (seeds > 1)}; evaluation on"
         f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed.{begun}"
     )
+
+
+def _trained(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> int:
+    """Control steps of a run: whole rollouts, which may be more than `total_steps`."""
+    facts = finished_facts(experiment.run_folder(arm, seed))
+    return int(facts.get("timesteps", arm.total_steps)) * arm.action_repeat
 
 
 def _begun(experiment: ExperimentConfig) -> Iterator[str]:

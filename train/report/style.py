@@ -50,7 +50,7 @@ article.card h3 { font-size: 17px; }
 article.card p { font-size: 16px; margin-top: 6px; }
 article.card .other { font-size: 14px; }
 .figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 14px; }
-.films { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 300px), 1fr)); gap: 14px; }
+.films { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); gap: 14px; }
 .figures, .films { margin-bottom: 14px; }
 /* Title, keys, drawing and sentence stand at the same height as the neighbour's. */
 figure {
@@ -92,6 +92,8 @@ table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nu
 th, td { text-align: right; padding: 6px 10px; border-bottom: 1px solid var(--line); white-space: nowrap; }
 thead th { font-size: 13px; color: var(--soft); font-weight: 600; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
+.words td { white-space: normal; overflow-wrap: anywhere; vertical-align: top; }
+.words td + td { text-align: left; }
 .runs { font-size: 14px; }
 .runs th, .runs td { padding: 6px 7px; }
 .runs th:first-child { padding-left: 0; }

@@ -24,7 +24,7 @@ def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
         *((_safety(found.off, found.on), judge) if found.judged else (judge, _own_measure(found.on))),
         _collisions(found.off, found.on),
         *_price(found),
-        _work(found.on),
+        _work(found.on, found.evaluated),
     )
     return [part for part in parts if part]
 
@@ -75,7 +75,7 @@ def _price(found: Comparison) -> list[str]:
     if not found.outcomes:
         return []
     told = [_policy(found, arm) for arm in dict.fromkeys(outcome.arm.name for outcome in found.outcomes)]
-    return [*told, " ".join(filter(None, (_choice(found), _brackets(found.outcomes))))]
+    return [*told, " ".join(filter(None, (_choice(found), _brackets(found.outcomes), _training(found))))]
 
 
 def _policy(found: Comparison, name: str) -> str:
@@ -138,16 +138,36 @@ def _brackets(outcomes: Sequence[Outcome]) -> str:
     return f"In brackets bootstrap 95 % intervals over seeds{rest}."
 
 
-def _work(on: Side) -> str:
-    if not on.infeasible and not on.fallback:
-        rest = "no step was infeasible and none ran the fallback"
+def _training(found: Comparison) -> str:
+    """For how long the compared policies were trained."""
+    arms = {arm.name: arm for pair in found.pairs for arm in (pair.bare, pair.filtered)}
+    lengths = [f"{arm.total_steps * arm.action_repeat:,}" for arm in arms.values()]
+    if len(set(lengths)) == 1:
+        return f"Trained for {lengths[0]} control steps{' each' if len(lengths) > 1 else ''}."
+    return f"Trained for {' and '.join(lengths)} control steps."
+
+
+def _work(on: Side, evaluated: Side) -> str:
+    """What the filter did in evaluation, and then, where it was on in training and failed there, how often."""
+    if evaluated.infeasible or evaluated.fallback:
+        rest = _failed(evaluated.infeasible, evaluated.fallback)
     else:
-        rest = f"{on.infeasible:,} steps were infeasible and {on.fallback:,} ran the fallback"
-    if on.changed is None:
-        return f"{rest[:1].upper()}{rest[1:]}."
-    return (
-        f"The filter changed {percent(on.changed) if on.changed else 'none'} of the evaluation steps; {rest}."
-    )
+        rest = "no step was infeasible and none ran the fallback"
+    if evaluated.changed is None:
+        in_evaluation = f"In evaluation {rest}."
+    else:
+        changed = percent(evaluated.changed) if evaluated.changed else "none"
+        in_evaluation = f"The filter changed {changed} of the evaluation steps; {rest}."
+    infeasible, fallback = on.infeasible - evaluated.infeasible, on.fallback - evaluated.fallback
+    if not infeasible and not fallback:
+        return in_evaluation
+    steps = on.steps - evaluated.steps
+    return f"{in_evaluation} In training {_failed(infeasible, fallback)}, of {steps:,}."
+
+
+def _failed(infeasible: int, fallback: int) -> str:
+    were = "step was" if infeasible == 1 else "steps were"
+    return f"{infeasible:,} {were} infeasible and {fallback:,} ran the fallback"
 
 
 def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> list[str]:

@@ -82,8 +82,7 @@ class Checkpoint:
                     _move(saved, empty)
                 else:
                     model.replay_buffer = saved
-            if (self.folder / RANDOM).exists():  # older checkpoints have none that is read
-                _set_random_states(json.loads((self.folder / RANDOM).read_text()))
+            _set_random_states(json.loads((self.folder / RANDOM).read_text()))
         return model
 
     def load_normalize(self, env: VecEnv) -> VecEnv:

@@ -29,7 +29,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import GoalSelectionStrategy
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.info import NOT_JUDGED
 
 from ..hyperparameters import LinearFall
 
@@ -65,8 +64,9 @@ _OTHERS: Final = {
     ("numpy.random._pickle", "__bit_generator_ctor"),
     ("numpy.random._pickle", "__generator_ctor"),
     ("numpy.random.bit_generator", "__pyx_unpickle_SeedSequence"),
+    ("safe_wrappers.info", "NOT_JUDGED"),
 }
-"""What NumPy makes its arrays and generators with."""
+"""What NumPy makes its arrays and generators with, and a number of our own."""
 
 
 class _Reader(pickle.Unpickler):
@@ -78,8 +78,6 @@ class _Reader(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """What a pickle calls `module.name`."""
-        if name == "NOT_JUDGED" and module.startswith("safe_wrappers."):
-            return NOT_JUDGED  # older checkpoints have it in another module
         known = module.partition(".")[0] in _PACKAGES and "." not in name
         found = getattr(importlib.import_module(module), name, None) if known else None
         if (module, name) in _OTHERS or (isinstance(found, type) and issubclass(found, _KINDS)):

@@ -13,7 +13,6 @@ from safe_wrappers.errors import RunStateError
 from ..atomic import json_bytes, write_json
 from ..checksums import read_facts
 from ..config import ArmConfig
-from ..config.models import without_default_buffer_size
 from .start import START_FILE
 from .trackers import IDS_FILE, TENSORBOARD
 
@@ -81,7 +80,6 @@ def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
         )
     try:
         theirs = json.loads(path.read_text())
-        without_default_buffer_size(theirs.get("config", {}))  # older folders have it
         there, here = _flat(theirs), _flat(json.loads(json.dumps(_identity(arm, seed))))
     except (ValueError, AttributeError):
         raise RunStateError(f"{str(path)!r} is unreadable; delete {str(folder)!r} to train again.") from None

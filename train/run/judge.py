@@ -53,12 +53,18 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         if isinstance(self._plant, MujocoPlant):
             self._plant = default_plant(task)
             self._plant.bind(task)
-            self._constraints = [constraint.spec.bind(self._plant) for constraint in its_filter.bound]
+            self._bind()
         elif self._plant.delay_s:
             raise ConfigurationError(
                 f"env.judge: the filter's plant looks {self._plant.delay_s} s ahead and does not see the present "
                 "state; use env.cost: module:function"
             )
+
+    def _bind(self) -> None:
+        self._model_version = self._plant.model_version
+        self._constraints = [constraint.spec.bind(self._plant) for constraint in self._constraints]
+        for constraint in self._constraints:
+            constraint.start()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -80,6 +86,8 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         refuse_own_cost(self.unwrapped, info)
         self._plant.received(observation, info)
         self._plant.observe()
+        if isinstance(self._plant, MujocoPlant) and self._plant.model_version != self._model_version:
+            self._bind()
         cost, still = 0.0, np.zeros(self._plant.lower.size)
         for i, constraint in enumerate(self._constraints):
             constraint.observe(self._memories[i])

@@ -44,6 +44,8 @@ CONFIG: Final = "config.json"
 MODEL: Final = "model.npz"
 NORMALISATION: Final = "normalisation.npz"
 FILTER: Final = "filter.json"
+_TARGET: Final = "_target."
+"""Target networks are lagging copies of others, and nearly half of the numbers; only training needs them."""
 _OF_TRAINING: Final = ("replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage")
 """A policy that only acts has no replay buffer."""
 _PACKAGES: Final = ("safe-wrappers", "stable-baselines3", "gymnasium", "mujoco")
@@ -65,7 +67,11 @@ def write_policy(arm: ArmConfig, seed: int, run: Path, model: BaseAlgorithm) -> 
     folder, temporary = run / POLICY, run / f".{POLICY}"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
-    weights = {name: tensor.detach().cpu().numpy() for name, tensor in model.policy.state_dict().items()}
+    weights = {
+        name: tensor.detach().cpu().numpy()
+        for name, tensor in model.policy.state_dict().items()
+        if _TARGET not in name
+    }
     write_bytes(temporary / MODEL, _npz(weights))
     scaling = model.get_vec_normalize_env()
     if scaling is not None and scaling.norm_obs:
@@ -113,7 +119,10 @@ class PolicyFolder:
                 env=envs, device=device, **constructor_arguments(arm, envs)
             )
         with np.load(self.folder / MODEL, allow_pickle=False) as arrays:
-            model.policy.load_state_dict({name: torch.as_tensor(arrays[name]) for name in arrays.files})
+            weights = {name: torch.as_tensor(arrays[name]) for name in arrays.files}
+        targets = (name for name in model.policy.state_dict() if _TARGET in name and name not in weights)
+        weights |= {name: weights[name.replace(_TARGET, ".")] for name in targets}
+        model.policy.load_state_dict(weights)
         return model
 
     def load_normalize(self, env: VecEnv) -> VecEnv:

@@ -11,7 +11,7 @@ from stable_baselines3.common.monitor import Monitor
 
 import safe_wrappers
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.cost_function import CostFunction
@@ -25,8 +25,9 @@ from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
-from ..config.env_ids import check_env_id
+from ..config.env_ids import make_env
 from ..config.names import check_name
+from ..filter_module import refuse_without_recipe
 from ..local_imports import own_folders
 from .judge import ConstraintJudge
 
@@ -53,15 +54,7 @@ def make_stack(
         ConfigurationError: The task or the filter refuses its settings.
     """
     kwargs = env.kwargs if render_mode is None else {**env.kwargs, "render_mode": render_mode}
-    check_env_id(env.id)  # a spawned process has not yet registered what the first one did
-    try:
-        task: gym.Env[Any, Any] = gym.make(env.id, **kwargs)
-    except SafeWrappersError:
-        raise
-    except Exception as error:  # whatever a task's own constructor says of its arguments
-        raise ConfigurationError(
-            f"env: {env.id} with kwargs {kwargs} cannot be made: {type(error).__name__}: {error}"
-        ) from error
+    task = make_env(env.id, kwargs)
     if env.cost is not None:
         task = CostFunction(task, _function(env.cost, "env.cost"))
     if env.judge is not None:
@@ -97,6 +90,7 @@ def make_stack(
 def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[Any, Any]:
     """The task in its filter; as it is if there is none."""
     if action_filter.protect is not None:
+        refuse_without_recipe(task)
         return safe_wrappers.protect(task, **action_filter.protect)
     if action_filter.factory is not None:
         factory = _function(action_filter.factory, "filter.factory")
@@ -125,8 +119,8 @@ def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> Filt
 
 def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:
     """The lease around a filter; its clearance, if none is given, is what the filter keeps."""
-    budget = arguments.get("budget", {})
-    if "clearance" in arguments or "clearance" in budget:
+    budget = arguments.get("budget") or {}
+    if "clearance" in budget:
         return LeaseExpiry(task, **arguments)
     constraints = getattr(task, "constraints", [])
     if len(constraints) != 1:
@@ -134,9 +128,7 @@ def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpir
             f"lease: the filter has {len(constraints)} constraints; say which one the lease is made from with "
             "budget: {clearance: {kind: ..., ...}, ...}"
         )
-    # Without a budget its bounds stand beside it, as they once did; LeaseExpiry takes them and warns.
-    clearance = {"clearance": constraints[0], **budget} if budget else constraints[0]
-    return LeaseExpiry(task, **{**arguments, "budget": clearance})
+    return LeaseExpiry(task, **{**arguments, "budget": {"clearance": constraints[0], **budget}})
 
 
 def _function(name: str, where: str) -> Any:

@@ -23,7 +23,7 @@ from ..atomic import write_json
 from ..checksums import checksums, damage
 from ..config import ArmConfig
 from ..config.algorithms import ALGORITHMS
-from ..hyperparameters import constructor_arguments, learning_starts
+from ..hyperparameters import constructor_arguments, learning_starts, whole_rollouts
 from ..processes.job import Progress
 from ..processes.lock import only_writer
 from ..processes.stopping import RunStoppedError, heeding_termination
@@ -90,7 +90,7 @@ def train_run(
         wrong = _finished_damage(folder)
         if wrong is None and is_finished(arm, folder):
             claim_folder(arm, seed, folder)  # the last rollout may have gone beyond totals that were raised
-            progress.steps(arm.total_steps)
+            progress.steps(whole_rollouts(arm))
             return
         checkpoint = latest_checkpoint(folder / CHECKPOINTS, progress.say)
         if wrong is not None:

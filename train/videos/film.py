@@ -1,42 +1,53 @@
-"""Frames of an episode become a small animated WebP with a strip below that shows when the filter acted."""
+"""Frames of episodes become a small animated WebP; a strip below each shows when the filter acted."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
+from safe_wrappers import info as keys
 from safe_wrappers.drawing.scene import set_size
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
 
-WIDTH: Final = 640
-HEIGHT: Final = 480
-"""Pixels of the picture, whose width an env that MuJoCo does not draw may decide; the strip is below it."""
+from ..evaluation.step_log import is_violation
+from ..run.policy import TrainedPolicy
+from .sight import InSight
+
+WIDTH: Final = 480
+HEIGHT: Final = 360
+"""Pixels of an episode's picture, whose width an env that MuJoCo does not draw may decide."""
 STRIP: Final = 16
-MOST_FRAMES: Final = 120
+"""Below it, px."""
+TITLE: Final = 24
+"""Above it, px; a film without a title has none."""
+MOST_FRAMES: Final = 100
 MOST_BYTES: Final = 2_000_000
 _LONGEST_S: Final = 10.0
 _SHORTEST_S: Final = 4.0
 _QUALITY: Final = 55
+_GAP: Final = 8  # px between two episodes
 _WIDE: Final = 3  # px: half of what marks one step in the strip
 _COLORS: Final = {
     "bare": (120, 128, 138),
     "changed": (240, 178, 20),
     "violated": (214, 40, 52),
     "now": (255, 255, 255),
+    "title": (29, 35, 43),
 }
 
 
 def for_film(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    """An env that has not been drawn yet, as films show it: as large as they are, and with what its filter does."""
+    """An env of which no frame was asked yet, as films show it: the robot in sight, and what its filter does."""
     set_size(env, WIDTH, HEIGHT)
-    return env if filter_inside(env) is None else SafetyOverlay(env)
+    return InSight(env if filter_inside(env) is None else SafetyOverlay(env))
 
 
 @dataclass
@@ -50,6 +61,9 @@ class Film:
     stride: int = 1
     changed: list[bool] = field(default_factory=list)
     violated: list[bool] = field(default_factory=list)
+    title: str = ""
+    figures: dict[str, Any] = field(default_factory=dict)
+    """The episode's, as `RecordInterventions` has them."""
 
     @property
     def wants_frame(self) -> bool:
@@ -89,33 +103,69 @@ def speed_of(steps: int, fps: float) -> float:
     return real_s / min(max(real_s, _SHORTEST_S), _LONGEST_S)
 
 
-def encode(film: Film, fps: float, speed: float) -> bytes:
+def film_episodes(
+    policy: TrainedPolicy, env: gym.Env[Any, Any], seeds: Mapping[str, int]
+) -> tuple[bytes, float, list[Film]]:
+    """Runs episodes and films them side by side.
+
+    Args:
+        policy: Acts, deterministically.
+        env: As `for_film` returns it, with a `RecordInterventions` inside.
+        seeds: Of the env's resets, by title.
+
+    Returns:
+        The animated WebP, times real time at which it shows them, and each episode.
+    """
+    longest = (env.spec.max_episode_steps if env.spec is not None else None) or 1
+    films = [_film_episode(policy, env, title, seed, stride_of(longest)) for title, seed in seeds.items()]
+    fps = float(env.metadata.get("render_fps") or 30.0)
+    # One speed for all conditions, also where one of them ends early.
+    speed = speed_of(max(longest, *(len(film.changed) for film in films)), fps)
+    return encode(films, fps, speed), speed, films
+
+
+def _film_episode(policy: TrainedPolicy, env: gym.Env[Any, Any], title: str, seed: int, stride: int) -> Film:
+    film = Film(stride=stride)
+    observation, _ = env.reset(seed=seed)
+    policy.begin(env)
+    done = False
+    while not done:
+        if film.wants_frame:
+            film.add_frame(env.render())  # type: ignore[arg-type]
+        observation, _, terminated, truncated, info = env.step(policy(observation))
+        film.add_step(bool(info.get(keys.CBF_INTERVENED, False)), is_violation(info))
+        done = terminated or truncated
+    film.figures = info[keys.EPISODE_SUMMARY]
+    film.title = f"{title}: episode {seed}, return {film.figures['return']:.1f}"
+    return film
+
+
+def encode(films: Sequence[Film], fps: float, speed: float) -> bytes:
     """An endless animated WebP of at most `MOST_BYTES`; half of the frames go until it fits.
 
     Args:
-        film: At least one frame.
+        films: Shown side by side, each with at least one frame; where one ends early, its last frame stays.
         fps: Control steps per second of the task.
         speed: Times real time.
     """
-    every = 1
+    stride = max(film.stride for film in films)
+    steps = max(len(film.changed) for film in films)
     while True:
-        kept = range(0, len(film.frames), every)
-        pictures = [_with_strip(film, at) for at in kept]
-        duration_ms = max(1, round(1000 * film.stride * every / (fps * speed)))
+        pictures = [_side_by_side(films, at) for at in range(0, max(steps, 1), stride)]
         data = io.BytesIO()
         pictures[0].save(
             data,
             "WEBP",
             save_all=True,
             append_images=pictures[1:],
-            duration=duration_ms,
+            duration=max(1, round(1000 * stride / (fps * speed))),
             loop=0,
             quality=_QUALITY,
             method=3,
         )
         if data.tell() <= MOST_BYTES or len(pictures) == 1:
             return data.getvalue()
-        every *= 2
+        stride *= 2
 
 
 def first_frame(animation: bytes) -> bytes:
@@ -126,7 +176,21 @@ def first_frame(animation: bytes) -> bytes:
     return data.getvalue()
 
 
-def _with_strip(film: Film, at: int) -> Image.Image:
+def _side_by_side(films: Sequence[Film], step: int) -> Image.Image:
+    """Every film's picture of a step."""
+    parts = [_picture(film, step) for film in films]
+    width = sum(part.width for part in parts) + _GAP * (len(parts) - 1)
+    whole = Image.new("RGB", (width, max(part.height for part in parts)), _COLORS["now"])
+    left = 0
+    for part in parts:
+        whole.paste(part, (left, 0))
+        left += part.width + _GAP
+    return whole
+
+
+def _picture(film: Film, step: int) -> Image.Image:
+    """A frame with the title above and the strip below."""
+    at = min(step // film.stride, len(film.frames) - 1)
     picture = film.frames[at]
     steps = len(film.changed)
     columns = np.arange(picture.width) * steps // picture.width
@@ -138,7 +202,9 @@ def _with_strip(film: Film, at: int) -> Image.Image:
         row[np.asarray(flags, dtype=bool)[columns]] = _COLORS[color]
     now = min(picture.width - 1, at * film.stride * picture.width // steps)
     row[max(0, now - _WIDE) : now + _WIDE + 1] = _COLORS["now"]
-    whole = Image.new("RGB", (picture.width, HEIGHT + STRIP))
-    whole.paste(picture, (0, 0))
-    whole.paste(Image.fromarray(np.tile(row[None], (STRIP, 1, 1))), (0, HEIGHT))
+    top = TITLE if film.title else 0
+    whole = Image.new("RGB", (picture.width, top + picture.height + STRIP), _COLORS["now"])
+    ImageDraw.Draw(whole).text((4, 3), film.title, _COLORS["title"], ImageFont.load_default(size=15))
+    whole.paste(picture, (0, top))
+    whole.paste(Image.fromarray(np.tile(row[None], (STRIP, 1, 1))), (0, top + picture.height))
     return whole

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
 
-from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
 from ..atomic import write_bytes, write_json
@@ -17,29 +16,36 @@ from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
 from ..evaluation.episode_selection import ShownEpisode, shown_episode
 from ..evaluation.evaluate import conditions
-from ..evaluation.step_log import is_violation
 from ..processes.job import Job, Progress
 from ..processes.parallel import RunsFailedError, environment, run_jobs
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import track_film
 from ..run.training import finished_checkpoint
-from .film import Film, encode, for_film, speed_of, stride_of
+from .film import Film, film_episodes, for_film
 from .rendering import find_rendering
 
 _PROBLEM: Final = "problem.json"
 
 
 @dataclass(frozen=True)
-class Video:
-    """One episode on film and what is to be said of it."""
+class Filmed:
+    """What is to be said of one episode on film."""
 
-    animation: bytes
+    title: str
     steps: int
-    speed: float
     changed: int
     violations: int | None
     """None for a task that reports no cost."""
+
+
+@dataclass(frozen=True)
+class Video:
+    """Episodes on film, side by side."""
+
+    animation: bytes
+    speed: float
+    episodes: list[Filmed]
 
 
 def video_path(experiment: ExperimentConfig, arm: ArmConfig, condition: str) -> Path:
@@ -58,9 +64,8 @@ def load_video(path: Path) -> Video | None:
         return None
     if damage(path.parent, values.get("files", {})) is not None:
         return None
-    return Video(
-        path.read_bytes(), **{key: values[key] for key in ("steps", "speed", "changed", "violations")}
-    )
+    episodes = [Filmed(**episode) for episode in values["episodes"]]
+    return Video(path.read_bytes(), values["speed"], episodes)
 
 
 def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
@@ -80,13 +85,13 @@ def video_problem(experiment: ExperimentConfig) -> str:
 
 
 def record_videos(experiment: ExperimentConfig, console: Console) -> None:
-    """Films the shown episode for every arm and condition that is not on film yet.
+    """Films the shown episodes for every arm and condition that are not on film yet, if the config wants films.
 
     Nothing here fails an evaluation: where no frame can be drawn, one line says why, on the console and later
     in the report.
     """
     shown = shown_episode(experiment)
-    if shown is None:
+    if shown is None or not experiment.evaluation.films:
         return
     problem = ""
     envs: list[EnvConfig] = []
@@ -149,11 +154,11 @@ def _record_arms(
 def record_video(
     arm: ArmConfig, shown: ShownEpisode, run_folder: Path, used: FilterConfig, path: Path, progress: Progress
 ) -> None:
-    """Runs one episode and writes its film, with what a filter knows drawn into it, and its facts.
+    """Runs the shown episodes and writes their film, with what a filter knows drawn into it, and its facts.
 
     Args:
         arm: Whose policy.
-        shown: Which seed and episode.
+        shown: Which seed and episodes.
         run_folder: The run's folder.
         used: The filter that is on.
         path: The film's.
@@ -163,39 +168,23 @@ def record_video(
     policy = TrainedPolicy(arm, checkpoint)
     filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
     env = for_film(make_stack(filmed, used, arm.learner.in_evaluation))
-    # One speed for all conditions, also where one of them ends early.
-    longest = env.spec.max_episode_steps if env.spec is not None else None
-    judged = False
-    film = Film(stride=stride_of(longest or 1))
     try:
-        observation, _ = env.reset(seed=shown.episode_seed)
-        policy.begin(env)
-        done = False
-        while not done:
-            if film.wants_frame:
-                film.add_frame(env.render())  # type: ignore[arg-type]
-            observation, _, terminated, truncated, info = env.step(policy(observation))
-            film.add_step(
-                bool(info.get(keys.CBF_INTERVENED, False)),
-                is_violation(info),
-            )
-            judged |= keys.COST in info
-            done = terminated or truncated
-        fps = float(env.metadata.get("render_fps") or 30.0)
+        animation, speed, films = film_episodes(policy, env, shown.filmed)
     finally:
         env.close()
-    speed = speed_of(longest or len(film.changed), fps)
-    write_bytes(path, encode(film, fps, speed))
+    write_bytes(path, animation)
     facts = {
         "state": _state(arm, used, shown, checkpoint.timesteps),
-        "steps": len(film.changed),
         "speed": speed,
-        "changed": sum(film.changed),
-        "violations": sum(film.violated) if judged else None,
+        "episodes": [asdict(_said_of(film)) for film in films],
         "files": checksums([path]),
     }
     write_json(path.with_suffix(".json"), facts)
     progress.steps(1)
+
+
+def _said_of(film: Film) -> Filmed:
+    return Filmed(film.title, len(film.changed), sum(film.changed), film.figures.get("violations"))
 
 
 def _state(arm: ArmConfig, used: FilterConfig, shown: ShownEpisode, timesteps: int) -> dict[str, Any]:
@@ -203,7 +192,7 @@ def _state(arm: ArmConfig, used: FilterConfig, shown: ShownEpisode, timesteps: i
         "arm": arm.fingerprint(),
         "filter": used.plain(),
         "seed": shown.seed,
-        "episode_seed": shown.episode_seed,
+        "filmed": shown.filmed,
         "timesteps": timesteps,
     }
 

@@ -28,11 +28,10 @@ class BoundBackupClearance(BoundConstraint):
 
     def __init__(self, spec: Any, plant: Plant) -> None:
         super().__init__(spec, plant)
-        self._model_version = plant.model_version
         self.read_constants()
 
     def read_constants(self) -> None:
-        """Read the constants of the plant's model: at binding, and whenever the model has changed."""
+        """Read the constants of the plant's model; a filter binds anew when the model has changed."""
 
     @abstractmethod
     def clearance(self) -> Array:
@@ -54,9 +53,6 @@ class BoundBackupClearance(BoundConstraint):
 
     def observe(self, memory: Memory) -> None:
         self._memory = memory
-        if self.plant.model_version != self._model_version:
-            self._model_version = self.plant.model_version
-            self.read_constants()
         self._value = self.clearance()
 
     def value(self) -> Array:

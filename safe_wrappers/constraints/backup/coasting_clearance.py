@@ -13,10 +13,8 @@ from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
-from safe_wrappers.constraints.rollout import RENAMED
 from safe_wrappers.control.numerics.nearest_discs import nearest_discs
 from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
@@ -32,7 +30,6 @@ _RECOVERED = 0.5  # share of the best gain of clearance that a control has to re
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 
 
-@deprecated_parameters(renamed={**RENAMED, "alone": "robot_model_attr", "reach_s": "max_decrease_per_speed"})
 @dataclass
 class CoastingClearance(Constraint):
     """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
@@ -49,7 +46,8 @@ class CoastingClearance(Constraint):
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.
         untouched: `Disc` and `Discs` for the outline.
-        outline: Points [x, y] in the body's frame, m; the outline is their convex hull.
+        outline: Points [x, y] in the body's frame, m; the outline is their convex hull. Needed for `untouched`; with
+            `keep_out` alone only `max_decrease_per_speed` counts its corners.
         body: Name of the machine's body, on a free joint.
         robot_model_attr: Name of an attribute of the env that holds a model of the machine alone, for the forecasts;
             None takes the plant's model.
@@ -85,6 +83,11 @@ class CoastingClearance(Constraint):
         if not (self.keep_out or self.untouched):
             raise ConfigurationError("give obstacles in keep_out (for the origin) or untouched (the outline)")
         self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
+        if self.outline and not self.untouched and self.max_decrease is None:
+            raise ConfigurationError(
+                "outline is kept out of untouched, and keep_out is for the body's origin alone: give the obstacles "
+                "that the outline must not meet in untouched, or leave outline out"
+            )
         if isinstance(self.horizon, bool) or self.horizon != int(self.horizon) or self.horizon < 2:
             wanted = "horizon is a whole number of control intervals >= 2"
             raise ConfigurationError(f"{wanted}, got {self.horizon!r}")
@@ -112,6 +115,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             wanted = "robot_model_attr names an attribute that holds an MjModel"
             raise ConfigurationError(f"{wanted}; {name!r} is {alone!r}")
+        self.plant.named("body", spec.body, "body")
         self.coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
         outline = np.reshape(spec.outline, (-1, 2))
@@ -141,7 +145,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         seen = np.zeros(0)
         if self._origin.near or self._body.near:
             discs = np.concatenate([self._origin.discs, self._body.discs])[:, :2].ravel()
-            seen = np.concatenate([[self.plant.model_version], self.coasting.state(), discs])
+            seen = np.concatenate([self.coasting.state(), discs])
         # Rollouts are kept while nothing moves.
         still = seen.size and seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()
         if not still:

@@ -37,9 +37,9 @@ class HeadingDriveBatch(ConstraintBatch):
         self._velocities: list[Array] = [np.zeros(3)] * n
         self._joints, self._motions = np.zeros((2, 3 * n)), np.zeros((n, 6))
         self._origins = np.zeros((n, 2))
-        self._versions: list[int] = []
         self._counts: list[int] = []
         self._loaded = False
+        self._read_constants()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -100,10 +100,6 @@ class HeadingDriveBatch(ConstraintBatch):
 
     def _observe(self) -> None:
         """Take the present motion of every robot, and its discs."""
-        versions = [b.plant.model_version for b in self._bound]
-        if versions != self._versions:
-            self._versions = versions
-            self._read_constants()
         np.concatenate(self._positions, out=self._joints[0])
         np.concatenate(self._velocities, out=self._joints[1])
         self._motions[:] = self._joints.reshape(2, -1, 3).swapaxes(0, 1).reshape(-1, 6)
@@ -117,8 +113,6 @@ class HeadingDriveBatch(ConstraintBatch):
         np.concatenate(groups, out=self._discs[:, :2])
 
     def _read_constants(self) -> None:
-        for b in self._bound:
-            b.read_constants()
         models = [b.plant.model for b in self._bound]
         self._models = np.array([b.models for b in self._bound])
         self._actuators = Actuators(*map(np.array, zip(*map(Actuators.of, models), strict=True)))

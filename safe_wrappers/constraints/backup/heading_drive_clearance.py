@@ -80,6 +80,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
     def __init__(self, spec: HeadingDriveClearance, plant: Plant) -> None:
         hint = "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
         machine = require_mujoco(plant, hint)
+        machine.named("body", spec.body, "body")
         self.frame = PlanarFrame(machine, spec.body)
         self._discs = np.zeros((0, 3))
         self.turns_first = self.frame.turn_index == 0

@@ -74,7 +74,7 @@ class BoundContactFeasibility(BoundSlacks):
         self._index = np.full(self.plant.model.nbody, -1)
         self._index[chosen] = np.arange(chosen.size)
         self._size = chosen.size
-        self._model_version, self._weight_n = self.plant.model_version, self.plant.weight_n
+        self._weight_n = self.plant.weight_n
 
     def _resting(self, name: str, touching: NDArray[np.bool_]) -> int:
         i = self.plant.named("body", name)
@@ -92,8 +92,6 @@ class BoundContactFeasibility(BoundSlacks):
         found = self.plant.contact_forecast(control)
         if not found.finite:
             return np.full(self._size, np.nan)
-        if self._model_version != self.plant.model_version:
-            self._model_version, self._weight_n = self.plant.model_version, self.plant.weight_n
         held = self.spec.friction_share, self._weight_n
         return _worst(found.body, found.normal, found.force, found.friction, self._index, self._size, *held)
 

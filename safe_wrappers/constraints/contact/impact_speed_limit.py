@@ -14,7 +14,6 @@ from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
 from safe_wrappers.control.contact.contact import series_stiffness
 from safe_wrappers.control.contact.impact import braked_peak_force, reduced_mass, speed_limit
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
@@ -22,7 +21,6 @@ from safe_wrappers.plants.plant import Plant
 _FIXED = 1e-12  # mobility along the normal, 1/kg, below which a geom cannot move into contact
 
 
-@deprecated_parameters(renamed={"holds": "horizon"})
 @dataclass
 class ImpactSpeedLimit(RolloutConstraint):
     """Keep the approach speed at every contact so low that its peak force stays below a limit.

@@ -8,9 +8,8 @@ import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, name_list, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain, Task
-from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering import manipulability as of_arm
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -23,7 +22,6 @@ _DECAY_HOLDS = 2.0
 _ALONG_S = 1e-5  # width of the difference for the curvature of w along the motion, s
 
 
-@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class SingularityMargin(RolloutConstraint):
     """Keep the manipulability `w = sqrt(det(J J'))` of a frame, for declared task directions, above a threshold.

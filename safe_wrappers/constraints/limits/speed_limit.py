@@ -6,8 +6,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, positive
-from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint, RolloutMemory
-from safe_wrappers.deprecation import deprecated_parameters
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.drawing.marks import Mark, arrow, ball
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory
@@ -21,7 +20,6 @@ _DRAWN, _LIFTED = (
 DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 
 
-@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class SpeedLimit(RolloutConstraint):
     """Keep the speed of a body, or of the centre of mass, below a limit.

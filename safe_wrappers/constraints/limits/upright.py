@@ -7,14 +7,12 @@ from typing import ClassVar
 import numpy as np
 
 from safe_wrappers.checks import Array, positive
-from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
-from safe_wrappers.deprecation import deprecated_parameters
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
 
-@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class Upright(RolloutConstraint):
     """Keep a body's height in a range and its own z axis within an angle of the vertical.
@@ -72,7 +70,7 @@ class BoundUpright(BoundRollout):
 
     def __init__(self, spec: Upright, plant: Plant) -> None:
         super().__init__(spec, plant)
-        self._body = self.plant.named("body", self.spec.body)
+        self._body = self.plant.named("body", self.spec.body, "body")
 
     def now(self) -> Array:
         pose = self.plant.pose()

@@ -9,15 +9,13 @@ import numpy as np
 from safe_wrappers.checks import Array, name_list, non_negative
 from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import distances, obstacles_from
-from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
-from safe_wrappers.deprecation import deprecated_parameters
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.drawing.marks import Mark, ball, edges, pad
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
 
-@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class Workspace(RolloutConstraint):
     """Keep points of the machine inside an axis-aligned box and outside obstacles, in world coordinates.

@@ -57,7 +57,7 @@ def normal_impulse(mass: ArrayLike, velocity: ArrayLike, restitution: ArrayLike)
 def effective_mass(inertia: ArrayLike, jacobian: ArrayLike) -> Array:
     """Effective mass of a machine at one point along one direction, `1 / (J M^-1 J')`, kg.
 
-    Each direction separately: simultaneous contacts share the inertia (`appendix.contact.contact_lcp`).
+    Each direction separately: simultaneous contacts share the inertia.
 
     Args:
         inertia: Joint-space inertia M, symmetric and positive definite, shape (..., n, n).

@@ -2,7 +2,7 @@
 
 The system is linear, x' = A x + b + w, with white noise of the *intensity* Q (covariance kernel Q delta(t - s)), in
 units of x^2 / s. Without measurements the covariance follows the Lyapunov equation P' = A P + P A' + Q. How much
-probability lies outside k sigma depends on the tail (`safe_wrappers.appendix.estimation.sigma_coverage`).
+probability lies outside k sigma depends on the tail.
 
 Source: appendix "Continuous covariance propagation and observability"; Van Loan (1978) for the discretisation.
 """
@@ -110,7 +110,7 @@ def blind_time(
         Q: Intensity of the process noise, shape (n, n).
         direction: D, direction(s) of the state, shape (n,) or (m, n); of several the worst unit combination counts.
         tolerance: In the units of D x, > 0.
-        sigmas: k, > 0; choose it with `safe_wrappers.appendix.estimation.sigma_coverage.sigmas_for`.
+        sigmas: k, > 0.
         horizon_s: How far to look, s, at least 0.
 
     Raises:

@@ -5,7 +5,6 @@ It runs at every step and checks nothing: check the matrices once with `checked_
 Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
 
 Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), section 5.2.
-The consistency test: `safe_wrappers.appendix.estimation.consistency`.
 """
 
 from typing import NamedTuple

@@ -30,8 +30,8 @@ _LARGEST_COLUMN_SCALE = 1e3
 
 
 @dataclass(frozen=True, eq=False)
-class Observability:
-    """Which directions of a state the outputs determine.
+class NonlinearObservability:
+    """Which directions of a state the outputs determine, locally.
 
     Attributes:
         rank: Number of independent observable directions.
@@ -40,6 +40,7 @@ class Observability:
             rank depends on the choice of tolerance.
         unobservable: Orthonormal basis of the unobservable directions, shape (n, n - rank).
         names: The same subspace as readable combinations of the states, one for each direction.
+        rank_by_order: Rank with Lie derivatives up to order 0, 1, ...: shows whether it had stopped growing.
     """
 
     rank: int
@@ -47,6 +48,7 @@ class Observability:
     gap: float
     unobservable: Array
     names: tuple[str, ...]
+    rank_by_order: tuple[int, ...]
 
     @property
     def observable(self) -> bool:
@@ -61,17 +63,6 @@ class Observability:
         """
         smallest = self.singular_values[self.rank - 1] if self.rank else 0.0
         return float(self.singular_values[0] / smallest) if smallest > 0.0 else math.inf
-
-
-@dataclass(frozen=True, eq=False)
-class NonlinearObservability(Observability):
-    """Local observability at one state.
-
-    Attributes:
-        rank_by_order: Rank with Lie derivatives up to order 0, 1, ...: shows whether it had stopped growing.
-    """
-
-    rank_by_order: tuple[int, ...]
 
 
 def nonlinear_observability(

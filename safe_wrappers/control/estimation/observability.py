@@ -27,12 +27,11 @@ _PIVOT = 0.1
 
 
 class Scaled(NamedTuple):
-    """A dimensionless system: states in `units`, time in `time_s`, rows of C of length one."""
+    """A dimensionless system: states in `units`, rows of C of length one."""
 
     a: Array
     c: Array
     units: Array
-    time_s: float
 
 
 def unobservable_directions(
@@ -53,26 +52,25 @@ def unobservable_directions(
     ('v - bias',)
     """
     a, c = checked_system(A, C)
-    basis, _ = unobservable_subspace(scale_system(a, c), TOLERANCE)
+    basis = unobservable_subspace(scale_system(a, c), TOLERANCE)
     return described_subspace(basis, state_names(names, len(a)))
 
 
-def unobservable_subspace(scaled: Scaled, tolerance: float) -> tuple[Array, list[Array]]:
-    """Orthonormal basis of the unobservable directions in the states' own units, and the singular values compared.
+def unobservable_subspace(scaled: Scaled, tolerance: float) -> Array:
+    """Orthonormal basis of the unobservable directions in the states' own units, shape (n, n - rank).
 
     The largest subspace in the kernel of C that A maps into itself, by orthogonal projections.
     """
-    basis, seen, compared = np.eye(len(scaled.a)), scaled.c, []
+    basis, seen = np.eye(len(scaled.a)), scaled.c
     while basis.shape[1]:
         _, values, axes = np.linalg.svd(seen @ basis if seen is scaled.c else seen)
         rank = int((values > tolerance).sum())
-        compared.append(values)
         if rank == 0:
             break
         basis = basis @ axes[rank:].T
         moved = scaled.a @ basis
         seen = moved - basis @ (basis.T @ moved)
-    return np.linalg.qr(scaled.units[:, None] * basis)[0], compared
+    return np.asarray(np.linalg.qr(scaled.units[:, None] * basis)[0])
 
 
 def described(direction: ArrayLike, names: Sequence[str]) -> str:
@@ -124,7 +122,7 @@ def scale_system(a: Array, c: Array) -> Scaled:
     c = c * units
     rate = max(float(np.linalg.norm(a, 2)), 1.0 / LONGEST_TIME_SCALE_S)
     lengths = np.linalg.norm(c, axis=1, keepdims=True)
-    return Scaled(a / rate, c / np.where(lengths > 0.0, lengths, 1.0), units, 1.0 / rate)
+    return Scaled(a / rate, c / np.where(lengths > 0.0, lengths, 1.0), units)
 
 
 def _units(a: Array, c: Array) -> Array:

@@ -45,8 +45,6 @@ def smoothstep(s: ArrayLike, derivative: int = 0) -> Array:
 def shortest_latched_blend(step: ArrayLike, rate_limit: ArrayLike) -> Array:
     """Shortest blend time in s between two constant commands: 1.875 |step| / rate_limit, rounded up.
 
-    For moving endpoints see `safe_wrappers.appendix.handover.blends.shortest_moving_blend`.
-
     Raises:
         ConfigurationError: For a limit that is not positive, or input that is not finite.
     """

@@ -3,8 +3,7 @@
 A change s(t) of the torque from 0 to 1 excites a resonance w as a step does, times |integral of s'(t) exp(-i w t)|;
 the energy that is left goes with the square, the **share**. The phase is w T, over the change's duration T.
 
-Source: appendix "Flexible joint dynamics and singular perturbations"; the energies themselves are in
-`safe_wrappers.appendix.handover.flexible_joint`.
+Source: appendix "Flexible joint dynamics and singular perturbations".
 """
 
 import math

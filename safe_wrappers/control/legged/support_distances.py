@@ -1,8 +1,7 @@
 """The zero moment point's distance from the edge of the support polygon, at many instants at once.
 
-The same numbers as `safe_wrappers.appendix.legged.balance` gives instant by instant, without building polygons. The
-distance of a point inside a convex hull from its boundary is the least of `max_k (p_k - x) . u` over directions u
-across pairs of points; pairs that are no edge give no smaller one.
+No polygon is built. The distance of a point inside a convex hull from its boundary is the least of
+`max_k (p_k - x) . u` over directions u across pairs of points; pairs that are no edge give no smaller one.
 """
 
 import math

@@ -75,8 +75,7 @@ def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) 
 class ChannelLedger:
     """Energy of a two-port channel with any coding, `E_ch(T) - E_ch(0) <= integral of (P_m - P_s) dt`.
 
-    F.v is positive into the channel at the port m (the operator's), and out of it at s (the remote one). One
-    component: `safe_wrappers.appendix.teleop.energy_ledger`.
+    F.v is positive into the channel at the port m (the operator's), and out of it at s (the remote one).
 
     Args:
         initial_storage_j: E_ch(0), or a bound on it, at least 0 J.

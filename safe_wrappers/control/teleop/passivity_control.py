@@ -2,7 +2,7 @@
 
 Ryu, Artigas and Preusche (2010), "A passive bilateral control scheme for a teleoperator with time-varying
 communication delay"; the damping is that of Hannaford and Ryu (2002), "Time-domain passivity control of haptic
-interfaces", whose observer and controller of one port are in `safe_wrappers.appendix.teleop.passivity_controller`.
+interfaces".
 
 In *impedance* causality a component answers a flow with an effort, so damping adds effort along the flow; in
 *admittance* causality it answers an effort with a flow, and damping adds flow along the effort. What cannot be
@@ -86,7 +86,15 @@ class EnergyReference:
     def modify(
         self, effort: ArrayLike, flow: ArrayLike, time_s: float, actual: ArrayLike | None = None
     ) -> Passivated:
-        """The port's effort and flow for the coming interval; arguments as `PassivityController.modify`."""
+        """The port's effort and flow for the coming interval.
+
+        Args:
+            effort: What the component would answer with (what it sees, in admittance causality), N, shape (m,).
+            flow: What it sees (would answer with), m/s, of the same shape.
+            time_s: Length of the interval over which they will be held, > 0.
+            actual: What the seen quantity truly was on average since the last call (a displacement over its time,
+                say), of the same shape; None: as sampled.
+        """
         interval = self._damper.interval(effort, flow, time_s)
         if self._last is not None:
             last = self._last.settled(actual)

@@ -2,7 +2,7 @@
 
 Speeds are signed along the wheel's heading: the circumferential speed `r w` and the ground speed `v_x` of the wheel's
 centre. Slip is positive when the wheel is faster than the ground, and normalised: 1 is a wheel that spins on the spot
-and -1 a locked one. The unbounded piecewise form is in `safe_wrappers.appendix.vehicle.slip`.
+and -1 a locked one.
 
 Source: appendix "Wheel slip ratio and friction boundaries".
 """

@@ -5,10 +5,8 @@ import numpy as np
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import NOT_REPLAYED, Env, Recording, braking_horizon
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, require_physics
-from safe_wrappers.diagnosis.symptoms.limits import touches_fixed
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.diagnosis.symptoms.limits import is_protected_by_recipe, touches_fixed
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
-from safe_wrappers.protect import protect
 
 
 def measure(env: Env, recording: Recording) -> Measured:
@@ -43,12 +41,8 @@ def lines(env: Env, recording: Recording) -> tuple[str, str]:
     """`protect`, where it keeps the machine off what is fixed; else a limit of the pair that hit hardest."""
     if recording.diverged.any():
         return "", "The simulation diverged: a shorter timestep, softer contacts, or weaker actuators."
-    if touches_fixed(env, recording).any():
-        try:
-            protect(env)
-            return "env = sw.protect(env)", ""
-        except ConfigurationError:
-            pass
+    if touches_fixed(env, recording).any() and is_protected_by_recipe(env):
+        return "env = sw.protect(env)", ""
     forces = np.nan_to_num(recording.of_info("contact/peak_force"), nan=0.0)
     k = int(np.argmax(forces))
     depth, pair = float(recording.of_info("contact/penetration")[k]), recording.struck[k]

@@ -1,5 +1,7 @@
 """Stale commands: how old what the machine executes is, found by looking for each command among the proposals."""
 
+import math
+
 import numpy as np
 
 from safe_wrappers.checks import Array
@@ -38,35 +40,35 @@ def ages(env: Env, recording: Recording) -> Array:
 
 
 def measure(env: Env, recording: Recording) -> Measured:
-    """The longest time for which the machine went on with a command after the proposals had changed, s."""
+    """For how long the machine went on with a command after the proposals had changed, at most, control steps."""
     changes = np.abs(np.diff(recording.actions, axis=0)).max(axis=1, initial=0.0) > 0.0
     if not changes.any() or changes.mean() < 0.9:
         raise NotMeasuredError(
             "the driver's proposals repeat themselves, so that an old one cannot be told from a new"
         )
-    age, dt = ages(env, recording), recording.control_dt
+    age = ages(env, recording)
     known = age[np.isfinite(age)]
     usual = float(np.median(known))
     evidence = [
-        Evidence("usual age of a command", usual * dt, "s"),
-        Evidence("oldest command", float(known.max()) * dt, "s"),
+        Evidence("usual age of a command", usual, "control steps"),
+        Evidence("oldest command", float(known.max()), "control steps"),
         Evidence("steps with a command older than usual", float((known > usual).mean()), "share"),
     ]
-    stale = np.maximum(age - usual, 0.0) * dt
-    return Measured(float(np.nanmax(stale)) / dt, np.nan_to_num(stale), evidence)
+    stale = np.nan_to_num(np.maximum(age - usual, 0.0))
+    return Measured(float(stale.max()), stale, evidence)
 
 
 def lines(env: Env, recording: Recording) -> tuple[str, str]:
     """A lease has to be inside of what loses commands: it is told, not tried."""
-    age, dt = ages(env, recording), recording.control_dt
-    usual = float(np.nanmedian(age)) * dt
+    lease = 2.0 + float(np.nanmedian(ages(env, recording)))
+    seconds = f" ({lease * recording.control_dt:.3g} s)" if math.isfinite(recording.control_dt) else ""
     return "", (
-        f"Put LeaseExpiry inside the link, next to the env: a lease of {2.0 * dt + usual:.3g} s lets through "
+        f"Put LeaseExpiry inside the link, next to the env: a lease of {lease:g} control steps{seconds} lets through "
         "commands that are as old as usual, and brakes from then on."
     )
 
 
 SYMPTOM = Symptom(
     "commands that go stale: the link is silent or stalls", "section 1.4, leases and reach",
-    2.0, "control steps", ("age above the usual one", "s"), measure, lines,
+    2.0, "control steps", ("age above the usual one", "control steps"), measure, lines,
 )  # fmt: skip

@@ -11,7 +11,7 @@ from safe_wrappers.diagnosis.recording import Env, Recording, braking_horizon, p
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, require_physics
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import fixed_bodies
-from safe_wrappers.protect import protect
+from safe_wrappers.protect import protect, recipe_of
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 PRESSED = 0.02
@@ -80,13 +80,21 @@ def measure(env: Env, recording: Recording) -> Measured:
     return Measured(float(bad.mean()), bad, evidence)
 
 
-def lines(env: Env, recording: Recording) -> tuple[str, str]:
-    """`protect`, where it knows the env; else limits of the joints that press their stops."""
+def is_protected_by_recipe(env: Env) -> bool:
+    """Whether `protect` has a recipe for the env, and accepts what is around it."""
+    if env.spec is None or recipe_of(env.spec.id) is None:
+        return False
     try:
         protect(env)
-        return "env = sw.protect(env)", ""
     except ConfigurationError:
-        pass
+        return False
+    return True
+
+
+def lines(env: Env, recording: Recording) -> tuple[str, str]:
+    """`protect`, where it knows the env; else limits of the joints that press their stops."""
+    if is_protected_by_recipe(env):
+        return "env = sw.protect(env)", ""
     found, beyond = physics(env), _beyond(env, recording)
     if found is not None and (beyond > PRESSED).any():
         joints = _stopped(found[0])

@@ -66,7 +66,7 @@ def _tracked(env: Env, recording: Recording, step: int, data: mujoco.MjData) -> 
 def unseen(a: Array, c: Array) -> Array:
     """Orthonormal basis of what outputs C x of x+ = A x never show, shape (n, k); states in comparable units."""
     n = len(a)
-    return unobservable_subspace(Scaled(a - np.eye(n), c, np.ones(n), 1.0), TOLERANCE)[0]
+    return unobservable_subspace(Scaled(a - np.eye(n), c, np.ones(n)), TOLERANCE)
 
 
 def _relative(c: Array) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.arguments import tells_arguments
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import (
@@ -23,12 +24,14 @@ from safe_wrappers.plants.identified.linear import LinearModel
 from safe_wrappers.plants.identified.logs import Episode, checked_episodes
 from safe_wrappers.plants.identified.windows import Model, measured, shortfalls
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
+from safe_wrappers.plants.simulator.substeps import known_substeps
 
 MODELS = ("linear", "ensemble")
 _SCALE_WINDOWS = 8  # per fitted episode
 _LEAST_SCALE = 1e-3  # of the largest one
 
 
+@tells_arguments
 class IdentifiedPlant(RolloutPlant):
     """Rolls out a model `x+ = F(x, u)` that was fitted to logged episodes; x is the observation.
 
@@ -141,6 +144,7 @@ class IdentifiedPlant(RolloutPlant):
                     "of this env, with the wrappers that are inside the filter (such as FlattenObservation)"
                 )
         self._attach(env)
+        self.substeps = known_substeps(env.unwrapped)
         self.view = View(None, np.zeros(first.observations.shape[1]), {})
 
     @property
@@ -177,6 +181,7 @@ class IdentifiedPlant(RolloutPlant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
+        between: str = "",
     ) -> Rollout:
         """Roll out the model from the last observation: see `RolloutPlant.rollout`.
 

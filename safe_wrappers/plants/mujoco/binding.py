@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 import gymnasium as gym
 import mujoco
@@ -19,8 +19,6 @@ DataOf = Callable[[Any], mujoco.MjData]
 """Takes the unwrapped env; returns its data."""
 
 _LAST_INTEGRATOR = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-PLACEMENTS: Final = ("body_pos", "body_quat", "geom_pos", "geom_quat", "site_pos", "site_quat")
-"""What envs change in their model from one episode to the next: where a door, a target or an obstacle is."""
 
 
 class Accessed:
@@ -77,14 +75,14 @@ def source_of(raw: Any, model: ModelOf | None, data: DataOf | None) -> Any:
     return raw if model is None and data is None else Accessed(raw, model, data)
 
 
-def own_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
-    """A copy of the given model, or of an env's, or an error that says why a plant cannot use it."""
+def checked_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
+    """The env's own model, or a copy of the given one; or an error that says why a plant cannot use it."""
     if not isinstance(getattr(source, "model", None), mujoco.MjModel) or not hasattr(source, "data"):
         raise UnsupportedEnvError(
             f"{source} has no MuJoCo .model and .data; describe it with AnalyticPlant(f=..., g=..., state=...) "
             "instead, or say where it keeps them: MujocoPlant(model=lambda env: ..., data=lambda env: ...)"
         )
-    model = copy.copy(given if given is not None else source.model)
+    model: mujoco.MjModel = source.model if given is None else copy.copy(given)
     wanted, sizes = ((m.nq, m.nv, m.nu) for m in (source.model, model))
     if sizes != wanted:
         must = "the plant's model must have the env's joints and actuators"
@@ -102,30 +100,14 @@ def own_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
     return model
 
 
-def take_placements(model: mujoco.MjModel, bound: mujoco.MjModel, env_model: mujoco.MjModel) -> bool:
-    """Place what an env has placed anew since its model, `bound`, was copied; whether there is any.
-
-    Raises:
-        UnsupportedEnvError: The env has another model by now, which differs in more than placements.
-    """
-    if env_model is not bound:
-        arrays = [name for name in dir(bound) if isinstance(getattr(bound, name), np.ndarray)]
-        other = [
-            name for name in arrays if not np.array_equal(getattr(bound, name), getattr(env_model, name))
-        ]
-        differ = [name for name in other if name not in PLACEMENTS]
-        if differ:
-            raise UnsupportedEnvError(
-                "the env has made itself another model since the filter was built; the filter's is a copy of the "
-                f"first one, and they differ in {', '.join(differ[:8])}: build the filter anew, or let the env keep "
-                "its model (robosuite: hard_reset=False)"
-            )
-    changed = False
-    for name in PLACEMENTS:
-        mine, its = getattr(model, name), getattr(env_model, name)
-        if not np.array_equal(mine, its):
-            mine[:], changed = its, True
-    return changed
+def check_same_machine(before: mujoco.MjModel, after: mujoco.MjModel) -> None:
+    """Refuse a model that an env has made itself since a plant was bound, with other joints or actuators."""
+    expected, found = ((m.nq, m.nv, m.nu) for m in (before, after))
+    if found != expected:
+        raise UnsupportedEnvError(
+            f"the env has made itself another machine: expected (nq, nv, nu) = {expected} as when the filter was "
+            f"built, got {found}; build the filter anew"
+        )
 
 
 def control_interval(raw: Any) -> float:

@@ -30,7 +30,11 @@ class InverseDynamics:
 
     def __init__(self, plant: MujocoPlant) -> None:
         refuse_mapped(plant.action_map, "a torque limit of position commands")
-        self._plant, model = plant, copy.copy(plant.model)
+        self._plant = plant
+        self._read_model()
+
+    def _read_model(self) -> None:
+        model, self._model_version = copy.copy(self._plant.model), self._plant.model_version
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         self._model, self._data = model, mujoco.MjData(model)
         for i in range(model.nu):
@@ -48,8 +52,9 @@ class InverseDynamics:
 
     def torques(self, motion: Motion) -> Array:
         """N m (N for slides), shape (k, m), by `mj_inverse`: passive forces of the joints are counted."""
-        data, torques = self._data, np.zeros_like(motion.position)
-        self._plant.observe()
+        torques = np.zeros_like(motion.position)
+        self._observe()
+        data = self._data
         for i in range(len(torques)):
             self._place(motion.position[i])
             data.qvel[:] = data.qacc[:] = 0.0
@@ -62,12 +67,17 @@ class InverseDynamics:
     def inertia(self, positions: Array) -> Array:
         """Of the driven joints per command, at positions (k, m), shape (k, m, m), kg m^2 (kg for slides)."""
         found = np.zeros((*positions.shape, positions.shape[1]))
-        self._plant.observe()
+        self._observe()
         for matrix, position in zip(found, positions, strict=True):
             self._place(position)
             mujoco.mj_fwdPosition(self._model, self._data)
             matrix[:] = of_model.inertia(self._model, self._data)[np.ix_(self._dof, self._dof)] / self._gear
         return found
+
+    def _observe(self) -> None:
+        self._plant.observe()
+        if self._plant.model_version != self._model_version:
+            self._read_model()
 
     def _place(self, position: Array) -> None:
         self._data.qpos[:] = self._plant.state[: self._model.nq]

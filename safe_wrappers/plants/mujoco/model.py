@@ -34,12 +34,16 @@ class Remade:
         return type(self), self._arguments
 
 
-def named(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """The id of a body, site, geom, joint, actuator or camera; for an unknown name an error that lists all."""
+def named(model: mujoco.MjModel, kind: str, name: str, argument: str = "") -> int:
+    """The id of a body, site, geom, joint, actuator or camera; for an unknown name an error that lists all.
+
+    The error also says which `argument` has the name, where the caller may have left that at its default.
+    """
     found = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if found < 0:
         known = ", ".join(names(model, kind)) or "none"
-        raise UnknownNameError(f"the model has no {kind} {name!r}; it has: {known}")
+        how = f"; give another by {argument}=" if argument else ""
+        raise UnknownNameError(f"the model has no {kind} {name!r}{how}; it has: {known}")
     return int(found)
 
 

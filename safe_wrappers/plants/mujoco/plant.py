@@ -1,5 +1,6 @@
-"""MujocoPlant: f and g of any env with a MuJoCo model and data, from a copy of the model."""
+"""MujocoPlant: f and g of any env with a MuJoCo model and data, and where a control leads."""
 
+import copy
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -17,25 +18,34 @@ from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
 from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
+from safe_wrappers.plants.mujoco.constants import (
+    DYNAMICS,
+    PLACES,
+    Constants,
+    different_fields,
+    every_constant,
+)
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
-from safe_wrappers.plants.mujoco.shared_step import shared_step
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.snapshot import STATE, Snapshot
+
+_ROUNDING = 1e-6, 1e-6
+"""Of controls and states, relative and absolute: envs may compute in single precision."""
 
 
 class MujocoPlant(Snapshot):
     """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
 
     u is the env's action. f and g hold for the present set of active contacts and limits, and are exact for pyramidal
-    friction cones. The env's own model and data are only read; where a reset moves fixed bodies, the copy follows.
+    friction cones. It simulates the env's own model on data of its own; the env's data are only read. So a model
+    that is changed, at a reset or in mid-episode (domain randomisation), is the one that is simulated; constants that
+    are read once are read again.
 
     Args:
-        model: None copies the env's `.model`; a function of the unwrapped env returns it where it is elsewhere. A
-            model (other masses) is the filter's in place of the env's, to test mismatch.
+        model: None takes the env's `.model`; a function of the unwrapped env returns it where it is elsewhere. A
+            model (other masses) is the filter's in place of the env's, to test mismatch, and does not follow it.
         delay_s: Evidence age plus detection plus actuation delay in s, over which this plant's model predicts.
-        share_step: Let the rollout of the executed control be the env's step. None: with envs where that was measured
-            equal bit for bit; True: with any that keeps `MujocoEnv`'s simulation step and leaves its model alone.
         data: A function of the unwrapped env that returns its data; None: they are its `.data`.
         control_dt: How long the env holds an action, s; needed where it has no `dt` or `frame_skip`.
         action_map: (offset, scale), one number or one per action: the env sets the control `offset + scale * action`.
@@ -60,7 +70,6 @@ class MujocoPlant(Snapshot):
         self,
         model: mujoco.MjModel | binding.ModelOf | None = None,
         delay_s: float = 0.0,
-        share_step: bool | None = None,
         *,
         data: binding.DataOf | None = None,
         control_dt: float | None = None,
@@ -68,56 +77,64 @@ class MujocoPlant(Snapshot):
         loop: ControlLoop | None = None,
     ) -> None:
         self._given, self._functions = binding.given_and_functions(model, data)
-        self._share_step, self._given_dt, self._given_map = share_step, control_dt, action_map
+        self._given_dt, self._given_map = control_dt, action_map
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._pending: deque[Array] = deque()
         self._factors, self.loop = (1.0, 1.0), checked_loop(loop)
         self._raw: Any = None
+        self._sent: Array | None = None
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        """Attach to an env and copy its model."""
+        """Attach to an env and its model."""
         raw: Any = env.unwrapped
         env_checks.refuse_second_env(self._raw, env)
-        self._source = source = binding.source_of(raw, *self._functions)
-        self.model, self._bound_model = binding.own_model(source, self._given), source.model
-        bound_before, self._raw, self._env = self._raw is not None, raw, env
-        self.substeps = binding.physics_steps(raw, source, self._given_dt)
-        self.data = mujoco.MjData(self.model)
-        self.actuators = AffineActuators(self.model)
-        self._response = Response(self.model, self.data, self.actuators)
-        self._clamped = bool(self.model.actuator_forcelimited.any())
-        self.lower, self.upper = of_model.control_range(self.model)
         env_checks.refuse_changed_actions(env)
-        self._bind_actions(env)
-        self._idle = self.controls(np.clip(0.0, self.lower, self.upper))
-        self.control_dt = env_checks.check_timing(env, self.substeps * float(self.model.opt.timestep))
+        self._source = binding.source_of(raw, *self._functions)
+        bound_before, self._raw, self._env = self._raw is not None, raw, env
+        self._env_model = self.model = None
+        self._take_model()
         self._check_loop(bound_before)
-        self._new_snapshot()
-        self.frames = of_model.Frames(self.model, self.data)
-        self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
-        self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
+
+    def _take_model(self) -> None:
+        """Read the model anew: at binding, and when the env's has changed."""
+        source = self._source
+        model = binding.checked_model(source, self._given)
+        if self._given is None and self._factors != (1.0, 1.0):
+            model = copy.copy(model)
+            _scale(model, *self._factors)
+        moved = source.model is not self._env_model
+        if moved and self._env_model is not None:
+            binding.check_same_machine(self._env_model, source.model)
+        self._env_model, self.model = source.model, model
+        self._constants = Constants(source.model, (*DYNAMICS, *PLACES))
+        self._dynamics = Constants(source.model, DYNAMICS)
+        self._every_constant = every_constant(source.model)
+        self._mismatch = (
+            ", ".join(different_fields(model, source.model)[:8]) if model is not source.model else ""
+        )
+        self.substeps = binding.physics_steps(self._raw, source, self._given_dt)
+        if moved or model is not source.model:
+            self.data = mujoco.MjData(model)
+        self.actuators = AffineActuators(model)
+        self._response = Response(model, self.data, self.actuators)
+        lower, upper = of_model.control_range(model)
+        if moved or not (np.array_equal(lower, self._range[0]) and np.array_equal(upper, self._range[1])):
+            self._range = self.lower, self.upper = lower, upper
+            self._bind_actions(self._env)
+        self._clamped = bool(model.actuator_forcelimited.any()) or (
+            self.action_map is not None and self.action_map.exceeds(lower, upper)
+        )
+        self._idle = self.controls(np.clip(0.0, self.lower, self.upper))
+        self.control_dt = env_checks.check_timing(self._env, self.substeps * float(model.opt.timestep))
+        if moved:
+            self._new_snapshot()
+        self.frames = of_model.Frames(model, self.data)
+        self._delay_steps = int(np.ceil(self.delay_s / model.opt.timestep - 1e-9))
+        self._pending = deque(self._pending, maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._recorder = self._new_recorder()
+        self._contact_reader = ContactReader(model)
+        self.model_version += 1
         self._forget()
-        exact = self._given is None and not self.delay_s
-        self._shared = shared_step(env, self.substeps, exact, self._share_step)
-        self._contact_reader = ContactReader(self.model)
-        if self._factors != (1.0, 1.0):
-            self.perturb(*self._factors)
-
-    @property
-    def shared_steps(self) -> int:
-        """Env steps that were taken over from a rollout since binding."""
-        return 0 if self._shared is None else self._shared.count
-
-    def offer_rollout(self) -> None:
-        """What a rollout of the same controls has simulated already, the env need not simulate again."""
-        if self._shared is not None:
-            self._shared.offer(self._recorder, self._snapshot)
-
-    def withdraw_rollout(self) -> None:
-        """Leave the env as it was, if it has not used the rollout."""
-        if self._shared is not None:
-            self._shared.withdraw()
 
     def _new_recorder(self) -> Recorder:
         stepped = self.model, self.data, self.substeps
@@ -134,7 +151,6 @@ class MujocoPlant(Snapshot):
         if are_controls and found.is_identity:
             return
         self.action_map = found
-        self._clamped |= found.exceeds(self.lower, self.upper)
         self.lower, self.upper = found.low, found.high
 
     def controls(self, action: Array) -> Array:
@@ -145,17 +161,9 @@ class MujocoPlant(Snapshot):
         """Scale the masses (and inertias) and joint damping of the plant's own model, now or once it has one."""
         if not (mass > 0.0 and damping >= 0.0):
             raise ConfigurationError(f"factors must be positive, got mass={mass}, damping={damping}")
-        if self._raw is None:
-            self._factors = (self._factors[0] * mass, self._factors[1] * damping)
-            return
-        self.model_version += 1
-        self._shared = None
-        self.model.body_mass *= mass
-        self.model.body_inertia *= mass
-        self.model.dof_damping *= damping
-        mujoco.mj_setConst(self.model, self.data)
-        self._recorder = self._new_recorder()  # its braking depends on the masses
-        self._forget()
+        self._factors = (self._factors[0] * mass, self._factors[1] * damping)
+        if self._raw is not None:
+            self._take_model()
 
     def _forget(self) -> None:
         """Called when the state or the model has changed."""
@@ -167,6 +175,7 @@ class MujocoPlant(Snapshot):
 
     def observe(self) -> None:
         """Take the env's present state; everything else is computed on demand."""
+        self.follow()
         mujoco.mj_getState(self._source.model, self._source.data, self._snapshot, STATE)
         self._forget()
         self.observation_id += 1
@@ -175,16 +184,50 @@ class MujocoPlant(Snapshot):
             self._predict_over_delay()
 
     def executed(self, control: Array | None) -> None:
-        """Remember a sent command for the delay; None begins an episode."""
+        """Remember a sent command; None begins an episode."""
+        self._sent, self._sent_at = control, float(self._source.data.time)
         if control is None:
             self._pending.clear()
-            if self._given is None and binding.take_placements(
-                self.model, self._bound_model, self._source.model
-            ):
-                self.model_version += 1
-                self._forget()
+            if self._every_constant.changed():
+                self._take_model()
         elif self._delay_steps:
             self._pending.append(np.array(control))
+
+    def deviation(self) -> str:
+        """How the env's last step was not what was decided; "" if it was, as far as can be seen.
+
+        Compared are the models, the time that has passed, the controls and, where the step was forecast, the state.
+        """
+        if self._mismatch:
+            return f"the plant's model is not the env's: they differ in {self._mismatch}"
+        data, sent = self._source.data, self._sent
+        if sent is None:
+            return ""
+        passed = float(data.time) - self._sent_at
+        if abs(passed - self.control_dt) > 1e-6 * self.control_dt + 1e-12 * abs(self._sent_at):
+            return f"a step took {passed:g} s of simulation instead of {self.control_dt:g} s"
+        if self._dynamics.changed():
+            return "the env's model changed during the step"
+        return self._other_control(data, sent) or self._other_state(data, sent)
+
+    def _other_control(self, data: mujoco.MjData, sent: Array) -> str:
+        control = self.controls(sent)
+        same = data.ctrl.tobytes() == control.tobytes() or np.allclose(data.ctrl, control, *_ROUNDING)
+        return "" if same else f"the env was sent {control} and applied {data.ctrl}"
+
+    def _other_state(self, data: mujoco.MjData, sent: Array) -> str:
+        key = sent.tobytes()
+        known = self._forecasts.get((key, False)) or self._forecasts.get((key, True))
+        if known is None or self._delay_steps:
+            return ""
+        state, end = np.concatenate([data.qpos, data.qvel]), known.path[self.substeps - 1]
+        same = state.tobytes() == end.tobytes() or np.allclose(state, end, *_ROUNDING, equal_nan=True)
+        return "" if same else f"the step ended {np.abs(state - end).max():.3g} from its forecast"
+
+    def follow(self) -> None:
+        """Read the model anew if the env's has changed."""
+        if self._source.model is not self._env_model or self._constants.changed():
+            self._take_model()
 
     def _predict_over_delay(self) -> None:
         self._load()
@@ -341,6 +384,13 @@ class MujocoPlant(Snapshot):
         """Read a published fact of the env."""
         found = getattr(self._raw, name, None)
         return found if found is not None else env_checks.read_attribute(self._env, name)
+
+
+def _scale(model: mujoco.MjModel, mass: float, damping: float) -> None:
+    model.body_mass *= mass
+    model.body_inertia *= mass
+    model.dof_damping *= damping
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def require_mujoco(plant: Plant, message: str) -> MujocoPlant:

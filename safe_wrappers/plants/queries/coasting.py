@@ -66,11 +66,10 @@ class Coasting:
         self._motion = self._qvel[self._moving : self._moving + 6]
         self._data = mujoco.MjData(m)
         self._none = plant.controls(np.zeros(m.nu))
-        self._model_version = -1
+        self._adopt()
 
     def _adopt(self) -> None:
         """Copy the plant's masses, damping, friction and motors into the model that is stepped."""
-        self._model_version = self._plant.model_version
         if not self._own:
             return
         m, whole = self._model, self._plant.model
@@ -107,8 +106,6 @@ class Coasting:
         `turning_radius`, m, is the distance of the machine's farthest point from its origin.
         """
         plant, m, data, n, at = self._plant, self._model, self._data, self._plant.substeps, self._at
-        if plant.model_version != self._model_version:
-            self._adopt()
         now = plant.pose()
         data.qpos[:], data.qvel[:] = now.qpos[self._qpos], now.qvel[self._qvel]
         data.qacc_warmstart[:] = now.qacc_warmstart[self._qvel]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle.wheel import Wheel
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -88,6 +88,28 @@ class DrivenWheels:
         self._opposing = self._drives * np.where(servos, -gear * m.actuator_biasprm[:, 2], 0.0)
         self.feedback = np.asarray((self._opposing * gear).sum(axis=1))
         return Wheel(m.geom_size[self._geoms, 0], about_axle, m.dof_damping[self.dofs])
+
+    def refuse_stiff_servos(self, plant: MujocoPlant) -> None:
+        """Refuse a speed servo that settles sooner than the wheel's answer to a torque can be seen.
+
+        Within a physics step; or, where its torque may be clamped and counts as constant, within a control step.
+        Measured, with twice that: 40 to 99 % of harmless commands are changed.
+        """
+        m = plant.model
+        inertia_of = self.constants(plant).inertia
+        clamped = m.actuator_forcelimited.astype(bool)
+        for wheel, drives in enumerate(self._drives):
+            for i in np.flatnonzero(drives & (m.actuator_biastype == _AFFINE_BIAS)):
+                steps = plant.substeps if clamped[i] else 1
+                stiffness = -float(m.actuator_gear[i, 0] ** 2 * m.actuator_biasprm[i, 2])
+                share = stiffness * steps * float(m.opt.timestep) / float(inertia_of[wheel])
+                if share > 1.0:
+                    longest = "a control step (its torque is clamped)" if clamped[i] else "a physics step"
+                    raise UnsupportedEnvError(
+                        f"the speed servo {m.actuator(int(i)).name or self.names[wheel]!r} is too stiff for a slip "
+                        f"limit: it settles within {longest}, so that its torque says nothing of the ground. Use a "
+                        f"motor, or a kv of at most {-0.99 * float(m.actuator_biasprm[i, 2]) / share:.3g}"
+                    )
 
     def motion(self, plant: MujocoPlant) -> tuple[Array, Array, Array]:
         """Of each wheel, shapes (n,): its rate about its axle, rad/s, positive ahead; its centre's speed, m/s.

@@ -11,6 +11,7 @@ import mujoco
 
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of, wrappers_of
+from safe_wrappers.plants.mujoco.constants import Constants, every_constant
 
 _DRAWING = ("pygame", "glfw", "OpenGL", "moviepy")
 _SHARED = (gym.Space, gym.envs.registration.EnvSpec, ModuleType)
@@ -77,7 +78,7 @@ def is_drawn(value: Any) -> bool:
 
 
 class EnvCopier:
-    """Copies an env again and again; MuJoCo's model is copied once per episode, its data into one place.
+    """Copies an env again and again; MuJoCo's model is copied when it has changed, its data into one place.
 
     A copy is valid until the next one is made. EzPickle, whose copies are new envs, has no say. Spaces and specs are
     shared; windows and renderers are left out.
@@ -91,8 +92,8 @@ class EnvCopier:
         self.start()
 
     def start(self) -> None:
-        """Copy models again: a reset may have changed them."""
-        self._models: dict[int, tuple[Any, Any]] = {}
+        """Copy models again: a reset may have changed what is not compared."""
+        self._models: dict[int, tuple[Any, Any, Constants]] = {}
         self._data: dict[int, tuple[Any, Any, Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -132,9 +133,11 @@ class EnvCopier:
         return copied
 
     def _model(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        if id(model) not in self._models:
-            self._models[id(model)] = model, copy.copy(model)
-        return self._models[id(model)][1]
+        known = self._models.get(id(model))
+        if known is None or known[2].changed():
+            self._models[id(model)] = known = model, copy.copy(model), every_constant(model)
+            self._data = {}
+        return known[1]
 
     def _copy_of_data(self, data: mujoco.MjData) -> mujoco.MjData:
         if id(data) not in self._data:

@@ -1,5 +1,7 @@
 """SimulatorPlant: the env's own simulation is the model."""
 
+import contextlib
+import copy
 import math
 import warnings
 from collections.abc import Callable
@@ -7,18 +9,22 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
 
 from safe_wrappers.checks import Array, positive, whole_number
-from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.plants.env_checks import name_of, reward_numbers
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
-from safe_wrappers.plants.simulator.replay_check import check_replay
+from safe_wrappers.plants.simulator.replay_check import check_replay, differing
 from safe_wrappers.plants.simulator.simulation import (
     Env,
     Simulation,
     Snapshot,
-    fresh_generator,
+    other_noise,
     simulation_of,
 )
+from safe_wrappers.plants.simulator.substeps import Substeps, known_substeps
+
+_ROUNDING = 1e-6  # of float32
 
 
 class SimulatorPlant(RolloutPlant):
@@ -30,7 +36,12 @@ class SimulatorPlant(RolloutPlant):
 
     **It knows what will be drawn**: the random generator of the env belongs to its state, so that a rollout has the
     noise that the env will have. Only a simulator has this privilege; `same_noise=False` takes it away, and then
-    rollouts are samples, and prove nothing about the env.
+    rollouts are samples, and prove nothing about the env. It reseeds, in the simulation, the generators of NumPy and
+    of `random` that the env, its wrappers or anything in them holds.
+
+    **After every step** what the env has returned is compared with the rollout of the executed action. From the first
+    difference on (a generator that copies share, a clock, another process) nothing is proved, and `cbf/mismatch` says
+    at which steps it was.
 
     Args:
         snapshot: `(save, restore)`: functions `save(env)` and `restore(env, state)` of the unwrapped env, which is
@@ -72,6 +83,9 @@ class SimulatorPlant(RolloutPlant):
         self.check_s, self.checked_steps = positive("check_s", check_s, "s"), 0
         self.exact = self.same_noise and self.check_steps > 0
         self._simulation: Simulation | None = None
+        self._compares, self._compared_substeps = self.exact, False
+        self._sent, self._answered = b"", False
+        self._foreseen: dict[bytes, tuple[Any, float | None, Measure | None]] = {}
 
     def bind(self, env: Env) -> None:
         """Attach to an env, and check that its simulation is the env."""
@@ -79,8 +93,12 @@ class SimulatorPlant(RolloutPlant):
         self._attach(env)
         self._simulation = simulation_of(env, self._snapshot)
         self.view = View(env.unwrapped, np.zeros(0), {})
+        self.substeps = known_substeps(env.unwrapped)
+        stepping = getattr(type(env.unwrapped), "_step_mujoco_simulation", None)
+        self.judges_substeps = stepping is MujocoEnv._step_mujoco_simulation
         if self.check_steps:
-            self.checked_steps = check_replay(self._simulation, self.check_steps, self.check_s)
+            steps = self.check_steps, self.check_s
+            self.checked_steps = check_replay(self._simulation, *steps, self.same_noise)
             if self.checked_steps < self.check_steps:
                 needed_s = math.ceil(1.2 * self.check_s * self.check_steps / self.checked_steps)
                 warnings.warn(
@@ -107,15 +125,35 @@ class SimulatorPlant(RolloutPlant):
     def observe(self) -> None:
         """Every rollout starts where the env is."""
         self.observation_id += 1
+        self._foreseen.clear()
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:
         """Take what the env's reset or step has returned."""
+        self._answered = True
         self.view = View(self.simulation.env.unwrapped, observation, info)
 
     def executed(self, control: Array | None) -> None:
-        """A new episode may have changed what copies share."""
+        """Remember it for `deviation`; a new episode may have changed what copies share."""
         if control is None:
             self.simulation.start()
+        else:
+            self._sent, self._answered = control.tobytes(), False
+
+    def deviation(self) -> str:
+        """Where the env's step was not the rollout of what was executed: in the observation, or in what was measured.
+
+        By more than rounding: an env may compute otherwise with a list. From the first one on it is not `exact`.
+        """
+        if not (self._answered and self._sent in self._foreseen):
+            return ""
+        observation, value, measure = self._foreseen[self._sent]
+        found = differing("observation", observation, self.view.observation, _ROUNDING)
+        if found is None and measure is not None:
+            found = differing("h", value, measure(self.view), _ROUNDING)
+        if found is None:
+            return ""
+        self.exact = False
+        return f"the env's step was not its simulation's: {found}"
 
     def rollout(
         self,
@@ -125,20 +163,29 @@ class SimulatorPlant(RolloutPlant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
+        between: str = "",
     ) -> Rollout:
         """Simulate a control, then a policy, from the env's present state: see `RolloutPlant.rollout`."""
 
-        def simulated(env: gym.Env[Any, Any]) -> Rollout:
-            if not self.same_noise:
-                env.unwrapped.np_random = fresh_generator(self.observation_id)
-            found, action = Rollout(), self.action(control)
+        def simulated(env: gym.Env[Any, Any]) -> tuple[Rollout, float | None, str]:
+            with contextlib.ExitStack() as stack:
+                if not self.same_noise:
+                    stack.enter_context(other_noise(env, self.observation_id))
+                seen = Substeps(measure, between if self.judges_substeps else "")
+                stack.enter_context(seen.of(env.unwrapped))
+                return rolled_out(env, seen)
+
+        def rolled_out(env: gym.Env[Any, Any], seen: Substeps) -> tuple[Rollout, float | None, str]:
+            found, action, first = Rollout(), self.action(control), None
             for step in range(horizon):
                 observation, reward, terminated, truncated, info = env.step(action)
                 view = View(env.unwrapped, observation, info)
-                found.observations.append(observation)
-                found.rewards.append(float(reward))
+                found.observations.append(observation if step else copy.deepcopy(observation))
+                found.rewards.append(reward_numbers(reward))
                 if measure is not None:
-                    found.values.append(measure(view))
+                    value = measure(view)
+                    first = first if step else value
+                    found.values.append(seen.least(value, view))
                     if not found.values[-1] >= least:
                         break
                 found.ended = bool(terminated or truncated)
@@ -147,9 +194,22 @@ class SimulatorPlant(RolloutPlant):
                     break
                 if policy is not None and step + 1 < horizon:
                     action = policy(view)
-            return found
+            return found, first, seen.why_not
 
-        return self.simulation.run(simulated)
+        found, value, why_not = self.simulation.run(simulated)
+        if between and self.judges_substeps and not (why_not or self._compared_substeps):
+            plain = self.rollout(control, len(found.observations), policy, measure)
+            pairs = zip(plain.observations, found.observations, strict=False)
+            if any(differing("observation", *pair) for pair in pairs):
+                why_not = "to look at this env between them changes what it does"
+            self._compared_substeps = True
+        if why_not:
+            self.judges_substeps = False
+            self.warn_of_substeps(why_not)
+            return self.rollout(control, horizon, policy, measure, least, until)
+        if self._compares:
+            self._foreseen[control.tobytes()] = found.observations[0], value, measure
+        return found
 
     def margins(self, measure: Measure, horizon: int) -> Array:
         """Zeros: a rollout is what the env does."""

@@ -1,13 +1,18 @@
 """Simulation: runs a task on an env as it would go on from its present state, and leaves the env as it is."""
 
+import contextlib
 import copy
 import functools
+import gc
 import inspect
+import logging
 import os
 import pickle
+import random
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from collections.abc import Callable, Iterator
+from types import FunctionType, ModuleType
+from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -32,6 +37,12 @@ class Simulation(ABC):
     Args:
         env: With the wrappers inside the filter.
     """
+
+    remedy: ClassVar[str] = (
+        "Say how to restore all of its state, SimulatorPlant(snapshot=(save, restore)), or simulate in child "
+        "processes, SimulatorPlant(snapshot='fork'), where the system has them"
+    )
+    """What to do where the simulation differs from the env."""
 
     def __init__(self, env: Env) -> None:
         self.env = env
@@ -91,6 +102,11 @@ class RestoredSimulation(Simulation):
 
 class ForkedSimulation(Simulation):
     """In a child process, which has the env as it is; its cost grows with the memory of this process."""
+
+    remedy = (
+        "A child process has all of its memory: what differs lies outside of it (a clock, a file, a server), and the "
+        "env's step must not depend on that; or say how to restore it, SimulatorPlant(snapshot=(save, restore))"
+    )
 
     def __init__(self, env: Env) -> None:
         super().__init__(env)
@@ -189,6 +205,67 @@ def _put_back(method: str, env: Any, state: Any) -> None:
     getattr(env, method)(copy.deepcopy(state))
 
 
-def fresh_generator(seed: int) -> np.random.Generator:
-    """Random numbers that are not those which the env will draw."""
-    return np.random.default_rng([0x5AFE, seed])
+_GLOBAL: Any = (np.random.get_state.__self__, random.getstate.__self__)  # type: ignore[attr-defined]
+_ELSEWHERE = (type, ModuleType, logging.Logger, random.SystemRandom)
+"""What leads out of an env, and what has no state."""
+
+
+def _generators_of(env: Env) -> list[Any]:
+    """The generators of NumPy and of `random` that an env, its wrappers or anything in them could draw from."""
+    found: list[Any] = []
+    seen: set[int] = set()
+    left: list[Any] = [*_GLOBAL, env, env.unwrapped.np_random]
+    while left:
+        one = left.pop()
+        if id(one) in seen or isinstance(one, _ELSEWHERE) or is_drawn(one):
+            continue
+        seen.add(id(one))
+        if isinstance(one, np.random.Generator | np.random.RandomState | random.Random):
+            found.append(one)
+        elif isinstance(one, FunctionType):
+            left += [cell.cell_contents for cell in one.__closure__ or ()]
+        else:
+            left += gc.get_referents(one)
+    return found
+
+
+@contextlib.contextmanager
+def other_noise(env: Env, seed: int) -> Iterator[None]:
+    """Lets steps draw other random numbers than the env will; afterwards its generators are as they were."""
+    generators = _generators_of(env)
+    before = [_state(one) for one in generators]
+    try:
+        for number, one in enumerate(generators):
+            _reseed(one, np.random.SeedSequence([0x5AFE, seed, number]))
+        yield
+    finally:
+        for one, state in zip(generators, before, strict=True):
+            _set_state(one, state)
+
+
+def _state(generator: Any) -> Any:
+    if isinstance(generator, np.random.Generator):
+        return generator.bit_generator.state
+    if isinstance(generator, random.Random):
+        return generator.getstate()
+    return generator.get_state(legacy=False)
+
+
+def _set_state(generator: Any, state: Any) -> None:
+    if isinstance(generator, np.random.Generator):
+        generator.bit_generator.state = state
+    elif isinstance(generator, random.Random):
+        generator.setstate(state)
+    else:
+        generator.set_state(state)
+
+
+def _reseed(generator: Any, seed: np.random.SeedSequence) -> None:
+    if isinstance(generator, random.Random):
+        generator.seed(int(seed.generate_state(1)[0]))
+        return
+    state = _state(generator)
+    fresh = getattr(np.random, state["bit_generator"])(seed).state
+    # A RandomState keeps half of a pair of Gaussian numbers beside its bits.
+    gauss = {"has_gauss": 0, "gauss": 0.0} if isinstance(generator, np.random.RandomState) else {}
+    _set_state(generator, fresh | gauss)

@@ -4,12 +4,13 @@ import inspect
 import warnings
 import zlib
 from collections.abc import Mapping
-from typing import Any, ClassVar, SupportsFloat
+from typing import Any, ClassVar, Self, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import numbers_of
+from safe_wrappers.arguments import refuse_call
+from safe_wrappers.checks import numbers_of, shown
 from safe_wrappers.errors import ActionError, UnsupportedEnvError
 from safe_wrappers.plants.default import PlantTemplate
 from safe_wrappers.plants.env_checks import wrappers_of
@@ -32,6 +33,12 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
 
     layer: ClassVar[Layer]
 
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Refuse a call that does not fit, before `__init__`; a copy is made without arguments."""
+        if args or kwargs:
+            refuse_call(cls, args, kwargs)
+        return super().__new__(cls)
+
     def __init__(self, env: Env) -> None:
         refuse_vector_env(env, type(self).__name__)
         refuse_order(env, self.layer, type(self).__name__)
@@ -51,7 +58,7 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
             given = numbers_of(action)
             if given is None or not np.isfinite(given).all():
                 raise ActionError(
-                    f"expected an action of finite numbers, got {action!r}; the env was not stepped"
+                    f"expected an action of finite numbers, got {shown(action)}; the env was not stepped"
                 )
 
     def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:

@@ -6,8 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import numbers_of
-from safe_wrappers.deprecation import deprecated_attribute, deprecated_method
+from safe_wrappers.checks import OF_NUMBERS, numbers_of, shown
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.common.layer import Env
@@ -30,7 +29,6 @@ class CommandReceiver:
 
     control_dt: float
     """Control interval, s."""
-    hold_s = deprecated_attribute("hold_s", "control_dt")
     _steps_done: int
     _observed_s: float | None
 
@@ -49,8 +47,11 @@ class CommandReceiver:
         Raises:
             ActionError: Not a finite time.
         """
-        if observed_s is not None and not math.isfinite(observed_s):
-            raise ActionError(f"observed_s is a time in seconds, or None for nothing; got {observed_s!r}")
+        given = None if observed_s is None else numbers_of(observed_s)
+        if observed_s is not None and (given is None or given.ndim or not np.isfinite(given)):
+            raise ActionError(
+                f"observed_s is a time in seconds, or None for nothing; got {shown(observed_s)}"
+            )
         self._observed_s = observed_s
 
     def admits(self, end: NDArray[np.float64], steps: int) -> bool:
@@ -60,8 +61,6 @@ class CommandReceiver:
     def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
         """Whether a chunk may be executed, shape (h, m): the commands of the next h control steps."""
         return self.admits(commands[-1], len(commands))
-
-    deliver = deprecated_method("deliver", "set_observation_time")
 
 
 def receiver_inside(env: Env) -> CommandReceiver | None:
@@ -81,7 +80,7 @@ def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None)
     """A copy of an action, in its own dtype unless told; an `ActionError` for another shape or no numbers."""
     given = numbers_of(action)
     if given is None:
-        raise ActionError(f"expected an action of shape {shape}, of numbers, got {action!r}")
+        raise ActionError(f"expected an action of shape {shape}, {OF_NUMBERS}, got {shown(action)}")
     if given.shape != shape:
         raise ActionError(f"expected an action of shape {shape}, got shape {given.shape}")
     return given if dtype is None else given.astype(dtype, copy=False)

@@ -5,7 +5,6 @@ from abc import abstractmethod
 from typing import ClassVar
 
 from safe_wrappers.checks import non_negative, positive
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.common.layer import Env, WrapperRng
 from safe_wrappers.wrappers.faults.fault import Carried, Fault
@@ -38,7 +37,6 @@ class Struck(Fault):
         return given
 
 
-@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class ShareFault(Struck):
     """Base of the faults that strike a share of the commands: the probability, from 0 to 1, for each by itself."""
 
@@ -50,7 +48,6 @@ class ShareFault(Struck):
         return bool(self.random.draw.random() < self._share)
 
 
-@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class Jitter(Fault):
     """Delays every command by a random time, uniform from 0 to `longest_s`, drawn for each by itself.
 
@@ -76,7 +73,6 @@ class Jitter(Fault):
         return newest
 
 
-@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class ClockSkew(Fault):
     """Gives the observation times of a clock that is off, and runs at another rate: `(1 + drift) t + offset_s`.
 
@@ -120,7 +116,6 @@ class OnOffProcess:
         return self._on
 
 
-@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class OnOffFault(Struck):
     """Base of the faults that are on for `mean_length_s` at a time, then off for `mean_between_s`, on average, s."""
 

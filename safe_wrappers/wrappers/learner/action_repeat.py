@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 from safe_wrappers.checks import whole_number
+from safe_wrappers.plants.env_checks import reward_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.chunk_handover import macro_info
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step
@@ -38,10 +39,11 @@ class ActionRepeat(LayerWrapper):
 
     def step(self, action: Any) -> Step:
         """Step the env with the same action until `repeat` control steps are made or the episode ends."""
-        total, infos = 0.0, []
+        total: Any = 0.0
+        infos = []
         for _ in range(self.repeat):
             observation, reward, terminated, truncated, info = self._pass_on(action)
-            total += float(reward)
+            total = total + reward_numbers(reward)
             infos.append(info)
             if terminated or truncated:
                 break

@@ -3,9 +3,12 @@
 import math
 from typing import Any, ClassVar
 
+import numpy as np
+
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
@@ -63,6 +66,7 @@ class AdaptionPenalty(LayerWrapper):
         scale: float = 1.0,
     ) -> None:
         LayerWrapper.__init__(self, env)
+        refuse_vector_rewards(env, "AdaptionPenalty")
         if filter_inside(env) is None:
             example = "AdaptionPenalty(sw.protect(env), penalty=...)"
             raise ConfigurationError(f"AdaptionPenalty needs a CBFActionFilter inside: {example}")
@@ -103,9 +107,12 @@ class AdaptionPenalty(LayerWrapper):
         """Steps the env; an unchanged step's reward passes through untouched."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         penalty = 0.0
-        info[keys.ADAPTION_TASK_REWARD] = float(reward)
-        if info[keys.CBF_INTERVENED]:
-            penalty = self.of(float(info[keys.CBF_CORRECTION]))
+        info[keys.ADAPTION_TASK_REWARD] = one_reward(reward, "AdaptionPenalty")
+        changed, correction = info[keys.CBF_INTERVENED], info[keys.CBF_CORRECTION]
+        if info.get(keys.CBF_ESCAPING, False):  # StuckEscape gave the filter another action than this one
+            changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))
+        if changed:
+            penalty = self.of(float(correction))
             reward = float(reward) - penalty
         info[keys.ADAPTION_PENALTY] = penalty
         return observation, reward, terminated, truncated, info

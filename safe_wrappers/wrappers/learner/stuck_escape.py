@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
@@ -24,14 +25,15 @@ _CANDIDATES: Final = 64
 class StuckEscape(LayerWrapper):
     """Proposes another action for a while, in the policy's place, where policy and filter are stuck.
 
-    Stuck means: in the last `after_s` the filter changed more than half of the actions, and the rewards of these
-    steps add up to `progress` at most. A deterministic policy that pushes against the filter, or circles an obstacle,
-    may do so for ever. For `escape_s` an action that was drawn at random is proposed; or, with a `value`, of 64 that
-    were drawn the best that the filter admits, chosen anew at every step. The filter inside checks it like any other,
-    so that its guarantees stay. A deadlock is ended by chance, not by a plan; it may take several draws.
+    Stuck means: in the last `after_s` more than half of the policy's actions were changed by the filter or replaced
+    by this wrapper, and the rewards of these steps add up to `progress` at most. A deterministic policy that pushes
+    against the filter, or circles an obstacle, may do so for ever. For `escape_s` an action that was drawn at random
+    is proposed; or, with a `value`, of 64 that were drawn the best that the filter admits, chosen anew at every step.
+    The filter inside checks it like any other, so that its guarantees stay. A deadlock is ended by chance, not by a
+    plan; it may take several draws.
 
-    While it acts, `proposed_action`, `cbf/intervened`, `cbf/correction` and `cbf/nonfinite` are about the policy's
-    own action.
+    While it acts, the filter's keys are about what the filter was given, the drawn action: an escape is
+    `cbf/escaping`, not `cbf/intervened`. `cbf/nonfinite` is also true for a policy's action that is not finite.
 
     Args:
         env: With a `CBFActionFilter` inside.
@@ -70,6 +72,7 @@ class StuckEscape(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
+        refuse_vector_rewards(env, "StuckEscape")
         inside = filter_inside(env)
         if inside is None:
             raise ConfigurationError(
@@ -101,23 +104,17 @@ class StuckEscape(LayerWrapper):
     def step(self, action: Any) -> Step:
         """Step the env with the policy's action, or with the drawn one."""
         escaping = self._left > 0
-        sent, proposed = action, None
+        sent = action
         if escaping:
-            proposed = action_array(action, self._drawn.shape[1:], np.float64)
+            own = action_array(action, self._drawn.shape[1:], np.float64)
             sent = self._other(action)
         observation, reward, terminated, truncated, info = self.env.step(sent)
-        if proposed is not None:
+        if escaping:
             self._left -= 1
-            finite = np.isfinite(proposed)
-            proposed = np.where(finite, proposed, 0.0)
-            info[keys.CBF_NONFINITE] = not finite.all()
-            executed = info[keys.EXECUTED_ACTION]
-            info[keys.PROPOSED_ACTION] = proposed
-            info[keys.CBF_CORRECTION] = float(np.linalg.norm(executed - proposed))
-            info[keys.CBF_INTERVENED] = bool((executed != proposed).any() or not finite.all())
+            info[keys.CBF_NONFINITE] |= not np.isfinite(own).all()
         self._observation = observation
-        self._rewards.append(float(reward))
-        self._changed.append(info[keys.CBF_INTERVENED])
+        self._rewards.append(one_reward(reward, "StuckEscape"))
+        self._changed.append(info[keys.CBF_INTERVENED] or escaping)
         full = len(self._rewards) == self._window
         stuck = full and 2 * sum(self._changed) > self._window and sum(self._rewards) <= self.progress
         if stuck and self._escape and self._left == 0 and not escaping:

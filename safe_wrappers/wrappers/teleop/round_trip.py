@@ -4,13 +4,11 @@ import math
 from dataclasses import KW_ONLY, dataclass
 
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
-from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.common.layer import Env
-from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, StoppingBudget, budget_from
+from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, budget_from
 
 
-@deprecated_parameters(moved={"budget": StoppingBudget}, positional=("braking", "acceleration", "top_speed"))
 @dataclass(frozen=True)
 class RoundTripCeiling:
     """The longest round trip at which an operator may still be relied on, from the clearance and speed of the moment.

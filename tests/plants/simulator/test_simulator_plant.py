@@ -1,7 +1,10 @@
 """The simulation of an env: equal to the env bit for bit, without a trace in it, or refused."""
 
+import copy
 import os
+import random
 import time
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -331,6 +334,170 @@ def test_the_check_costs_about_as_many_steps_as_it_makes():
 
     bound(Counted(), check_steps=200)
     assert 400 <= Counted.made <= 440
+
+
+class Held:
+    """Keeps a generator where only what it holds leads to it."""
+
+    __slots__ = ("draw",)
+
+    def __init__(self, draw):
+        self.draw = draw
+
+
+def push(held):
+    generator = held[0].draw["generator"]
+    return generator.gauss(0.0, 1.0) if isinstance(generator, random.Random) else generator.standard_normal()
+
+
+class OwnNoise(Cart):
+    """Noise from a generator of its own, behind an object with slots."""
+
+    def __init__(self, generator):
+        super().__init__()
+        self.held = [Held({"generator": generator})]
+
+    def step(self, action):
+        return super().step(np.asarray(action) * 0.5 + 0.2 * push(self.held))
+
+
+class NoisyActions(gym.Wrapper):
+    """A wrapper with a generator of its own."""
+
+    def __init__(self, env, generator):
+        super().__init__(env)
+        self.held = [Held({"generator": generator})]
+
+    def step(self, action):
+        return self.env.step(np.asarray(action) * 0.5 + 0.2 * push(self.held))
+
+
+GENERATORS = {
+    "NumPy's": np.random.default_rng,
+    "RandomState": np.random.RandomState,
+    "random": random.Random,
+    "np_random of a space": lambda seed: gym.spaces.Box(-1.0, 1.0, seed=seed).np_random,
+}
+
+
+@pytest.mark.parametrize("where", ["env", "wrapper"])
+@pytest.mark.parametrize("kind", GENERATORS)
+@pytest.mark.parametrize("snapshot", [None, "restored"])
+def test_noise_of_any_generator_is_foreseen_only_if_told(kind, where, snapshot):
+    def restore(raw, saved):
+        raw.x, raw.v = saved[0]
+        if where == "env":
+            raw.held = saved[1]
+
+    save = (
+        (lambda raw: ((raw.x, raw.v), copy.deepcopy(raw.held)))
+        if where == "env"
+        else (lambda raw: ((raw.x, raw.v),))
+    )
+    for same_noise in (True, False):
+        drawn = [GENERATORS[kind](7) for _ in range(2)]
+        envs = [OwnNoise(g) if where == "env" else NoisyActions(Cart(), g) for g in drawn]
+        plant = bound(
+            envs[0],
+            same_noise=same_noise,
+            check_steps=0,
+            snapshot=None if snapshot is None else (save, restore),
+        )
+        for env in envs:
+            env.reset(seed=0)
+        first = envs[0].step(np.ones(1))[0]  # of a pair of Gaussian numbers
+        assert first.tobytes() == envs[1].step(np.ones(1))[0].tobytes()
+        ahead = [plant.rollout(np.ones(1), 1).observations[0].tobytes() for _ in range(2)]
+        assert ahead[0] == ahead[1], "the samples of one step are the same for all candidates"
+        real, bare = (env.step(np.ones(1))[0].tobytes() for env in envs)
+        assert real == bare, "the env itself draws on as it would"
+        assert (ahead[0] == real) == same_noise
+
+
+def test_noise_that_is_the_same_in_all_of_the_process_is_not_foreseen_either():
+    class Global(Cart):
+        def step(self, action):
+            return super().step(np.asarray(action) * 0.5 + 0.1 * np.random.randn() + 0.1 * random.gauss(0, 1))
+
+    plant = bound(Global(), same_noise=False, check_steps=0)
+    env = plant.simulation.env
+    env.reset(seed=0)
+    np.random.seed(3), random.seed(3)
+    before = np.random.get_state()[1].tobytes(), random.getstate()
+    ahead = plant.rollout(np.ones(1), 3).observations[0]
+    assert (np.random.get_state()[1].tobytes(), random.getstate()) == before
+    assert ahead.tobytes() != env.step(np.ones(1))[0].tobytes()
+
+
+def test_other_noise_that_changes_nothing_is_told():
+    with pytest.warns(UserWarning, match="same_noise=False changes nothing in"):
+        bound(Cart(), same_noise=False, check_steps=20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bound(NoisyCart(), same_noise=False, check_steps=20)
+        bound(OwnNoise(random.Random(7)), same_noise=False, check_steps=20)
+
+
+class LateNoise(Cart):
+    """Draws from the generator of the whole process, but not before its hundredth step."""
+
+    made, seen = 0, "observation"
+
+    def step(self, action):
+        self.made += 1
+        push = 0.1 * np.random.randn() if self.made > 100 else 0.0
+        if self.seen == "observation":
+            return super().step(np.asarray(action) + push)
+        self.hidden = 1.0 + push
+        return super().step(action)
+
+
+@pytest.mark.parametrize("seen", ["observation", "h alone"])
+def test_noise_that_begins_after_the_check_is_flagged_at_its_first_step(seen):
+    kind = type("Late", (LateNoise,), {"seen": seen, "hidden": 1.0})
+    shield = sw.constraints.PredictiveShield(
+        lambda view: view.env.hidden, 3, sees="view", terminal=lambda view: True
+    )
+    env = sw.CBFActionFilter(kind(), [shield], plant=sw.SimulatorPlant(check_steps=50))
+    env.reset(seed=0)
+    (own,) = env.constraints
+    for step in range(1, 100 + 1):
+        info = env.step(np.array([0.1]))[4]
+        assert not info["cbf/mismatch"] and own.promise == "proved", step
+    with pytest.warns(UserWarning, match=r"not its simulation's: its (observation\[\d\]|h) is .* instead of"):
+        assert env.step(np.array([0.1]))[4]["cbf/mismatch"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # said once
+        assert env.step(np.array([0.1]))[4]["cbf/mismatch"]
+    assert own.promise == "best effort"
+
+
+def test_a_vector_env_flags_such_a_step_too():
+    made = gym.vector.SyncVectorEnv(
+        [lambda: gym.wrappers.TimeLimit(LateNoise(), 101)] * 2,
+        autoreset_mode=gym.vector.AutoresetMode.SAME_STEP,
+    )
+    shield = sw.constraints.PredictiveShield(lambda x: 1.0, 2)
+    envs = sw.VectorCBFActionFilter(made, [shield], plant=sw.SimulatorPlant(check_steps=50))
+    envs.reset(seed=0)
+    for _ in range(100):
+        assert not envs.step(np.zeros((2, 1)))[4]["cbf/mismatch"].any()
+    with pytest.warns(UserWarning, match="not its simulation's"):
+        finals = envs.step(np.zeros((2, 1)))[4]["final_info"]
+    assert finals["cbf/mismatch"].all()
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0"])
+@pytest.mark.parametrize("form", [np.float32, np.float64, list])
+def test_an_action_in_a_finer_dtype_is_simulated_as_it_is_executed(env_id, form):
+    shield = sw.constraints.PredictiveShield(lambda x: 1.0, 2)
+    env = sw.CBFActionFilter(gym.make(env_id), [shield], plant=sw.SimulatorPlant(check_steps=50))
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        action = rng.uniform(env.action_space.low, env.action_space.high)
+        info = env.step(action.tolist() if form is list else action.astype(form))[4]
+        assert not info["cbf/mismatch"]
 
 
 class SlowCart(Cart):

@@ -1,1 +1,0 @@
-"""Formulas of the appendix that no wrapper needs: kept and tested, outside the core."""

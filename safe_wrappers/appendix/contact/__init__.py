@@ -1,1 +1,0 @@
-"""Contact: impacts, forces of simple shapes, contact steps as linear complementarity problems."""

@@ -1,1 +1,0 @@
-"""Estimation: covariance, filter consistency, observability, tail probabilities, lever arms."""

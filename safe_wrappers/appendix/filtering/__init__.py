@@ -1,1 +1,0 @@
-"""Barriers in continuous time, and least-norm joint rates."""

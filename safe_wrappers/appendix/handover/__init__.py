@@ -1,1 +1,0 @@
-"""Trajectories: splines, blends, polynomial extrema, flexible joints."""

@@ -1,1 +1,0 @@
-"""Centroidal momentum, zero moment point, moving bodies of a model."""

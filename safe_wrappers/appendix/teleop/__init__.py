@@ -1,1 +1,0 @@
-"""Wave variables, and the passivity controller of one port."""

@@ -1,1 +1,0 @@
-"""Wheel slip and Burckhardt's traction curve."""

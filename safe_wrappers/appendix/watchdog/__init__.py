@@ -1,1 +1,0 @@
-"""Reachability, and the delays of a lease."""

@@ -1,0 +1,67 @@
+"""Short formulas, written a second time, to hold the library against."""
+
+import numpy as np
+
+from safe_wrappers.control.contact.friction_cone import cone_excess
+from safe_wrappers.control.estimation.covariance import discretise
+from safe_wrappers.control.legged.support import common_plane, support_polygon
+
+
+def blind_covariance(start, a, q, time_s):
+    """The covariance after a time without measurements, from the exact steps of `discretise`."""
+    transition, noise = discretise(a, q, time_s)
+    return transition @ start @ np.swapaxes(transition, -1, -2) + noise
+
+
+def double_integrator_covariance(start, intensity, t):
+    """The closed form for position and velocity under white acceleration noise."""
+    (p, both), (_, v) = start
+    apart = both + v * t + intensity * t**2 / 2
+    return np.array([[p + 2 * both * t + v * t**2 + intensity * t**3 / 3, apart], [apart, v + intensity * t]])
+
+
+def in_cone(forces, normals, friction, tolerance=0.0):
+    return cone_excess(forces, normals, friction) <= tolerance
+
+
+def zero_moment_point(points, forces, ground):
+    """Where forces, shape (k, 3), have no tangential moment on a plane; NaN where nothing presses."""
+    pressure = forces.sum(axis=0) @ ground.normal
+    if pressure <= 0.0:
+        return np.full(3, np.nan)
+    moment = np.cross(points - ground.origin, forces).sum(axis=0)
+    return ground.origin + np.cross(ground.normal, moment) / pressure
+
+
+def margin_inside(point, corners):
+    """Distance of a point, shape (2,), from the edge of a convex polygon, anticlockwise; negative outside."""
+    edges = np.roll(corners, -1, axis=0) - corners
+    inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
+    inside = (inward * (point - corners)).sum(axis=1).min()
+    if inside >= 0.0:
+        return inside
+    along = ((point - corners) * edges).sum(axis=1) / (edges**2).sum(axis=1)
+    nearest = corners + np.clip(along, 0.0, 1.0)[:, None] * edges
+    return -np.linalg.norm(point - nearest, axis=1).min()
+
+
+def support_margin(points, normals, forces):
+    """Distance of the zero moment point from the edge of the support polygon; NaN where one of them is none."""
+    ground = common_plane(points, normals)
+    corners = None if ground is None else support_polygon(ground.flat(points))
+    if ground is None or len(corners) < 3:
+        return np.nan
+    return margin_inside(ground.flat(zero_moment_point(points, forces, ground)), corners)
+
+
+def damping_ratios(arm, inertia):
+    """Of the two-mass model of an arm with elastic joints, from the eigenvalues of its whole linear system."""
+    k, j, n = arm.stiffness, arm.rotor_inertia, len(arm.stiffness)
+    springs = np.block([[np.diag(k), -np.diag(k)], [-np.diag(k), np.diag(k)]])
+    d = np.diag(np.broadcast_to(arm.joint_damping, n))
+    damping = np.block([[d + np.diag(np.broadcast_to(arm.motor_damping, n)), -d], [-d, d]])
+    inverse = np.block([[np.diag(1.0 / j), np.zeros((n, n))], [np.zeros((n, n)), np.linalg.inv(inertia)]])
+    system = np.block([[np.zeros((2 * n, 2 * n)), np.eye(2 * n)], [-inverse @ springs, -inverse @ damping]])
+    values = np.linalg.eigvals(system)
+    ringing = sorted(values[values.imag > 1.0], key=abs)
+    return np.array([-value.real / abs(value) for value in ringing])

@@ -1,0 +1,278 @@
+"""The plant simulates the env's own model, whatever happens to it, and says so when the env does something else."""
+
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
+
+import safe_wrappers as sw
+
+ENVS = (
+    *("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Swimmer-v5", "Ant-v5", "Humanoid-v5"),
+    *("HumanoidStandup-v5", "Reacher-v5", "Pusher-v5", "InvertedPendulum-v5", "InvertedDoublePendulum-v5"),
+    *("SafePointGoal2-v0", "SafeCarGoal1-v0", "SafeHopperVelocity-v0", "SafeRover-v0", "FlexJointReach-v0"),
+)
+ROBOTICS = (
+    "FetchReach-v4",
+    "FetchPush-v4",
+    "PointMaze_UMaze-v3",
+    "AntMaze_UMaze-v5",
+    "HandReach-v3",
+    "AdroitHandDoor-v1",
+)
+CHANGES = {
+    "gravity": lambda m: m.opt.gravity.__imul__(0.4),
+    "mass": lambda m: (
+        m.body_mass.__imul__(1.3),
+        m.body_inertia.__imul__(1.3),
+        mujoco.mj_setConst(m, mujoco.MjData(m)),
+    ),
+    "damping": lambda m: m.dof_damping.__imul__(1.3),
+    "friction": lambda m: m.geom_friction.__imul__(0.5),
+    "gear": lambda m: m.actuator_gear.__imul__(1.5),
+    "wind": lambda m: (m.opt.wind.__iadd__(0.3), setattr(m.opt, "density", m.opt.density + 0.1)),
+    "flags": lambda m: setattr(m.opt, "disableflags", int(mujoco.mjtDisableBit.mjDSBL_CONTACT)),
+}
+
+
+def made(env_id):
+    if env_id in ROBOTICS:
+        gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    with warnings.catch_warnings(action="ignore"):
+        return gym.make(env_id)
+
+
+def driven(env, plan, actions):
+    """The observations, times and infos of an env whose model changes at steps of the plan (-1: after the reset)."""
+    rng, found = np.random.default_rng(0), [env.reset(seed=3)]
+    for step in range(-1, 12):
+        if step >= 0:
+            # Weak, so that an unlucky change seldom ends the episode.
+            action = (
+                actions[step]
+                if actions
+                else (0.4 * rng.uniform(-1, 1, env.action_space.shape)).astype(np.float32)
+            )
+            observation, *_, info = env.step(action)
+            found.append((observation, info))
+        for change in plan.get(step, ()):
+            CHANGES[change](env.unwrapped.model)
+    return found
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("env_id", [*ENVS, *ROBOTICS])
+def test_a_filtered_env_goes_on_with_its_own_model(env_id):
+    """Bit for bit as the bare env under the same actions, and as the plant's forecast, with every kind of change."""
+    rng = np.random.default_rng(ENVS.index(env_id) if env_id in ENVS else 0)
+    kinds = list(CHANGES)
+    if "Point" in env_id:  # its constraint refuses a machine that is no damped point
+        kinds = ["mass", "gear", "gravity"]
+    plan = {
+        -1: rng.choice(kinds, 2, replace=False),
+        2: rng.choice(kinds, 2, replace=False),
+        7: rng.choice(kinds, 1),
+    }
+    env = sw.protect(made(env_id))
+    filtered = driven(env, plan, None)
+    executed = [info["executed_action"].astype(env.action_space.dtype) for _, info in filtered[1:]]
+    bare = driven(made(env_id), plan, executed)
+    for (one, info), (two, _) in zip(filtered, bare, strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(parts(one), parts(two), strict=True))
+        assert not info["cbf/mismatch"]
+    if "Goal" not in env_id and "Rover" not in env_id and "Maze" not in env_id:
+        env.plant.observe()
+        action = executed[-1].astype(np.float64)
+        end = env.plant.forecast(action).path[-1]
+        env.unwrapped.step(executed[-1])
+        np.testing.assert_array_equal(end[: env.unwrapped.model.nq], env.unwrapped.data.qpos)
+
+
+def parts(observation):
+    return observation.values() if isinstance(observation, dict) else [observation]
+
+
+class Randomised(ReacherEnv):
+    """Domain randomisation as it is usually written: the model is edited in place by every reset."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self.kind = kind
+        self.own = (
+            self.model.actuator_gear.copy(),
+            self.model.dof_damping.copy(),
+            self.model.dof_armature.copy(),
+        )
+
+    def reset_model(self):
+        factor = self.np_random.uniform(0.2, 1.0)
+        if self.kind == "gear":
+            self.model.actuator_gear[:] = self.own[0] * factor
+        elif self.kind == "damping":
+            self.model.dof_damping[:] = self.own[1] + 0.9 * factor
+        else:
+            self.model.dof_armature[:] = self.own[2] * (1.0 + 9.0 * factor)
+        return super().reset_model()
+
+
+@pytest.mark.parametrize("kind", ["gear", "damping", "armature"])
+def test_domain_randomisation_is_followed(kind):
+    raw = Randomised(kind)
+    env = sw.CBFActionFilter(raw, [sw.constraints.JointSpeedLimit(limit=5.0, joints=["joint0", "joint1"])])
+    worst, corrected = 0.0, 0
+    space = env.action_space
+    space.seed(0)
+    for episode in range(6):
+        env.reset(seed=episode)
+        for step in range(50):
+            if step % 10 == 0:
+                action = np.sign(space.sample())
+            info = env.step(action)[4]
+            assert not info["cbf/mismatch"]
+            if not (info["cbf/infeasible"] or info["cbf/fallback"]):
+                worst = max(worst, np.abs(raw.data.qvel[:2]).max())
+            corrected += info["cbf/intervened"]
+    assert worst <= 5.0 + 1e-6 and corrected > 20
+
+
+def heavier():
+    model = gym.make("Hopper-v5").unwrapped.model
+    model.body_mass[:] *= 1.1
+    return model
+
+
+@pytest.mark.parametrize("other", ["model", "perturbed"])
+def test_a_plant_that_is_declared_to_be_another_says_so_once(other):
+    plant = sw.MujocoPlant(model=heavier() if other == "model" else None)
+    if other == "perturbed":
+        plant.perturb(mass=1.1)
+    env = sw.CBFActionFilter(gym.make("Hopper-v5"), [sw.constraints.SpeedLimit(9.0)], plant=plant)
+    mass = env.unwrapped.model.body_mass.copy()
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match=r"model is not the env's: they differ in .*body_mass") as caught:
+        infos = [env.step(np.zeros(3, np.float32))[4] for _ in range(5)]
+    assert len(caught) == 1 and all(info["cbf/mismatch"] for info in infos)
+    np.testing.assert_array_equal(mass, env.unwrapped.model.body_mass)
+    np.testing.assert_allclose(plant.model.body_mass, 1.1 * mass)
+
+
+class Late(gym.Wrapper):
+    """Applies the action before last."""
+
+    last = None
+
+    def step(self, action):
+        now, self.last = self.last, action
+        return self.env.step(action if now is None else now)
+
+
+class Twice(gym.Wrapper):
+    def step(self, action):
+        self.env.step(action)
+        return self.env.step(action)
+
+
+class Pushed(gym.Wrapper):
+    def step(self, action):
+        self.unwrapped.data.qvel[0] += 0.5
+        return self.env.step(action)
+
+
+class Weaker(gym.Wrapper):
+    """Tires within the step."""
+
+    def step(self, action):
+        self.unwrapped.model.actuator_gear[:, 0] *= 0.999
+        return self.env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("inside", "told"),
+    [(Late, "applied"), (Twice, "instead of"), (Pushed, "from its forecast"), (Weaker, "changed during")],
+)
+@pytest.mark.parametrize("vector", [False, True])
+def test_a_step_that_is_not_the_one_that_was_judged_is_flagged(inside, told, vector):
+    """No violation without a flag, and no flag without a reason."""
+    limit = sw.constraints.JointSpeedLimit(limit=5.0, joints=["joint0", "joint1"])
+    for wrapper in (inside, gym.Wrapper):
+        make = lambda wrapper=wrapper: wrapper(gym.make("Reacher-v5").unwrapped)  # noqa: E731
+        if vector:
+            env = sw.VectorCBFActionFilter(gym.vector.SyncVectorEnv([make]), [limit])
+            raw = env.unwrapped.envs[0].unwrapped
+        else:
+            env, raw = (one := sw.CBFActionFilter(make(), [limit])), one.unwrapped
+        env.reset(seed=0)
+        flags, unflagged, rng = 0, 0, np.random.default_rng(0)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for _ in range(100):
+                action = np.sign(rng.uniform(-1, 1, env.action_space.shape)).astype(np.float32)
+                info = {
+                    key: np.ravel(value)[0]
+                    for key, value in env.step(action)[4].items()
+                    if key.startswith("cbf/")
+                }
+                flags += info["cbf/mismatch"]
+                broken = np.abs(raw.data.qvel[:2]).max() > 5.0 + 1e-6
+                unflagged += broken and not (
+                    info["cbf/mismatch"] or info["cbf/infeasible"] or info["cbf/unsafe"]
+                )
+        warned = [str(w.message) for w in caught if "cbf/mismatch" in str(w.message)]
+        assert unflagged == 0
+        if wrapper is inside:
+            assert flags > 10 and len(warned) == 1 and told in warned[0]
+        else:
+            assert flags == 0 and not warned
+
+
+def test_a_model_that_is_made_anew_is_followed():
+    """As envs do whose robot is compiled for every episode."""
+    env = sw.CBFActionFilter(gym.make("Hopper-v5"), [sw.constraints.SpeedLimit(9.0)])
+    raw = env.unwrapped
+    env.reset(seed=0)
+    raw.model = heavier()
+    raw.data = mujoco.MjData(raw.model)
+    env.reset(seed=1)
+    for _ in range(5):
+        info = env.step(np.full(3, 0.5, np.float32))[4]
+        assert not info["cbf/mismatch"] and env.plant.model is raw.model
+    raw.model = gym.make("Walker2d-v5").unwrapped.model
+    with pytest.raises(sw.SafeWrappersError, match=r"another machine: expected .* build the filter anew"):
+        env.plant.observe()
+
+
+def test_many_envs_follow_their_models_as_single_ones_do():
+    single = [sw.protect(made("SafePointGoal1-v0")) for _ in range(3)]
+    many = sw.protect(gym.vector.SyncVectorEnv([lambda: made("SafePointGoal1-v0")] * 3))
+    assert many.constraint_batch is not None
+    seeds, rng = [5, 6, 7], np.random.default_rng(0)
+    many.reset(seed=seeds), [env.reset(seed=seed) for env, seed in zip(single, seeds, strict=True)]
+    for step in range(60):
+        if step % 20 == 10:
+            for raw in (many.unwrapped.envs[1].unwrapped, single[1].unwrapped):
+                CHANGES["mass"](raw.model)
+        actions = rng.uniform(-1, 1, (3, 2)).astype(np.float32)
+        infos = many.step(actions)[4]
+        for i, env in enumerate(single):
+            info = env.step(actions[i])[4]
+            for key in ("executed_action", "cbf/margin", "cbf/stage", "cbf/mismatch"):
+                np.testing.assert_array_equal(infos[key][i], info[key], err_msg=key)
+    assert many.filters[1].plant.model_version > 1
+
+
+def test_a_simulation_follows_the_model_of_its_env():
+    """Gravity, mass and motors that change in mid-episode are those of the next rollout."""
+    raw = gym.make("Reacher-v5")
+    shield = sw.constraints.PredictiveShield(lambda x: 30.0 - np.abs(x[6:8]).max(), horizon=2, backup="zero")
+    env = sw.CBFActionFilter(raw, [shield], plant=sw.SimulatorPlant(check_steps=20))
+    env.reset(seed=0)
+    for step, change in enumerate(["gear", "mass", "gravity", "damping"] * 3):
+        CHANGES[change](env.unwrapped.model)
+        action = np.full(2, (-1.0) ** step, np.float32)
+        foreseen = env.plant.rollout(action.astype(float), 1).observations[0]
+        observation, *_, info = env.step(action)
+        np.testing.assert_array_equal(foreseen, observation)
+        assert not info["cbf/mismatch"] and not info["cbf/intervened"]
