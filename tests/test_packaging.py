@@ -206,6 +206,17 @@ def test_addresses_and_versions_agree():
     ]
 
 
+def test_what_contributing_names_is_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(" ".join(re.findall(r"^([a-z -]+):", makefile, re.MULTILINE)).split())
+    assert set(re.findall(r"`make ([a-z-]+)`", text)) <= targets
+    for path in re.findall(
+        r"\]\(([\w./-]+)\)|`((?:\w+/)+(?:[\w.]+)?|[\w/.]+\.(?:py|toml|cff|yml|md))`", text
+    ):
+        assert (ROOT / "".join(path)).exists(), path
+
+
 def test_what_needs_stable_baselines_says_so(python, tmp_path):
     done = run(python, "import safe_wrappers.sb3", tmp_path)
     assert done.returncode != 0
