@@ -92,10 +92,10 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
 
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
-        self._scene = self.models, np.empty(6), self.discs(), self.spec.brake
+        self._scene = self.models, np.empty(6), self.discs(), self.spec.brake, self.reserve
         qpos, qvel, place = self.plant.qpos, self.plant.qvel, self.frame.place
-        least, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
-        return np.array([least + self.reserve])
+        value, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
+        return np.array([value])
 
     @property
     def reserve(self) -> float:
@@ -113,7 +113,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         return self._discs
 
     def nearest(self, neighbours: int) -> Array:
-        _, (x, y, heading, vx, vy, _), discs, _ = self._scene
+        _, (x, y, heading, vx, vy, _), discs, *_ = self._scene
         return nearest_discs(discs, x, y, heading, vx, vy, neighbours)
 
     def _pair(self, control: Array) -> Array:
