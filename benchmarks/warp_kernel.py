@@ -90,6 +90,7 @@ def decide_worlds(
     models: wp.array2d(dtype=Real),
     bounds: wp.array2d(dtype=Real),
     brake: bool,
+    reserve: Real,
     detour: bool,
     qpos: wp.array2d(dtype=wp.float32),
     qvel: wp.array2d(dtype=wp.float32),
@@ -126,7 +127,7 @@ def decide_worlds(
         side = Real(sides[world])
     out = take(arena, 2)
     stage, way, normals, offsets = closest_admitted(
-        models, motion, near, brake, proposal, side, detour, bounds, out, arena
+        models, motion, near, brake, reserve, proposal, side, detour, bounds, out, arena
     )
     if way != Real(0.0):
         sides[world] = wp.float32(way)
@@ -134,7 +135,8 @@ def decide_worlds(
     kept[world] = kept[world] - 1
     if stage == {unresolved} or not wp.isfinite(out[0] + out[1]):
         stage = {unresolved}
-        out[0] = smaller(larger(manoeuvre_drive(models, motion, near, brake, arena), bounds[0, 0]), bounds[1, 0])
+        back = manoeuvre_drive(models, motion, near, brake, reserve, arena)
+        out[0] = smaller(larger(back, bounds[0, 0]), bounds[1, 0])
         out[1] = Real(0.0)
     ctrl[world, 0] = wp.float32(out[0])
     ctrl[world, 1] = wp.float32(out[1])
@@ -181,6 +183,7 @@ class Scene(NamedTuple):
     bounds: Array
     room: float
     brake: bool
+    reserve: float
     detour: bool
 
 
@@ -191,8 +194,8 @@ def scene(env: sw.CBFActionFilter) -> Scene:
     least, most = bound.plant.acting_range
     low, high = bound.plant.lower, bound.plant.upper
     bounds = np.array([low, high, np.clip(least, low, high), np.clip(most, low, high)])
-    room = group.radius + bound.spec.margin + bound.spec.state_error
-    return Scene(bound.models, bounds, room, bound.spec.brake, bound.spec.detour)
+    room, brake, reserve = group.radius + bound.reserve, bound.spec.brake, bound.reserve
+    return Scene(bound.models, bounds, room, brake, reserve, bound.spec.detour)
 
 
 class WorldFilter:
@@ -227,6 +230,7 @@ class WorldFilter:
             wp.array(shared.models, dtype=number, device=device),
             wp.array(shared.bounds, dtype=number, device=device),
             shared.brake,
+            shared.reserve,
             shared.detour,
         ]
         self.sides = wp.zeros(n, dtype=wp.float32, device=device)

@@ -198,7 +198,7 @@ class _Translation(ast.NodeTransformer):
             return ast.BinOp(self.visit(node.left), ast.Mult(), self.visit(node.left))
         new = self.generic_visit(node)
         assert isinstance(new, ast.BinOp)
-        if ast.unparse(new.right) == "body.substeps":  # numbers of two types do not mix
+        if ast.unparse(new.right).endswith(".substeps"):  # numbers of two types do not mix
             new.right = ast.Call(ast.Name("Real", ast.Load()), [new.right], [])
         return new
 

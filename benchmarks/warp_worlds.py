@@ -103,7 +103,7 @@ class Agreement(NamedTuple):
 def by_numba(shared: Scene, states: States, i: int) -> tuple[int, Array]:
     """Stage and control of one world; an unresolved one is given the manoeuvre."""
     motion, out = np.concatenate([states.qpos[i], states.qvel[i]]), np.empty(2)
-    here = shared.models, motion, states.discs[i], shared.brake
+    here = shared.models, motion, states.discs[i], shared.brake, shared.reserve
     stage = among.closest_admitted(
         *here, states.proposals[i], states.sides[i], shared.detour, shared.bounds, out
     )[0]
@@ -125,13 +125,13 @@ def _is_borderline(shared: Scene, states: States, i: int) -> bool:
 
 def _short(shared: Scene, states: States, i: int, control: Any) -> float:
     motion, place = np.empty(6), np.zeros(4)
-    scene = shared.models, motion, states.discs[i], shared.brake
-    if among.least_clearance(states.qpos[i], states.qvel[i], place, *scene)[0] < 0.0:
+    scene = shared.models, motion, states.discs[i], shared.brake, shared.reserve
+    if among.least_clearance(states.qpos[i], states.qvel[i], place, *scene)[0] < shared.reserve:
         return 0.0  # it has to recover, at a rate
     drive, turn = map(float, control)
     for room in _ROOM:
         discs = states.discs[i] - [0.0, 0.0, room]
-        if among.is_admitted(shared.models, motion, discs, shared.brake, drive, turn):
+        if among.is_admitted(shared.models, motion, discs, shared.brake, shared.reserve, drive, turn):
             return float(room)
     return float("inf")
 

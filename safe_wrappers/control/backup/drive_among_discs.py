@@ -2,8 +2,8 @@
 
 The closed form of the stopping path is off by a millimetre or two: under the backup manoeuvre its clearance may fall
 by that. So the manoeuvre is admitted for what it is and not for the clearance that it leaves; and within `CLOSE_M` of
-a disc the steps of a control, and of the manoeuvre after it until rest, are predicted one by one. What is left of a
-manoeuvre whose way is clear is a manoeuvre whose way is clear.
+a disc the physics steps of a control, and of the manoeuvre after it until rest, are predicted one by one: where that
+way is clear, so is what is left of it at the next control step.
 """
 
 import math
@@ -227,23 +227,30 @@ def _needed(at: Look, i: int, backup: StoppingPath) -> float:
 
 
 @compiled
-def _recovery(models: Array, at: Look, brake: bool) -> tuple[float, float, float]:
-    """From outside: the drive control that recovers best, what it leaves, and the clearance to aim at, m."""
+def _recovery(models: Array, at: Look, brake: bool) -> tuple[float, float]:
+    """From outside: the drive control that recovers best, and the least clearance of all discs that it leaves, m."""
     body = _body(models[0])
-    drive, full = _ends(body, at.motion, brake)[0], body.drive_limit / body.drive_gain
+    drive = _ends(body, at.motion, brake)[0]
+    full = body.drive_limit / body.drive_gain
     best = _least_after(models, at, drive, brake)
     for other in (full, -full):
         left = _least_after(models, at, other, brake)
         if left > best:
             drive, best = other, left
-    # As much recovery as the drive can give here: across the heading it can give none.
-    return drive, best, min(at.least * (1.0 - RECOVERY_RATE * body.timestep * body.substeps), best)
+    return drive, best
 
 
 @compiled
-def _needed_outside(at: Look, aim: float) -> float:
+def _aim(body: HeadingDrive, at: Look, best: float) -> float:
+    """From outside: the clearance to aim at, m, where the best drive control leaves `best`."""
+    # As much recovery as the drive can give here: across the heading it can give none.
+    return min(at.least * (1.0 - RECOVERY_RATE * body.timestep * body.substeps), best)
+
+
+@compiled
+def _needed_outside(body: HeadingDrive, at: Look, best: float) -> float:
     """The least clearance of all discs that a control must leave, once one of them is lost."""
-    return 0.25 * aim + 0.75 * at.least  # a quarter of what the rows aim at will do
+    return 0.25 * _aim(body, at, best) + 0.75 * at.least  # a quarter of what the rows aim at will do
 
 
 @compiled
@@ -254,7 +261,7 @@ def _keeps_clear(models: Array, at: Look, least: float, drive: float, turn: floa
     body = _body(models[0])
     for i in range(1, len(models)):
         truth, start = _body(models[i]), at.motion
-        if _least_on_the_way(body, truth, start, drive, turn, brake, at.discs, at.reserve) < -HAIR_M:
+        if _least_on_the_way(body, truth, start, drive, turn, brake, at.discs, at.reserve) < HAIR_M:
             return False
     return True
 
@@ -278,7 +285,8 @@ def admits(models: Array, at: Look, drive: float, turn: float, brake: bool) -> b
     outside, needed, least, refused = at.least < 0.0, 0.0, math.inf, False
     braking = _ends(body, at.motion, brake)[0]
     if outside:
-        needed = _needed_outside(at, _recovery(models, at, brake)[2])
+        best = _recovery(models, at, brake)[1]
+        needed = _needed_outside(body, at, best)
     for i in range(1, len(models)):
         if refused:
             break
@@ -317,7 +325,10 @@ def rows(models: Array, at: Look, brake: bool) -> tuple[Array, Array]:
         return normals[:0], offsets[:0]
     body = _body(models[0])
     braking, pushing = _ends(body, at.motion, brake)
-    aim = _recovery(models, at, brake)[2] if outside else 0.0
+    aim = 0.0
+    if outside:
+        best = _recovery(models, at, brake)[1]
+        aim = _aim(body, at, best)
     for i in range(1, len(models)):
         base = _after(models[i], body, at, braking, 0.0, brake)
         pushed = _after(models[i], body, at, pushing, 0.0, brake)
@@ -379,10 +390,11 @@ def passing_side(models: Array, at: Look, drive: float, turn: float, brake: bool
 @compiled
 def backup_drive(models: Array, at: Look, brake: bool) -> float:
     """The drive control of the backup manoeuvre; from inside a disc, or its margin, the one that leads out best."""
-    braking = _ends(_body(models[0]), at.motion, brake)[0]
+    body = _body(models[0])
+    braking = _ends(body, at.motion, brake)[0]
     if not at.least < 0.0:
         return braking
-    drive, best, aim = _recovery(models, at, brake)
-    if at.safe and (best < _needed_outside(at, aim) or not _keeps_clear(models, at, best, drive, 0.0, brake)):
+    drive, best = _recovery(models, at, brake)
+    if at.safe and best < _needed_outside(body, at, best):
         return braking
-    return drive
+    return drive if _keeps_clear(models, at, best, drive, 0.0, brake) else braking
