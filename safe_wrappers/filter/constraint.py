@@ -167,6 +167,13 @@ class BoundConstraint:
         """Whether a control, held for one control interval, keeps the requirement."""
         return self.slack(control) >= -self.tolerance
 
+    def keeps_limit(self, control: Array) -> bool:
+        """Inside the margin: whether a refused control keeps the limit, and loses no more of the margin.
+
+        Asked where no control is admitted. Such a control is executed without being reported as infeasible.
+        """
+        return False
+
     def linearize(self, control: Array) -> HalfSpaces:
         """The requirement linearised about a refused control; no rows: it cannot be."""
         return HalfSpaces.none(self.plant.lower.size)

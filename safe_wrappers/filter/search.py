@@ -224,6 +224,10 @@ class SafeActionSearch:
         if admitted:
             return Decision(target, Stage.FALLBACK, fallback=True)
         least = self.least_violation(target, strict)
+        for control in (least, target):
+            if all(c.admits(control) or c.keeps_limit(control) for c in self._constraints):
+                stage = Stage.FALLBACK if control is target else Stage.LEAST_VIOLATION
+                return Decision(control, stage, fallback=True)
         stage = Stage.FALLBACK if least is target else Stage.LEAST_VIOLATION
         return Decision(least, stage, fallback=True, infeasible=True)
 

@@ -154,11 +154,33 @@ def test_from_inside_it_drives_out():
     assert first < 40 and not any(info["cost_substep"] for info in infos[first:])
 
 
-def test_a_start_that_cannot_stop_is_reported_as_infeasible():
+def test_a_start_that_cannot_stop_is_unsafe_and_infeasible():
     env, _, _ = bound([[5.0, 0.0]], speed_up=30)
     env.unwrapped._hazards[:] = ahead_of(env, 0.21)
-    info = env.step(FULL.astype(np.float32))[4]
+    with pytest.warns(UnsafeStateWarning):
+        info = env.step(FULL.astype(np.float32))[4]
     assert info["cbf/infeasible"] and info["cbf/fallback"]
+    assert info["cbf/unsafe"] and info["cbf/margin"] < 0.0
+
+
+@pytest.mark.parametrize("gap", [0.01, 0.05, 0.2])
+@pytest.mark.parametrize("speed_up", [0, 6, 30])
+def test_the_value_is_what_coasting_leaves(gap, speed_up):
+    env, constraint, plant = bound([[5.0, 0.0]], speed_up=speed_up)
+    for side in (1.0, -1.0):  # before the car, and behind it: what it rolls away from is as near as now
+        hazard = ahead_of(env, side * (0.2 + gap))
+        env.unwrapped._hazards[:] = hazard
+        plant.observe()
+        left = min(least_way(env, NONE, hazard) - 0.2, gap)
+        assert constraint.value() == pytest.approx(left, abs=1e-3)
+
+
+@pytest.mark.parametrize("declared", [{"max_decrease_per_speed": 0.13}, {}])
+def test_where_nothing_is_forecast_the_value_is_no_more_than_what_coasting_leaves(declared):
+    env, constraint, _ = bound([[2.0, 0.0]], speed_up=30, max_decrease=0.3, **declared)
+    constraint.coasting.run = None  # any forecast would fail
+    left, here = least_way(env, NONE, [2.0, 0.0]) - 0.2, 1.8 - env.unwrapped.agent_position[0]
+    assert here - 0.4 < constraint.value() < left < here
 
 
 def test_a_detour_leads_around():

@@ -30,6 +30,7 @@ def test_what_does_not_rest_within_the_horizon_is_refused_however_far_it_stays_a
         limit, at = parked([5.0, 0.0], speed_up=30, horizon=horizon)
         for control in (FULL, NONE, -FULL):
             assert limit.admits(control) == rests
+            assert np.isfinite(limit.value()).all() == rests
             if rests:
                 assert 5.0 - RADIUS - at[0] - 0.3 < limit.slack(control) < 5.0 - RADIUS - at[0]
             else:

@@ -14,6 +14,7 @@ from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.projection import cast_inside
 
+RESERVE_M = 0.004
 KINDS = {
     "detour": {"detour": True},
     "no detour": {},
@@ -105,7 +106,7 @@ def together(scenes, bounds, single):
     models, motions, discs, controls = (np.array([s[k] for s in scenes]) for k in (0, 1, 2, 4))
     brake, detour, n = scenes[0][3], scenes[0][5], len(scenes)
     first = np.arange(n + 1) * len(scenes[0][2])
-    scene = models, motions, np.concatenate(discs), first, brake, controls
+    scene = models, motions, np.concatenate(discs), first, brake, RESERVE_M, controls
     least, admitted, out, stages = np.empty(n), np.empty(n, bool), controls.copy(), np.zeros(n, np.int64)
     among.admit_each(*scene, least, admitted)
     refused = np.flatnonzero(~admitted)
@@ -116,7 +117,7 @@ def together(scenes, bounds, single):
 
 def random_scenes(count):
     """Every function on random scenes, as one digest."""
-    rng, digest = np.random.default_rng(7), hashlib.sha256()
+    rng, digest = np.random.default_rng(8), hashlib.sha256()
     env = sw.CBFActionFilter(
         gym.make("SafePointGoal1-v0"),
         [sw.constraints.HeadingDriveClearance([sw.constraints.Disc([0.0, 0.0], 0.2)], uncertainty=0.1)],
@@ -134,11 +135,17 @@ def random_scenes(count):
         state = motion[:3], motion[3:], np.zeros(4)
         discs = np.column_stack([rng.uniform(-0.9, 0.9, (6, 2)), np.full(6, 0.1)])
         control, brake = rng.uniform(-1.0, 1.0, 2), bool(i % 3)
-        numbers = among.closest_admitted(models, motion, discs, brake, control, 0.0, bool(i % 5), bounds, out)
+        numbers = among.closest_admitted(
+            models, motion, discs, brake, RESERVE_M, control, 0.0, bool(i % 5), bounds, out
+        )
         stages.add(numbers[0])
-        for part in (*numbers, out, *among.least_clearance(*state, models, np.empty(6), discs, brake)):
+        for part in (
+            *numbers,
+            out,
+            *among.least_clearance(*state, models, np.empty(6), discs, brake, RESERVE_M),
+        ):
             digest.update(np.asarray(part, dtype=np.float64).tobytes())
-        digest.update(np.float64(among.manoeuvre_drive(models, motion, discs, brake)).tobytes())
+        digest.update(np.float64(among.manoeuvre_drive(models, motion, discs, brake, RESERVE_M)).tobytes())
         for part in together([(models, motion, discs, brake, control, bool(i % 5))], bounds, single=True):
             digest.update(part.tobytes())
     return digest.hexdigest(), sorted(stages)
@@ -146,7 +153,7 @@ def random_scenes(count):
 
 def test_the_random_scenes_have_everything_in_them():
     _, stages = random_scenes(400)
-    assert {among.PROPOSAL, among.ROWS, among.CANDIDATE, among.UNRESOLVED} <= set(stages)
+    assert {among.PROPOSAL, among.ROWS, among.CANDIDATE, among.BACKUP, among.UNRESOLVED} <= set(stages)
 
 
 def test_a_quarter_of_a_refused_correction_is_tried_before_the_backup_alone():
@@ -154,7 +161,7 @@ def test_a_quarter_of_a_refused_correction_is_tried_before_the_backup_alone():
     models = np.array([env.filter.bound[0].drive._replace(uncertainty=0.0)] * 2, dtype=np.float64)
     motion, discs = np.array([0.05, -0.05, 0.24, 0.28, 0.28, 1.78]), np.array([[0.2, -0.01, 0.15]])
     bounds, found = np.array([[-1.0, -1.0], [1.0, 1.0], [-0.05, -1.0], [0.05, 1.0]]), np.empty(2)
-    coasting = models, motion, discs, False
+    coasting = models, motion, discs, False, RESERVE_M
     stage, *_ = among.closest_admitted(*coasting, np.array([1.0, -1.0]), 0.0, False, bounds, found)
     assert stage == among.BLEND and among.is_admitted(*coasting, *found)
     backup = np.array([among.manoeuvre_drive(*coasting), 0.0])
@@ -176,10 +183,10 @@ def test_many_are_decided_as_each_alone_and_rounded_as_the_filter_rounds(dtype):
     for i, (_, motion, discs, brake, control, detour) in enumerate(scenes):
         seen = np.empty(6)
         state = motion[:3], motion[3:], np.zeros(4)
-        assert least[i] == among.least_clearance(*state, models, seen, discs, brake)[0]
-        assert admitted[i] == among.is_admitted(models, motion, discs, brake, *control)
+        assert least[i] == among.least_clearance(*state, models, seen, discs, brake, RESERVE_M)[0]
+        assert admitted[i] == among.is_admitted(models, motion, discs, brake, RESERVE_M, *control)
         stage, _, *rows = among.closest_admitted(
-            models, motion, discs, brake, control, 0.0, detour, bounds, found
+            models, motion, discs, brake, RESERVE_M, control, 0.0, detour, bounds, found
         )
         assert stage == stages[i]
         if stage != among.PROPOSAL:

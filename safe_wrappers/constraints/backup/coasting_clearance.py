@@ -41,7 +41,7 @@ class CoastingClearance(Constraint):
     best.
 
     Proved, for obstacles that stand still, and as far as `margin` covers the forecast's error: from a state whose way
-    to rest is clear there is always an admissible control, and every physics substep is clear.
+    to rest is clear (`value` >= 0) there is always an admissible control, and every physics substep is clear.
 
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.
@@ -133,12 +133,17 @@ class BoundCoastingClearance(BoundDetourClearance):
         return Detour()
 
     def clearance(self) -> Array:
-        """Of the present place from the nearest disc, margin not taken off, m, shape (1,): not along the way."""
+        """On the way to rest without control, margin not taken off, m, shape (1,); minus infinity without rest.
+
+        Where nothing is forecast, a lower bound: the present clearance less the way that the speed may add.
+        """
         here = self.coasting.start()
         self._here, self._ahead = here.places[0], here.ahead[0]
-        way = math.inf
+        way, rolls = math.inf, 0.0
         if self.max_decrease is not None:
-            way = self.max_decrease + self.spec.max_decrease_per_speed * self.coasting.speed(self._radius)
+            added = self.spec.max_decrease_per_speed * self.coasting.speed(self._radius)
+            way = self.max_decrease + added
+            rolls = added if self.spec.max_decrease_per_speed else way
         room = self.spec.margin + way
         self._least = min(group.keep(self.plant, here, room) for group in (self._origin, self._body))
         self._within = way
@@ -150,7 +155,9 @@ class BoundCoastingClearance(BoundDetourClearance):
         still = seen.size and seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()
         if not still:
             self._seen, self._known = seen, {}
-        return np.array([self._least])
+        if self._origin.near or self._body.near:
+            return np.array([min(self._least, self._after(self._still).least)])
+        return np.array([self._least - rolls])
 
     def load(self, low: Array, high: Array) -> None:
         _ = self.plant.acting_range

@@ -63,20 +63,20 @@ class HeadingDriveBatch(ConstraintBatch):
         self, proposals: Array, judged: NDArray[np.bool_], controls: Array
     ) -> tuple[Array, NDArray[np.int64]]:
         self._observe()
-        n, brake = len(proposals), self._bound[0].spec.brake
-        scene = self._models, self._motions, self._discs, self._first, brake
-        least, admitted, stages = np.empty(n), np.empty(n, dtype=bool), np.zeros(n, dtype=np.int64)
+        n, one = len(proposals), self._bound[0]
+        scene = self._models, self._motions, self._discs, self._first, one.spec.brake, one.reserve
+        values, admitted, stages = np.empty(n), np.empty(n, dtype=bool), np.zeros(n, dtype=np.int64)
         pairs = np.ascontiguousarray(self._pairs(proposals))
-        among.admit_each(*scene, pairs, least, admitted)
+        among.admit_each(*scene, pairs, values, admitted)
         found, refused = pairs.copy(), np.flatnonzero(judged & ~admitted)
         sides = np.where(self._steps > 0, self._sides, 0.0)
         if refused.size or not self._loaded:  # the first step compiles what a later one would wait for
             self._loaded = True
-            bounds, detour = self._bounds(refused), self._bound[0].spec.detour
+            bounds, detour = self._bounds(refused), one.spec.detour
             among.decide_each(*scene, pairs, refused, sides, detour, bounds, self._single, found, stages)
         self._tried = np.where(judged & ~admitted, sides, 0.0)
         controls[judged] = self._pairs(found)[judged]
-        return least + self._bound[0].reserve, stages
+        return values, stages
 
     def executed(self, envs: NDArray[np.bool_]) -> None:
         detour = envs & (self._tried != 0.0)

@@ -29,13 +29,13 @@ class HeadingDriveClearance(Constraint):
 
     The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading only.
     The backup manoeuvre brakes along the heading and holds it; clearance is counted from the area that it sweeps
-    until rest (`control/backup/heading_drive.py`), and never shrinks under it. A control is admitted if one control
-    step of it uses up at most half of the clearance.
+    until rest (`control/backup/heading_drive.py`). A control is admitted if one control step of it uses up at most
+    half of the clearance; within 2 mm of a disc its physics steps, and the backup's until rest, are predicted too.
 
     Proved: from a safe state the backup is admissible, for any number of discs, and the discs stay clear at every
     physics substep, while mass and damping are right to within `uncertainty`, the measured position to within
-    `state_error`, discs stand still and nothing hits the robot. `margin` covers what the closed form leaves out,
-    under 2 mm for the Point robot.
+    `state_error`, discs stand still and nothing hits the robot. A motion that is faster than the actuators make it
+    is reported as unsafe.
 
     Args:
         obstacles: `Disc` and `Discs`; they stand still.
@@ -93,10 +93,10 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
 
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
-        self._scene = self.models, np.empty(6), self.discs(), self.spec.brake
+        self._scene = self.models, np.empty(6), self.discs(), self.spec.brake, self.reserve
         qpos, qvel, place = self.plant.qpos, self.plant.qvel, self.frame.place
-        least, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
-        return np.array([least + self.reserve])
+        value, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
+        return np.array([value])
 
     @property
     def reserve(self) -> float:
@@ -114,7 +114,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         return self._discs
 
     def nearest(self, neighbours: int) -> Array:
-        _, (x, y, heading, vx, vy, _), discs, _ = self._scene
+        _, (x, y, heading, vx, vy, _), discs, *_ = self._scene
         return nearest_discs(discs, x, y, heading, vx, vy, neighbours)
 
     def _pair(self, control: Array) -> Array:

@@ -15,6 +15,8 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
+_STILL_M = 1e-4  # what is at rest on springy contacts moves by less within a forecast
+
 
 @dataclass
 class Workspace(RolloutConstraint):
@@ -23,7 +25,8 @@ class Workspace(RolloutConstraint):
     Moving obstacles are taken where they are.
 
     Best effort: an executed control that is not flagged keeps the workspace at every physics substep of its step, for
-    a plant that is right. Near a singular pose, or under loads stronger than the actuators, a point can move on.
+    a plant that is right. Near a singular pose, under loads stronger than the actuators, or where the body pitches
+    after the joints have stopped, a point can move on after the forecast.
 
     Args:
         low: Smallest x, y, z, m; None is no bound, for all or for one: `[None, -0.5, None]`.
@@ -114,6 +117,13 @@ class BoundWorkspace(BoundRollout):
     def room(self, forecast: Forecast) -> Array:
         poses = forecast.poses()
         return self._left(self._points(poses.frames, poses.axes))
+
+    def keeps_limit(self, control: Array) -> bool:
+        if not 0.0 <= self._least < self.spec.margin:
+            return False
+        left = self.room(self.plant.forecast(control, self.spec.horizon)).min(axis=0)
+        kept = self._outside + self.spec.margin - _STILL_M
+        return bool((left >= np.maximum(kept, 0.0)).all())
 
     def draw(self) -> list[Mark]:
         """The points; the edges of the box in which they stay, or what is near of its planes; the obstacles."""

@@ -1,4 +1,10 @@
-"""A heading drive among discs: which controls leave its stopping path clear. The rules of `HeadingDriveClearance`."""
+"""A heading drive among discs: which controls leave its stopping path clear. The rules of `HeadingDriveClearance`.
+
+The closed form of the stopping path is off by a millimetre or two: under the backup manoeuvre its clearance may fall
+by that. So the manoeuvre is admitted for what it is and not for the clearance that it leaves; and within `CLOSE_M` of
+a disc the physics steps of a control, and of the manoeuvre after it until rest, are predicted one by one: where that
+way is clear, so is what is left of it at the next control step.
+"""
 
 import math
 from typing import Final, NamedTuple
@@ -10,7 +16,10 @@ from safe_wrappers.control.backup.heading_drive import (
     HeadingDrive,
     Motion,
     StoppingPath,
+    advance,
+    beyond_reach,
     brake_control,
+    com_speed,
     end_distance,
     path_distance,
     predict,
@@ -28,6 +37,12 @@ HAIR_M: Final = 1e-7
 """Between two discs at rest the rows of both meet at one control; this much slack lets a solver find it."""
 RESERVE_M: Final = 0.001
 """Kept free before the boundary for what the closed form leaves out; only the backup may use it."""
+CLOSE_M: Final = 0.002
+"""Clearance, margin not taken off, below which the closed form is not relied on."""
+SAME: Final = 1e-6
+"""Drives that differ by a smaller share of the full drive are the same: actions are rounded."""
+REST: Final = 16.0
+"""Time until rest, in time constants of the coasting: of 1 m, 0.1 um are left."""
 
 
 class Look(NamedTuple):
@@ -38,6 +53,10 @@ class Look(NamedTuple):
         path: From there, without any further control but the backup manoeuvre's.
         discs: Those that one hold can bring into play: x, y and the distance to keep, m, shape (k, 3).
         least: The least clearance of all discs, m; NaN if one is not a number.
+        value: The same, margin not taken off; at least 0 if the way until rest is clear, below 0 if it is not, and
+            beyond what the actuators reach.
+        safe: Whether the way of the backup manoeuvre until rest is clear, margin not taken off.
+        reserve: The margin, m.
         loss: The most that one hold can use up, m.
         swivel: Twice the distance of the centre of mass from the turning axis, m.
     """
@@ -46,6 +65,9 @@ class Look(NamedTuple):
     path: StoppingPath
     discs: Array
     least: float
+    value: float
+    safe: bool
+    reserve: float
     loss: float
     swivel: float
 
@@ -53,7 +75,9 @@ class Look(NamedTuple):
 @compiled
 def _body(constants: Array) -> HeadingDrive:
     c = constants
-    return HeadingDrive(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], int(c[11]), c[12])
+    return HeadingDrive(
+        c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], int(c[11]), c[12], c[13]
+    )
 
 
 @compiled
@@ -64,16 +88,63 @@ def _to_disc(path: StoppingPath, swivel: float, x: float, y: float, room: float)
 
 
 @compiled
-def look(constants: Array, motion: Array, discs: Array, brake: bool) -> Look:
+def _ends(body: HeadingDrive, m: Motion, brake: bool) -> tuple[float, float]:
+    """The drive controls that brake and that push on, as far as the drive acts."""
+    ahead = m.vx * math.cos(m.heading) + m.vy * math.sin(m.heading)
+    full = body.drive_limit / body.drive_gain
+    return brake_control(body, ahead) if brake else 0.0, math.copysign(full, ahead)
+
+
+@compiled
+def _least_on_the_way(
+    body: HeadingDrive,
+    truth: HeadingDrive,
+    start: Motion,
+    drive: float,
+    turn: float,
+    brake: bool,
+    discs: Array,
+    reserve: float,
+) -> float:
+    """The least clearance, margin not taken off, m, of a held control and then of the backup until rest.
+
+    Of all physics steps, the present place included, until a disc is touched or none is within reach any more.
+    """
+    motion, least, near = start, math.inf, math.inf
+    for i in range(len(discs)):
+        least = min(least, hypot(discs[i, 0] - start.x, discs[i, 1] - start.y) - discs[i, 2] + reserve)
+    control_dt = truth.timestep * truth.substeps
+    coast, ahead, around = truth.mass / truth.damping, drive, turn
+    for _ in range(int(REST * coast / control_dt) + 1):
+        if least < -HAIR_M:
+            return least
+        for _ in range(truth.substeps):
+            motion = advance(truth, motion, ahead, around, 1)
+            near = math.inf
+            for i in range(len(discs)):
+                gap = hypot(discs[i, 0] - motion.x, discs[i, 1] - motion.y) - discs[i, 2] + reserve
+                near = min(near, gap)
+            least = min(least, near)
+        # The axis circles about the centre of mass, which coasts.
+        if near > 2.0 * (coast * com_speed(truth, motion) + abs(truth.com_offset)):
+            break
+        forward = motion.vx * math.cos(motion.heading) + motion.vy * math.sin(motion.heading)
+        ahead, around = brake_control(body, forward) if brake else 0.0, 0.0
+    return least
+
+
+@compiled
+def look(models: Array, motion: Array, discs: Array, brake: bool, reserve: float) -> Look:
     """Judge the present state.
 
     Args:
-        constants: Of a `HeadingDrive`, shape (13,).
+        models: Constants of the body, then of each corner of its uncertainty, shape (1 + c, 14).
         motion: As `Motion`, shape (6,).
-        discs: x, y and the distance to keep from there, m, shape (n, 3).
+        discs: x, y and the distance to keep from there, margin in it, m, shape (n, 3).
         brake: Whether the backup manoeuvre brakes along the heading.
+        reserve: The margin, m.
     """
-    body = _body(constants)
+    body = _body(models[0])
     now = Motion(motion[0], motion[1], motion[2], motion[3], motion[4], motion[5])
     path = stopping_path(body, now, brake)
     swivel = 2.0 * abs(body.com_offset)
@@ -88,7 +159,7 @@ def look(constants: Array, motion: Array, discs: Array, brake: bool) -> Look:
     for i in range(n):
         bound = hypot(discs[i, 0] - now.x, discs[i, 1] - now.y) - discs[i, 2] - kept
         if bound != bound:
-            return Look(now, path, order[:0], math.nan, loss, swivel)
+            return Look(now, path, order[:0], math.nan, math.nan, False, reserve, loss, swivel)
         place = i
         while place > 0 and bounds[place - 1] > bound:
             bounds[place] = bounds[place - 1]
@@ -107,7 +178,18 @@ def look(constants: Array, motion: Array, discs: Array, brake: bool) -> Look:
     if best < cutoff:
         while close < n and bounds[close] < cutoff:
             close += 1
-    return Look(now, path, order[:close], best, loss, swivel)
+    value, exact = best + reserve, math.inf
+    if value < CLOSE_M:
+        braking = _ends(body, now, brake)[0]
+        for i in range(1, len(models)):
+            truth = _body(models[i])
+            least = _least_on_the_way(body, truth, now, braking, 0.0, brake, order, reserve)
+            exact = min(exact, least)
+    safe, beyond = exact >= -HAIR_M, beyond_reach(body, now)
+    value = max(value, 0.0) if safe else min(value, exact)
+    if beyond > 0.0:
+        value = min(value, -beyond * loss)
+    return Look(now, path, order[:close], best, value, safe, reserve, loss, swivel)
 
 
 @compiled
@@ -135,15 +217,6 @@ def _least_after(models: Array, at: Look, drive: float, brake: bool) -> float:
 
 
 @compiled
-def _ends(body: HeadingDrive, at: Look, brake: bool) -> tuple[float, float]:
-    """The drive controls that brake and that push on, as far as the drive acts."""
-    m = at.motion
-    ahead = m.vx * math.cos(m.heading) + m.vy * math.sin(m.heading)
-    full = body.drive_limit / body.drive_gain
-    return brake_control(body, ahead) if brake else 0.0, math.copysign(full, ahead)
-
-
-@compiled
 def _needed(at: Look, i: int, backup: StoppingPath) -> float:
     """The clearance that a control must leave of a disc, from inside the safe set: a share of today's."""
     x, y, room = at.discs[i, 0], at.discs[i, 1], at.discs[i, 2]
@@ -154,22 +227,53 @@ def _needed(at: Look, i: int, backup: StoppingPath) -> float:
 
 
 @compiled
-def _needed_outside(models: Array, at: Look, backup: StoppingPath, brake: bool) -> float:
-    """The least clearance of all discs that a control must leave, once one of them is lost."""
+def _recovery(models: Array, at: Look, brake: bool) -> tuple[float, float]:
+    """From outside: the drive control that recovers best, and the least clearance of all discs that it leaves, m."""
     body = _body(models[0])
+    drive = _ends(body, at.motion, brake)[0]
     full = body.drive_limit / body.drive_gain
+    best = _least_after(models, at, drive, brake)
+    for other in (full, -full):
+        left = _least_after(models, at, other, brake)
+        if left > best:
+            drive, best = other, left
+    return drive, best
+
+
+@compiled
+def _aim(body: HeadingDrive, at: Look, best: float) -> float:
+    """From outside: the clearance to aim at, m, where the best drive control leaves `best`."""
     # As much recovery as the drive can give here: across the heading it can give none.
-    best = max(_least_after(models, at, full, brake), _least_after(models, at, -full, brake))
-    best = max(best, _least_of(backup, at))
     return min(at.least * (1.0 - RECOVERY_RATE * body.timestep * body.substeps), best)
+
+
+@compiled
+def _needed_outside(body: HeadingDrive, at: Look, best: float) -> float:
+    """The least clearance of all discs that a control must leave, once one of them is lost."""
+    return 0.25 * _aim(body, at, best) + 0.75 * at.least  # a quarter of what the rows aim at will do
+
+
+@compiled
+def _keeps_clear(models: Array, at: Look, least: float, drive: float, turn: float, brake: bool) -> bool:
+    """Whether a control that leaves this clearance leads, step by step, to rest without touching a disc."""
+    if not at.safe or min(at.value, least + at.reserve) >= CLOSE_M:
+        return True  # an unsafe state promises nothing; elsewhere the closed form says it
+    body = _body(models[0])
+    for i in range(1, len(models)):
+        truth, start = _body(models[i]), at.motion
+        if _least_on_the_way(body, truth, start, drive, turn, brake, at.discs, at.reserve) < HAIR_M:
+            return False
+    return True
 
 
 @compiled
 def admits(models: Array, at: Look, drive: float, turn: float, brake: bool) -> bool:
     """Whether the end of a held control still has a safe stopping path, for every model of the uncertainty.
 
+    From a safe state the backup manoeuvre itself is always admitted.
+
     Args:
-        models: Constants of the body, then of each corner of its uncertainty, shape (1 + c, 13).
+        models: As for `look`.
         at: The present state.
         drive: Control along the heading.
         turn: Control about the axis.
@@ -178,19 +282,33 @@ def admits(models: Array, at: Look, drive: float, turn: float, brake: bool) -> b
     if not len(at.discs):
         return True
     body = _body(models[0])
-    braking = _ends(body, at, brake)[0]
+    outside, needed, least, refused = at.least < 0.0, 0.0, math.inf, False
+    braking = _ends(body, at.motion, brake)[0]
+    if outside:
+        best = _recovery(models, at, brake)[1]
+        needed = _needed_outside(body, at, best)
     for i in range(1, len(models)):
+        if refused:
+            break
         path = _after(models[i], body, at, drive, turn, brake)
-        backup = _after(models[i], body, at, braking, 0.0, brake)
-        if at.least < 0.0:  # recovering: a quarter of what the rows aim at will do
-            if _least_of(path, at) < 0.25 * _needed_outside(models, at, backup, brake) + 0.75 * at.least:
-                return False
-            continue
-        for j in range(len(at.discs)):
-            left = _to_disc(path, at.swivel, at.discs[j, 0], at.discs[j, 1], at.discs[j, 2])
-            if left < at.loss and left < _needed(at, j, backup) * (1.0 - ROW_SLACK):
-                return False
-    return True
+        if outside:
+            least = min(least, _least_of(path, at))
+            refused = least < needed
+        else:
+            backup = _after(models[i], body, at, braking, 0.0, brake)
+            for j in range(len(at.discs)):
+                left = _to_disc(path, at.swivel, at.discs[j, 0], at.discs[j, 1], at.discs[j, 2])
+                least = min(least, left)
+                if left < at.loss and left < _needed(at, j, backup) * (1.0 - ROW_SLACK):
+                    refused = True
+                    break
+    if not refused and _keeps_clear(models, at, least, drive, turn, brake):
+        return True
+    if not at.safe or turn != 0.0:
+        return False
+    full = body.drive_limit / body.drive_gain
+    acting = max(-full, min(drive, full))
+    return abs(acting - backup_drive(models, at, brake)) <= SAME * full
 
 
 @compiled
@@ -206,7 +324,11 @@ def rows(models: Array, at: Look, brake: bool) -> tuple[Array, Array]:
     if near == 0:
         return normals[:0], offsets[:0]
     body = _body(models[0])
-    braking, pushing = _ends(body, at, brake)
+    braking, pushing = _ends(body, at.motion, brake)
+    aim = 0.0
+    if outside:
+        best = _recovery(models, at, brake)[1]
+        aim = _aim(body, at, best)
     for i in range(1, len(models)):
         base = _after(models[i], body, at, braking, 0.0, brake)
         pushed = _after(models[i], body, at, pushing, 0.0, brake)
@@ -214,7 +336,7 @@ def rows(models: Array, at: Look, brake: bool) -> tuple[Array, Array]:
         right = _after(models[i], body, at, braking, -1.0, brake)
         for j in range(each):
             if outside:
-                needed = _needed_outside(models, at, base, brake)
+                needed = aim
                 at_brake, by_push = _least_of(base, at), _least_of(pushed, at)
                 by_left, by_right = _least_of(left, at), _least_of(right, at)
             else:
@@ -267,14 +389,12 @@ def passing_side(models: Array, at: Look, drive: float, turn: float, brake: bool
 
 @compiled
 def backup_drive(models: Array, at: Look, brake: bool) -> float:
-    """The drive control of the backup manoeuvre; from inside a disc the one that leads out best."""
+    """The drive control of the backup manoeuvre; from inside a disc, or its margin, the one that leads out best."""
     body = _body(models[0])
-    best = _ends(body, at, brake)[0]
-    if at.least < 0.0:
-        full = body.drive_limit / body.drive_gain
-        most = _least_after(models, at, best, brake)
-        for other in (full, -full):
-            left = _least_after(models, at, other, brake)
-            if left > most:
-                best, most = other, left
-    return best
+    braking = _ends(body, at.motion, brake)[0]
+    if not at.least < 0.0:
+        return braking
+    drive, best = _recovery(models, at, brake)
+    if at.safe and best < _needed_outside(body, at, best):
+        return braking
+    return drive if _keeps_clear(models, at, best, drive, 0.0, brake) else braking

@@ -136,9 +136,16 @@ def _decide(
 
 @compiled
 def least_clearance(
-    qpos: Array, qvel: Array, place: Array, models: Array, motion: Array, discs: Array, brake: bool
+    qpos: Array,
+    qvel: Array,
+    place: Array,
+    models: Array,
+    motion: Array,
+    discs: Array,
+    brake: bool,
+    reserve: float,
 ) -> tuple[float, int]:
-    """The stopping path's least clearance of all discs, m (NaN if one is not a number), and how many are in play.
+    """`Look.value`, m (NaN if a disc is not a number), and how many discs are in play.
 
     Writes the `motion`, shape (6,): `place` has the indices of the first of its joints in qpos and qvel, and the
     body's place at qpos = 0, m.
@@ -147,34 +154,43 @@ def least_clearance(
         motion[i], motion[3 + i] = qpos[int(place[0]) + i], qvel[int(place[1]) + i]
     motion[0] += place[2]
     motion[1] += place[3]
-    at = look(models[0], motion, discs, brake)
-    return at.least, len(at.discs)
+    at = look(models, motion, discs, brake, reserve)
+    return at.value, len(at.discs)
 
 
 @compiled
-def is_admitted(models: Array, motion: Array, discs: Array, brake: bool, drive: float, turn: float) -> bool:
+def is_admitted(
+    models: Array, motion: Array, discs: Array, brake: bool, reserve: float, drive: float, turn: float
+) -> bool:
     """Whether the end of a held control still has a safe stopping path."""
-    return admits(models, look(models[0], motion, discs, brake), drive, turn, brake)
+    return admits(models, look(models, motion, discs, brake, reserve), drive, turn, brake)
 
 
 @compiled
-def secants(models: Array, motion: Array, discs: Array, brake: bool) -> tuple[Array, Array]:
+def secants(models: Array, motion: Array, discs: Array, brake: bool, reserve: float) -> tuple[Array, Array]:
     """Half-spaces of (drive, turn) that keep the clearance, about: shapes (k, 2) and (k,)."""
-    return rows(models, look(models[0], motion, discs, brake), brake)
+    return rows(models, look(models, motion, discs, brake, reserve), brake)
 
 
 @compiled
 def way_around(
-    models: Array, motion: Array, discs: Array, brake: bool, drive: float, turn: float, side: float
+    models: Array,
+    motion: Array,
+    discs: Array,
+    brake: bool,
+    reserve: float,
+    drive: float,
+    turn: float,
+    side: float,
 ) -> float:
     """1 (left), -1 (right), or 0 with nothing to go around; `side` is that of a detour that goes on, or 0."""
-    return passing_side(models, look(models[0], motion, discs, brake), drive, turn, brake, side)
+    return passing_side(models, look(models, motion, discs, brake, reserve), drive, turn, brake, side)
 
 
 @compiled
-def manoeuvre_drive(models: Array, motion: Array, discs: Array, brake: bool) -> float:
+def manoeuvre_drive(models: Array, motion: Array, discs: Array, brake: bool, reserve: float) -> float:
     """The drive control of the backup manoeuvre."""
-    return backup_drive(models, look(models[0], motion, discs, brake), brake)
+    return backup_drive(models, look(models, motion, discs, brake, reserve), brake)
 
 
 @compiled
@@ -183,6 +199,7 @@ def closest_admitted(
     motion: Array,
     discs: Array,
     brake: bool,
+    reserve: float,
     proposal: Array,
     side: float,
     detour: bool,
@@ -190,7 +207,7 @@ def closest_admitted(
     out: Array,
 ) -> tuple[int, float, Array, Array]:
     """`_decide` from the present state."""
-    at = look(models[0], motion, discs, brake)
+    at = look(models, motion, discs, brake, reserve)
     return _decide(models, at, proposal, side, brake, detour, bounds, out)
 
 
@@ -233,25 +250,27 @@ def admit_each(
     discs: Array,
     first: NDArray[np.int64],
     brake: bool,
+    reserve: float,
     proposals: Array,
-    least: Array,
+    values: Array,
     admitted: NDArray[np.bool_],
 ) -> None:
     """Judges n robots.
 
     Args:
-        models: As for one, of each, shape (n, 1 + c, 13).
+        models: As for one, of each, shape (n, 1 + c, 14).
         motions: Likewise, shape (n, 6).
         discs: All robots' discs, one after the other, shape (d, 3).
         first: Where each robot's discs begin, and the end, shape (n + 1,).
         brake: Whether the backup manoeuvre brakes along the heading.
+        reserve: The margin, m.
         proposals: (drive, turn), shape (n, 2).
-        least: Written: the least clearance of each, m, shape (n,), NaN if one is not a number.
+        values: Written: as of `least_clearance`, m, shape (n,).
         admitted: Written: whether its proposal is admitted, shape (n,).
     """
     for i in range(len(motions)):
-        at = look(models[i, 0], motions[i], discs[first[i] : first[i + 1]], brake)
-        least[i] = at.least
+        at = look(models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve)
+        values[i] = at.value
         admitted[i] = admits(models[i], at, proposals[i, 0], proposals[i, 1], brake)
 
 
@@ -262,6 +281,7 @@ def decide_each(
     discs: Array,
     first: NDArray[np.int64],
     brake: bool,
+    reserve: float,
     proposals: Array,
     chosen: NDArray[np.int64],
     sides: Array,
@@ -279,7 +299,7 @@ def decide_each(
     """
     for r in range(len(chosen)):
         i = chosen[r]
-        at = look(models[i, 0], motions[i], discs[first[i] : first[i + 1]], brake)
+        at = look(models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve)
         stage, side, normals, offsets = _decide(
             models[i], at, proposals[i], sides[i], brake, detour, bounds[r], out[i]
         )

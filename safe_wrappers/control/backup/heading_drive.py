@@ -130,6 +130,7 @@ class HeadingDrive(NamedTuple):
         timestep: Physics step, s.
         substeps: Physics steps per control step.
         uncertainty: Relative uncertainty of mass and damping each, in [0, 1).
+        top_yaw_rate: The most that the actuators reach from rest, rad/s.
     """
 
     mass: float
@@ -145,6 +146,7 @@ class HeadingDrive(NamedTuple):
     timestep: float
     substeps: int
     uncertainty: float = 0.0
+    top_yaw_rate: float = math.inf
 
     def corners(self) -> "list[HeadingDrive]":
         """The bodies at the corners of the uncertainty, each without uncertainty; this one if there is none."""
@@ -237,8 +239,27 @@ def stopping_path(body: HeadingDrive, motion: Motion, brake: bool) -> StoppingPa
 
 
 @compiled
-def predict(body: HeadingDrive, motion: Motion, drive: float, turn: float) -> Motion:
-    """Motion after both controls were held for one control step, by semi-implicit Euler steps as in MuJoCo."""
+def com_speed(body: HeadingDrive, motion: Motion) -> float:
+    """Speed of the centre of mass, m/s."""
+    swing = body.com_offset * motion.yaw_rate
+    return hypot(motion.vx - swing * math.sin(motion.heading), motion.vy + swing * math.cos(motion.heading))
+
+
+@compiled
+def beyond_reach(body: HeadingDrive, motion: Motion) -> float:
+    """The share by which a motion is faster than the actuators make it from rest; at most 0 for what they reach.
+
+    The force on the centre of mass is the drive less the damping of the axis, which swings about it: its speed stays
+    below `F_max / c + r w`. The damping's torque about the axis bounds the yaw rate w: see `top_yaw_rate`.
+    """
+    slow = body.damping * (1.0 - body.uncertainty)
+    top = body.drive_limit / slow + abs(body.com_offset) * body.top_yaw_rate
+    return max(com_speed(body, motion) / top, abs(motion.yaw_rate) / body.top_yaw_rate) - 1.0
+
+
+@compiled
+def advance(body: HeadingDrive, motion: Motion, drive: float, turn: float, substeps: int) -> Motion:
+    """Motion after so many physics steps of both controls."""
     x, y, heading, vx, vy, yaw_rate = motion
     h, r, m = body.timestep, body.com_offset, body.mass
     push = max(-body.drive_limit, min(body.drive_gain * drive, body.drive_limit))
@@ -247,7 +268,7 @@ def predict(body: HeadingDrive, motion: Motion, drive: float, turn: float) -> Mo
     scale = h / (m_l * m_w - m_c * m_c)
     limit, damping, yaw_damping = body.yaw_limit, body.damping, body.yaw_damping
     wanted, feedback = body.yaw_gain * turn, body.yaw_feedback
-    for _ in range(body.substeps):
+    for _ in range(substeps):
         cos, sin = math.cos(heading), math.sin(heading)
         ahead, aside = vx * cos + vy * sin, vy * cos - vx * sin
         torque = max(-limit, min(wanted + feedback * yaw_rate, limit)) - yaw_damping * yaw_rate
@@ -261,3 +282,9 @@ def predict(body: HeadingDrive, motion: Motion, drive: float, turn: float) -> Mo
         y += h * vy
         heading += h * yaw_rate
     return Motion(x, y, heading, vx, vy, yaw_rate)
+
+
+@compiled
+def predict(body: HeadingDrive, motion: Motion, drive: float, turn: float) -> Motion:
+    """Motion after both controls were held for one control step, by semi-implicit Euler steps as in MuJoCo."""
+    return advance(body, motion, drive, turn, body.substeps)
