@@ -194,7 +194,7 @@ def test_what_the_page_says(report):
         "The same episode, filter off and on",
         "policies of training seed 0: ",
         "unfiltered, filter off",
-        "changed; shown 2.0 times slower than real.",
+        "changed. Shown 2.0 times slower than real.",
         "filtered, filter on, from above",
         "“unfiltered”: putting the filter on took the cost",
         "How large the corrections were",
