@@ -25,7 +25,7 @@ LAYERS = {
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
-COMMON = {"checks", "errors", "info"}
+COMMON = {"arguments", "checks", "errors", "info"}
 """Single modules at the top that every layer may use; `protect` and the package itself are the top."""
 BELOW_WRAPPERS = {"control", "plants", "drawing", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
@@ -38,7 +38,7 @@ MAY_USE = {
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
     "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
     "envs": {"control", "constraints", "envs", *COMMON},
-    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "", *BELOW_WRAPPERS},
+    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "by_hand", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {
@@ -138,7 +138,12 @@ def test_the_parser_sees_what_it_should(tmp_path):
     found = imports(path, "safe_wrappers.control")
     assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
     assert layers_used("control", LAYERS["control"] / "watchdog" / "leases.py") == {"checks", "errors"}
-    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {"checks", "errors", "plants"}
+    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {
+        "arguments",
+        "checks",
+        "errors",
+        "plants",
+    }
 
 
 def test_control_runs_without_gymnasium_and_mujoco():

@@ -60,7 +60,8 @@ class BoundSlacks(BoundConstraint):
         return least if least == least else -np.inf
 
     def load(self, low: Array, high: Array) -> None:
-        self.slacks(np.clip(np.zeros(low.size), low, high))
+        if self.value().size:
+            self.slacks(np.clip(np.zeros(low.size), low, high))
 
     def linearize(self, control: Array) -> HalfSpaces:
         return linearize(self.slacks, control, self.plant.lower, self.plant.upper)

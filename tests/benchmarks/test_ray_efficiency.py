@@ -42,12 +42,12 @@ def test_every_way_has_the_same_four_runs(monkeypatch, tmp_path):
     monkeypatch.setattr(measured, "one_after_another", alone)
     monkeypatch.setattr(measured, "nodes", Nodes)
     monkeypatch.setattr(measured, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    rows = measured.measure(512)
+    rows = measured.measure(1024)
     assert list(ran) == [measured.ALONE, measured.LOCAL, "cluster", measured.RAY]
     assert [(row.cpus, row.seconds, row.start_s) for row in rows] == [(1, 40, 0), (2, 25, 0), (2, 30, 5)]
     work = [ran[way] for way in (measured.ALONE, measured.LOCAL, measured.RAY)]
     assert [[(job.name, job.total) for job in each] for each in work] == 3 * [
-        [(f"training filtered seed {seed}", 512) for seed in range(4)]
+        [(f"training filtered seed {seed}", 1024) for seed in range(4)]
     ]
     assert len({job.arguments[2] for each in work for job in each}) == 12
 

@@ -20,11 +20,10 @@ def of(marks, role, shape=None):
     return [m for m in marks if m.role == role and shape in (None, m.shape)]
 
 
-def rods(marks):
-    """Both ends of every rod."""
-    return np.array(
-        [[m.position - m.size[1] * m.axes[:, 2], m.position + m.size[1] * m.axes[:, 2]] for m in marks]
-    )
+def rods(marks, along=1):
+    """Both ends of every rod; the size along it."""
+    ends = [(m.position, m.size[along] * m.axes[:, 2]) for m in marks]
+    return np.array([[middle - half, middle + half] for middle, half in ends])
 
 
 def test_a_constraint_draws_nothing_unless_it_says_so():
@@ -42,7 +41,7 @@ def test_heading_drive_rings_every_disc_and_shows_where_braking_ends(uncertainty
     for _ in range(20):
         env.step(np.array([1.0, 0.0], np.float32))
     (marks,) = looked(env)
-    limits = rods(of(marks, "limit"))[:, 0, :2].reshape(len(task.hazard_positions), -1, 2)
+    limits = rods(of(marks, "limit"), along=2)[:, 0, :2].reshape(len(task.hazard_positions), -1, 2)
     np.testing.assert_allclose(limits.mean(axis=1), task.hazard_positions, atol=1e-9)
     radii = np.linalg.norm(limits - task.hazard_positions[:, None], axis=2)
     np.testing.assert_allclose(radii, 0.25)

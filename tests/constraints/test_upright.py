@@ -166,7 +166,11 @@ def test_a_fall_that_nothing_stops_is_infeasible():
             ConfigurationError,
             "margin must be a finite number >= 0 in m or rad",
         ),
-        ({"body": "head", "tilt": 1.0}, UnknownNameError, "no body 'head'; it has: world, torso"),
+        (
+            {"body": "head", "tilt": 1.0},
+            UnknownNameError,
+            "no body 'head'; give another by body=; it has: world, torso",
+        ),
     ],
 )
 def test_nonsense_is_refused(arguments, error, message):

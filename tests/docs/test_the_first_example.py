@@ -23,7 +23,7 @@ DRIVERS = {
 
 
 def of_page(page):
-    return PAGES["run"](page, until="slow")
+    return PAGES["run"](page, until="plant")
 
 
 def of_docstring():

@@ -127,7 +127,7 @@ def test_bad_input_is_refused():
     with pytest.raises(ConfigurationError, match="no zero"):
         grid(fallback="zero")
     with pytest.raises(
-        ConfigurationError, match=r"the backup must be a finite action of Discrete\(4\), got 4"
+        ConfigurationError, match=r"the backup must be a finite action of Discrete\(4\), got \[4\]"
     ):
         sw.ActionShield(Grid(), [PredictiveShield("cost", 2, backup=4)])
     env = grid()

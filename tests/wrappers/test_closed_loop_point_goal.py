@@ -238,7 +238,7 @@ DISCS = [sw.constraints.Discs("hazard_positions", 0.2)]
         ({"uncertainty": -0.1}, "uncertainty must be a finite number >= 0"),
         ({"uncertainty": 1.0}, r"uncertainty is a fraction in \[0, 1\), got 1.0"),
         ({"uncertainty": np.nan}, "uncertainty must be a finite number"),
-        ({"body": "agnet"}, "no body 'agnet'; it has: .*agent"),
+        ({"body": "agnet"}, "no body 'agnet'; give another by body=; it has: .*agent"),
     ],
 )
 def test_constructor_refuses_nonsense(arguments, message):

@@ -257,7 +257,7 @@ def test_file_gains_one_row_per_episode(tmp_path: Path):
     assert first["correction_mean"] == second["correction_mean"] == 0.5
     assert first["success"] == 1.0
     # A task without wheels, cars and tracks, no StuckEscape: empty cells, which do not come back.
-    assert set(first) == set(COLUMNS) - {"stuck", "spin_outs", "collisions", "seen", "expiries"}
+    assert set(first) == set(COLUMNS) - {"stuck", "mismatch", "spin_outs", "collisions", "seen", "expiries"}
 
 
 def test_spin_outs_are_counted_where_the_task_reports_them(tmp_path: Path):
