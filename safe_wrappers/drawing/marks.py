@@ -77,7 +77,7 @@ def ring(role: Role, center: ArrayLike, radius: float) -> list[Mark]:
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     corners = [spatial(point) for point in spatial(center)[:2] + radius * around]
     return [
-        _mark("box", role, (a + b) / 2.0, [THIN, THIN, np.linalg.norm(b - a) / 2.0], _frame(b - a))
+        _mark("box", role, (a + b) / 2.0, [THIN, THIN, float(np.linalg.norm(b - a)) / 2.0], _frame(b - a))
         for a, b in pairwise(corners)
     ]
 
