@@ -245,8 +245,8 @@ def caption(counts: dict[str, Any]) -> str:
         " 0, 1 and 2, at double speed. An amber ring marks an action that the filter changed. Over whole episodes of"
         f" seeds 0 to {free['episodes'] - 1} the left one returns {returned['unfiltered']:.1f} and is in a hazard in"
         f" {free['violations']:,} of {free['steps']:,} steps; the right one returns {returned['filtered']:.1f}"
-        f" ({returned['filtered'] / returned['unfiltered']:.0%}) and is {hurt}; {safe['changed'] / safe['steps']:.0%}"
-        " of its actions are changed"
+        f" ({100 * returned['filtered'] / returned['unfiltered']:.0f} %) and is {hurt};"
+        f" {100 * safe['changed'] / safe['steps']:.0f} % of its actions are changed"
     )
 
 

@@ -15,7 +15,7 @@ from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 
 class AdaptionPenalty(LayerWrapper):
-    """Takes a penalty off the reward at every step at which the filter changed the action.
+    """Takes a penalty off the reward at every step at which the filter changed the action, or an escape replaced it.
 
     The learner keeps its own action a, and its reward is r(s, a_safe) less a function of the correction
     c = |a_safe - a| (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023), the sum of
