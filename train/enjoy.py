@@ -63,7 +63,7 @@ def enjoy_command(
     for name in ("none", "trained" if own else "protect") if both else (action_filter,):
         figures = _drive(trained, name, episodes, window, None if both else say)
         on = name == "protect" or (name == "trained" and own)
-        say(f"filter {'on' if on else 'off'}, {episodes} episodes: {_mean(figures)}")
+        say(f"{trained.arm.name}, filter {'on' if on else 'off'}, {episodes} episodes: {_mean(figures)}")
         if film is not None and (on == own or not both):
             returns = {seed: episode["return"] for seed, episode in enumerate(figures)}
             say(_film(trained, name, returns, film))

@@ -34,7 +34,7 @@ def test_its_caption_has_the_numbers_that_were_counted(page):
 
 
 def test_both_sides_meet_the_same_episodes_and_only_one_is_filtered(monkeypatch):
-    monkeypatch.setattr(moving_picture, "COUNTED", range(1))
+    monkeypatch.setattr(moving_picture, "COUNTED", range(1, 2))
     counts = moving_picture.whole_episodes()
     alone, filtered = counts["unfiltered"], counts["filtered"]
     assert alone["steps"] == filtered["steps"] == 1000

@@ -34,7 +34,10 @@ def test_it_prints_a_line_per_episode(run, capsys):
         lines[0] == f"{run}: PPO on fake_task:FilmedGoal-v0, trained for 128 control steps through the filter"
     )
     assert [re.fullmatch(LINE + r", [\d.]+ % changed", line)[1] for line in lines[1:4]] == ["0", "1", "2"]
-    assert lines[4].startswith("filter on, 3 episodes: return ") and " of 60 steps in violation, " in lines[4]
+    assert (
+        lines[4].startswith("filtered, filter on, 3 episodes: return ")
+        and " of 60 steps in violation, " in lines[4]
+    )
     assert main(["enjoy", str(run), "--episodes", "1", "--filter", "none"]) == 0
     _, line, _ = capsys.readouterr().out.splitlines()
     assert re.fullmatch(LINE, line), "without a filter nothing is changed, and nothing is said of it"
@@ -55,8 +58,8 @@ def test_both_drives_without_the_filter_and_with_it_and_films_what_was_trained(r
     film = tmp_path / "film.webp"
     assert main(["enjoy", str(run), "--episodes", "2", "--filter", "both", "--output", str(film)]) == 0
     _, off, on, last = capsys.readouterr().out.splitlines()
-    assert off.startswith("filter off, 2 episodes: return ") and "changed" not in off
-    assert on.startswith("filter on, 2 episodes: return ") and on.endswith("% changed")
+    assert off.startswith("filtered, filter off, 2 episodes: return ") and "changed" not in off
+    assert on.startswith("filtered, filter on, 2 episodes: return ") and on.endswith("% changed")
     assert last.startswith(f"Film: {film}") and film.exists()
 
 

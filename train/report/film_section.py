@@ -59,9 +59,8 @@ def _film(arm: ArmConfig, words: str, video: Video) -> str:
 
 
 def _episode(episode: Filmed) -> str:
-    hurt = "" if episode.violations is None else f"{episode.violations:,} in violation, "
     title = episode.title[:1].upper() + episode.title[1:]
-    return f"{title}: of {episode.steps:,} steps {hurt}{episode.changed:,} changed."
+    return f"{title}; of {episode.steps:,} steps {episode.changed:,} changed."
 
 
 def _speed(times: float) -> str:

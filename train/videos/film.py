@@ -136,7 +136,8 @@ def _film_episode(policy: TrainedPolicy, env: gym.Env[Any, Any], title: str, see
         film.add_step(bool(info.get(keys.CBF_INTERVENED, False)), is_violation(info))
         done = terminated or truncated
     film.figures = info[keys.EPISODE_SUMMARY]
-    film.title = f"{title}: episode {seed}, return {film.figures['return']:.1f}"
+    hurt = f", {film.figures['violations']:,} in violation" if "violations" in film.figures else ""
+    film.title = f"{title}: episode {seed}, return {film.figures['return']:.1f}{hurt}"
     return film
 
 

@@ -22,7 +22,7 @@ from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import track_film
 from ..run.training import finished_checkpoint
-from .film import Film, film_episodes, for_film
+from .film import film_episodes, for_film
 from .rendering import find_rendering
 
 _PROBLEM: Final = "problem.json"
@@ -35,8 +35,6 @@ class Filmed:
     title: str
     steps: int
     changed: int
-    violations: int | None
-    """None for a task that reports no cost."""
 
 
 @dataclass(frozen=True)
@@ -176,15 +174,11 @@ def record_video(
     facts = {
         "state": _state(arm, used, shown, checkpoint.timesteps),
         "speed": speed,
-        "episodes": [asdict(_said_of(film)) for film in films],
+        "episodes": [asdict(Filmed(film.title, len(film.changed), sum(film.changed))) for film in films],
         "files": checksums([path]),
     }
     write_json(path.with_suffix(".json"), facts)
     progress.steps(1)
-
-
-def _said_of(film: Film) -> Filmed:
-    return Filmed(film.title, len(film.changed), sum(film.changed), film.figures.get("violations"))
 
 
 def _state(arm: ArmConfig, used: FilterConfig, shown: ShownEpisode, timesteps: int) -> dict[str, Any]:
