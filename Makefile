@@ -28,7 +28,7 @@ demo: .venv/installed
 		$(ENJOY)filtered $(ALL)filtered.webp; filtered=$$?; wait $$unfiltered && exit $$filtered
 	@echo "2 of 2: two policies that are trained here, for two minutes each, then evaluated over 20 episodes:"
 	@$(BIN)/safe-wrappers compare configs/demo.yaml --report
-	@echo "This verdict is of the policies that were trained here; those of an hour's training are at the top."
+	@echo "This verdict is of the policies that were trained here; those of 1,000,000 control steps are at the top."
 
 # The order of files is that of tests/conftest.py.
 PARALLEL = -n 2 --dist loadfile --no-loadscope-reorder

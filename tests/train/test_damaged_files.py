@@ -155,7 +155,7 @@ def test_a_damaged_film_is_not_shown(tmp_path):
 
     path = tmp_path / "a_filter_on.webp"
     path.write_bytes(b"frames")
-    shown = {"title": "typical", "steps": 1, "changed": 0, "violations": None}
+    shown = {"title": "typical", "steps": 1, "changed": 0}
     facts = {"speed": 1.0, "episodes": [shown], "files": checksums([path])}
     path.with_suffix(".json").write_text(json.dumps(facts))
     assert load_video(path).animation == b"frames"
