@@ -276,3 +276,14 @@ def test_a_simulation_follows_the_model_of_its_env():
         observation, *_, info = env.step(action)
         np.testing.assert_array_equal(foreseen, observation)
         assert not info["cbf/mismatch"] and not info["cbf/intervened"]
+
+
+def test_what_is_compared_at_resets_alone_is_followed_from_the_next_episode_on():
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=5.0)])
+    env.reset(seed=0)
+    env.unwrapped.model.jnt_actfrclimited[0] = (
+        True  # of a joint whose motors MujocoPlant cannot write as f + g u
+    )
+    env.step(np.zeros(2, np.float32))
+    with pytest.raises(sw.SafeWrappersError, match="clamps the sum of its actuators' forces"):
+        env.reset(seed=1)
