@@ -67,7 +67,6 @@ class SafetyFilter:
         """Let the constraints read what they need of the plant's model."""
         fallback, solver, low, high, dtype, search = self._making
         plant = self.plant
-        self._model_version = plant.model_version
         self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in self._constraints]
         self.reporting = [c for c in self.bound if c.info_keys]
         kinds = [type(c.spec).__name__ for c in self.reporting]
@@ -77,6 +76,7 @@ class SafetyFilter:
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
         self._search = search(plant, self.bound, Fallback(fallback, self.bound), solver, low, high, dtype)
         self._all_predict = all(c.predicts for c in self.bound)
+        self._model_version = plant.model_version  # last: what does not fit is refused at every observation
 
     @property
     def outdated(self) -> bool:

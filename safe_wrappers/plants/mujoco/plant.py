@@ -83,6 +83,7 @@ class MujocoPlant(Snapshot):
         self._factors, self.loop = (1.0, 1.0), checked_loop(loop)
         self._raw: Any = None
         self._sent: Array | None = None
+        self._outdated = False
         self._range: tuple[Array, Array] = self.lower, self.upper
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
@@ -106,7 +107,7 @@ class MujocoPlant(Snapshot):
         moved = source.model is not self._env_model
         if moved and self._env_model is not None:
             binding.check_same_machine(self._env_model, source.model)
-        self._env_model, self.model = source.model, model
+        self.model = model
         self._constants = Constants(source.model, (*DYNAMICS, *PLACES))
         self._dynamics = Constants(source.model, DYNAMICS)
         self._every_constant = every_constant(source.model)
@@ -134,6 +135,8 @@ class MujocoPlant(Snapshot):
         self._pending = deque(self._pending, maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._recorder = self._new_recorder()
         self._contact_reader = ContactReader(model)
+        # Last: a model that was refused is refused again at the next observation.
+        self._env_model, self._outdated = source.model, False
         self.model_version += 1
         self._forget()
 
@@ -189,8 +192,8 @@ class MujocoPlant(Snapshot):
         self._sent, self._sent_at = control, float(self._source.data.time)
         if control is None:
             self._pending.clear()
-            if self._every_constant.changed():
-                self._take_model()
+            self._outdated |= self._every_constant.changed()
+            self.follow()
         elif self._delay_steps:
             self._pending.append(np.array(control))
 
@@ -227,7 +230,8 @@ class MujocoPlant(Snapshot):
 
     def follow(self) -> None:
         """Read the model anew if the env's has changed."""
-        if self._source.model is not self._env_model or self._constants.changed():
+        self._outdated |= self._source.model is not self._env_model or self._constants.changed()
+        if self._outdated:
             self._take_model()
 
     def _predict_over_delay(self) -> None:
