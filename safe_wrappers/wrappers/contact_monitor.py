@@ -9,8 +9,7 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
-from safe_wrappers.control.contact.contact import complementarity_residuals
-from safe_wrappers.control.contact.impact import normal_impulse, peak_force
+from safe_wrappers.control.contact.impact import complementarity_residuals, normal_impulse, peak_force
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.contacts import Contacts
 from safe_wrappers.plants.queries.next_impact import NextImpact
