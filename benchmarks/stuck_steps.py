@@ -24,7 +24,7 @@ from safe_wrappers.train.config import ArmConfig, FilterConfig
 from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
-from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
+from safe_wrappers.wrappers.replaced_actions import StuckEscape
 
 RESULTS = Path(__file__).parent / "results"
 ESCAPE = {"progress": 0.1}

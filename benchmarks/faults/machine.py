@@ -13,7 +13,7 @@ import safe_wrappers as sw
 from benchmarks.faults.outcomes import Cell, Found, Outcome, flags, judged, reached_wrongly
 from benchmarks.faults.stacks import BEFORE, Answer, Row, Session
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, filter_inside
-from safe_wrappers.wrappers.common.receiver import CommandReceiver
+from safe_wrappers.wrappers.layer import CommandReceiver
 
 _PARTS = {
     "mass": ("body_mass", "body_inertia"),

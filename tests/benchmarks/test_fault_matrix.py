@@ -123,7 +123,7 @@ def test_a_wrapper_that_is_wrong_is_seen(wrapper, fault, outcome):
 
 
 def test_a_guard_that_is_gone_is_seen(monkeypatch):
-    from safe_wrappers.wrappers.common.layer import LayerWrapper
+    from safe_wrappers.wrappers.layer import LayerWrapper
 
     monkeypatch.setattr(LayerWrapper, "_pass_on", lambda self, action: self.env.step(action))
     (found,) = fault_matrix.judge(FIRST["CostFunction"], only={("NaN", "all")})
