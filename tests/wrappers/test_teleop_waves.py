@@ -7,8 +7,8 @@ from teleop_worlds import Energies, ceiling, channel, clamp, place
 import safe_wrappers as sw
 from safe_wrappers.control.teleop.wave_line import WaveLine
 from safe_wrappers.envs.teleop_operator import TeleopOperator
+from safe_wrappers.wrappers import teleop_coding as codings
 from safe_wrappers.wrappers.teleop import Packet
-from safe_wrappers.wrappers.teleop import coding as codings
 from safe_wrappers.wrappers.teleop_coding import Up, WaveCoding
 
 B = 40.0
