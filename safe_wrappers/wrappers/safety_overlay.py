@@ -13,7 +13,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import name_of, wrappers_of
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 
 _MODES: Final = ("rgb_array", "human")

@@ -1,10 +1,10 @@
 """Contacts: residuals of rigid ones; restitution and impulse; peak force and the use of brakes of elastic ones.
 
 Source: appendix "Rigid Body Contact Mechanics", "Non-smooth collision manifolds and velocity jumps" and
-"Elastodynamic impact force and compliance deformation". The elastic part is one mass on one massless linear spring without damping,
-`m x'' = -k x - m a`, `x(0) = 0`, `x'(0) = v`, up to the first peak of the deflection x. Not modelled: stiffness that
-grows with depth, damping, a pad at the end of its stroke, a second contact. The functions relate force to speed; they
-do not certify a contact as safe.
+"Elastodynamic impact force and compliance deformation". The elastic part is one mass on one massless linear spring
+without damping, `m x'' = -k x - m a`, `x(0) = 0`, `x'(0) = v`, up to the first peak of the deflection x. Not
+modelled: stiffness that grows with depth, damping, a pad at the end of its stroke, a second contact. The functions
+relate force to speed; they do not certify a contact as safe.
 
 **Braking after contact is too late.** The peak comes a quarter of a period after the touch, typically 20 to 50 ms.
 A brake that acts later does not reduce it (`attenuation_after_delay`), so protection needs clearance before contact.
