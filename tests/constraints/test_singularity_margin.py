@@ -27,16 +27,13 @@ CHAIN = """<mujoco><compiler angle="radian"/><option timestep="0.002"><flag cont
 DRIVEN = ["rail", "a", "b", "c"]
 
 
-def true_w(model, data, kind, name, joints, directions="xyz", rotations="", length=1.0, own=False):
+def true_w(model, data, kind, name, joints, directions="xyz", rotations="", length=1.0):
     """sqrt(det) by the singular values of MuJoCo's own Jacobian; positions are up to date."""
     mujoco.mj_comPos(model, data)
     linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     index = getattr(model, kind)(name).id
     call = {"body": mujoco.mj_jacBody, "site": mujoco.mj_jacSite, "geom": mujoco.mj_jacGeom}[kind]
     call(model, data, linear, angular, index)
-    if own:
-        axes = getattr(data, {"body": "xmat", "site": "site_xmat", "geom": "geom_xmat"}[kind])[index]
-        linear, angular = axes.reshape(3, 3).T @ linear, axes.reshape(3, 3).T @ angular
     rows = [linear["xyz".index(d)] for d in directions] + [
         length * angular["xyz".index(r)] for r in rotations
     ]
@@ -46,18 +43,10 @@ def true_w(model, data, kind, name, joints, directions="xyz", rotations="", leng
 
 TASKS = {
     "a site, all directions": ({"site": "tip"}, {}),
-    "a geom in its own axes": (
-        {"geom": "shin", "directions": "xz", "frame": "own"},
-        {"directions": "xz", "own": True},
-    ),
-    "a body in the world's": ({"body": "hand", "directions": "zy"}, {"directions": "zy"}),
+    "a geom, two directions": ({"geom": "shin", "directions": "zx"}, {"directions": "zx"}),
     "with a rotation": (
-        {"site": "tip", "directions": "xz", "rotations": "y", "length": 0.3, "frame": "own"},
-        {"directions": "xz", "rotations": "y", "length": 0.3, "own": True},
-    ),
-    "rotations alone, named joints": (
-        {"site": "tip", "directions": "", "rotations": "xz", "joints": ["d", "a", "b"]},
-        {"directions": "", "rotations": "xz", "joints": ["a", "b", "d"]},
+        {"site": "tip", "directions": "xz", "rotations": "y", "length": 0.3},
+        {"directions": "xz", "rotations": "y", "length": 0.3},
     ),
     "as many joints as directions": (
         {"site": "tip", "joints": ["a", "b", "c"]},
@@ -256,13 +245,6 @@ def test_no_step_that_is_not_flagged_goes_below_the_threshold(case, driver):
     check_closed_loop(case, driver, 45, [1])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("driver", DRIVERS)
-@pytest.mark.parametrize("case", CASES)
-def test_no_step_that_is_not_flagged_goes_below_the_threshold_for_long(case, driver):
-    check_closed_loop(case, driver, 400, range(3))
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_a_margin_covers_a_plant_that_is_wrong(case):
     plant = sw.MujocoPlant()
@@ -413,45 +395,18 @@ TIP = {"body": "fingertip", "directions": "xy"}
             "give a threshold .*task_speed=1.0",
         ),
         ({**TIP, "rate_limit": 1.0}, ConfigurationError, "give a threshold .*rate_limit=1.0"),
-        ({**TIP, "task_speed": -1.0, "rate_limit": 1.0}, ConfigurationError, "task_speed must be a finite"),
-        ({**TIP, "task_speed": 1.0, "rate_limit": np.inf}, ConfigurationError, "rate_limit must be a finite"),
-        ({**TIP, "threshold": 0.0}, ConfigurationError, "threshold must be a finite number > 0"),
         ({**TIP, "threshold": np.nan}, ConfigurationError, "threshold must be a finite number > 0"),
-        (
-            {**TIP, "threshold": 1e-3, "margin": -1.0},
-            ConfigurationError,
-            "margin must be a finite number >= 0",
-        ),
         ({"threshold": 1e-3}, ConfigurationError, "name the one site, body or geom .*site=None"),
         (
             {**TIP, "threshold": 1e-3, "geom": "fingertip"},
             ConfigurationError,
             "name the one site, body or geom",
         ),
-        ({"threshold": 1e-3, "body": ["fingertip"]}, ConfigurationError, "name the one site, body or geom"),
-        ({**TIP, "threshold": 1e-3, "frame": "tool"}, ConfigurationError, '"world" or "own", got \'tool\''),
         ({**TIP, "threshold": 1e-3, "directions": "xw"}, ConfigurationError, 'directions is some of "xyz"'),
+        ({**TIP, "threshold": 1e-3, "directions": ""}, ConfigurationError, "got neither"),
         ({**TIP, "threshold": 1e-3, "rotations": "z"}, ConfigurationError, r"give the length \(m\)"),
-        ({**TIP, "threshold": 1e-3, "joints": "joint0"}, ConfigurationError, "joints is a list of names"),
-        (
-            {**TIP, "threshold": 1e-3, "joints": []},
-            ConfigurationError,
-            r"joints is a list of names.*got \[\]",
-        ),
-        ({**TIP, "threshold": 1e-3, "horizon": 0}, ConfigurationError, "horizon is a whole number"),
-        (
-            {**TIP, "threshold": 1e-3, "max_decrease": 0.0},
-            ConfigurationError,
-            "max_decrease must be a finite number > 0",
-        ),
         ({"threshold": 1e-3, "body": "hand"}, UnknownNameError, "no body 'hand'; it has: world, body0"),
-        ({"threshold": 1e-3, "site": "tip"}, UnknownNameError, "no site 'tip'"),
         ({**TIP, "threshold": 1e-3, "joints": ["elbow"]}, UnknownNameError, "no joint 'elbow'"),
-        (
-            {"threshold": 1e-3, "geom": "sideN"},
-            ConfigurationError,
-            "no hinge or slide moves the geom 'sideN'",
-        ),
         (
             {"threshold": 1e-3, "body": "target", "directions": "xy"},
             ConfigurationError,
@@ -462,36 +417,15 @@ TIP = {"body": "fingertip", "directions": "xy"}
             ConfigurationError,
             "'target_x' does not move the body 'fingertip'; those that do: joint0, joint1",
         ),
-        ({**TIP, "threshold": 1e-3, "joints": ["joint0", "joint0"]}, ConfigurationError, "named twice"),
         (
-            {"threshold": 1e-3, "body": "body1", "directions": "x", "joints": ["joint0", "joint1"]},
+            {**TIP, "threshold": 1e-3, "directions": "xyz"},
             ConfigurationError,
-            "'joint1' moves the body 'body1' in none of the task's directions",
-        ),
-        (
-            {"threshold": 1e-3, "body": "body1", "directions": "xy"},
-            ConfigurationError,
-            "1 joints cannot move the body 'body1' in 2 directions at once .*the joints are joint0",
-        ),
-        (
-            {"threshold": 1e-3, "body": "fingertip"},
-            ConfigurationError,
-            "2 joints cannot move .*in 3 directions",
-        ),
-        (
-            {"threshold": 1e-3, "body": "fingertip", "directions": "xz"},
-            ConfigurationError,
-            "cannot be moved in all of these directions at once in any configuration",
+            "2 joints cannot move",
         ),
         (
             {**TIP, "threshold": 0.02},
             ConfigurationError,
             "no configuration has .*above 0.02 .*is 0.011, half",
-        ),
-        (
-            {**TIP, "threshold": 0.01, "margin": 0.2},
-            ConfigurationError,
-            "no configuration has a manipulability",
         ),
     ],
 )

@@ -52,7 +52,7 @@ def _tied(model: mujoco.MjModel) -> list[set[int]]:
         elif kind in _LOOPS:
             at_sites = model.eq_objtype[e] == int(mujoco.mjtObj.mjOBJ_SITE)
             first, second = (
-                set(_chain(model, int(model.site_bodyid[end]) if at_sites else end)) for end in ends
+                set(chain(model, int(model.site_bodyid[end]) if at_sites else end)) for end in ends
             )
             groups.append(first ^ second)
     return groups + [_of_tendon(model, t) for t in np.flatnonzero(tendons).tolist()]
@@ -68,12 +68,12 @@ def _of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
         if kind == int(mujoco.mjtWrap.mjWRAP_JOINT):
             found.add(thing)
         elif kind == int(mujoco.mjtWrap.mjWRAP_SITE):
-            chains.append(set(_chain(model, int(model.site_bodyid[thing]))))
+            chains.append(set(chain(model, int(model.site_bodyid[thing]))))
     common = set.intersection(*chains) if chains else set[int]()
     return found.union(*chains) - common
 
 
-def _chain(model: mujoco.MjModel, body: int) -> list[int]:
+def chain(model: mujoco.MjModel, body: int) -> list[int]:
     """The joints between a body and the world."""
     found: list[int] = []
     while body:
