@@ -25,7 +25,6 @@ class SlipLimiter(CBFActionFilter):
         regularization: Speed below which slip is counted against it, m/s.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`. "brake" here brakes as hard as the slip limit allows.
-        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         margin: Slip kept free below the limit.
 
     Info, at every step: the keys of `CBFActionFilter` (``cbf/margin`` stays 0), and arrays with one entry
@@ -55,11 +54,10 @@ class SlipLimiter(CBFActionFilter):
         regularization: float = 0.5,
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         arguments = dict(locals())
         traction = Traction(wheels, max_slip, friction, regularization, margin)
         plant = own_plant(plant)
         self._record(arguments, wheels=list(wheels), plant=plant)
-        CBFActionFilter.__init__(self, env, [traction], plant=plant, fallback=fallback, solver=solver)
+        CBFActionFilter.__init__(self, env, [traction], plant=plant, fallback=fallback)

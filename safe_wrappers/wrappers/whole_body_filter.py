@@ -48,7 +48,6 @@ class WholeBodyFilter(CBFActionFilter):
         horizon: Control steps to look ahead for the joints, for forecasts: as many as braking takes; None is 3.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`.
-        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
 
     Info, at every step: the keys of `CBFActionFilter`, ``whole_body/contacts``, ``whole_body/cone_margin``, and for
     forecasts with a `zmp_inset` ``whole_body/zmp_margin`` and ``whole_body/supported``.
@@ -78,7 +77,6 @@ class WholeBodyFilter(CBFActionFilter):
         horizon: int | None = None,
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "active-set",
     ) -> None:
         arguments = dict(locals())
         refuse_vector_env(env, type(self).__name__)
@@ -116,4 +114,4 @@ class WholeBodyFilter(CBFActionFilter):
             raise UnknownNameError(f'contacts is "forecast", "pyramid" or "cone", got {contacts!r}')
         plant = own_plant(plant)
         self._record(arguments, bodies=None if bodies is None else list(bodies), plant=plant)
-        CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback, solver=solver)
+        CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback)
