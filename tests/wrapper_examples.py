@@ -1,4 +1,4 @@
-"""An example of every exported wrapper: for the wrapper contract (tests/contract) and for the fault matrix.
+"""An example of every exported wrapper, for tests/contract.
 
 They are found by `safe_wrappers.__all__`; a new one needs an example below and is then held to all of it.
 """

@@ -1,16 +1,6 @@
-"""Does `diagnose` find what was planted? Envs and policies with one fault each, and healthy ones.
+"""Envs and policies with one fault each, and healthy ones: what `diagnose` has to find, and to leave alone."""
 
-    python -m benchmarks.diagnose
-    python -m benchmarks.diagnose --only "icy ground" --steps 2000
-
-A planted symptom should rank first, the proposed lines should halve its figure in the second run, and a healthy env
-should have no symptom. The table goes to `benchmarks/results/diagnose.md`.
-"""
-
-import argparse
-import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -20,10 +10,8 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.mujoco_drivers import balancing_gain
-from safe_wrappers.diagnosis import Diagnosis, diagnose
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 
-RESULTS = Path(__file__).parent / "results" / "diagnose.md"
 Policy = Callable[[Any], Any]
 Made = tuple[gym.Env[Any, Any], Policy | None]
 gym.register_envs(gymnasium_robotics)
@@ -338,62 +326,3 @@ HEALTHY: dict[str, Callable[[], Made]] = {
     ),
     "Pusher, still": lambda: _with(gym.make("Pusher-v5"), still),
 }
-
-
-def lines(planted: bool, name: str, symptom: str, found: Diagnosis) -> str:
-    """A row of the table."""
-    first = found.present[0] if found.present else None
-    cells = [name, "planted" if planted else "healthy", symptom or "-"]
-    cells.append(", ".join(f"{one.symptom} ({one.severity:.2g})" for one in found.present) or "nothing")
-    if planted and first is not None and first.symptom == symptom:
-        cells.append(f"{first.figure:.3g} {first.unit}")
-        cells.append(f"{first.after:.3g}" if first.code else "told, no wrapper")
-    else:
-        cells += ["-", "-"]
-    return "| " + " | ".join(cells) + " |"
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--only", nargs="+", choices=[*PLANTED, *HEALTHY])
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--words", action="store_true", help="print each diagnosis")
-    arguments = parser.parse_args()
-    warnings.simplefilter("ignore")
-    table = [
-        "| env and policy | is | planted | found (in thresholds) | figure | with the proposed lines |",
-        "|---|---|---|---|---|---|",
-    ]
-    ranked = halved = treatable = clean = 0
-    for name, (symptom, make) in PLANTED.items():
-        if arguments.only and name not in arguments.only:
-            continue
-        env, policy = make()
-        found = diagnose(env, policy, arguments.steps * LONGER.get(name, 1))
-        first = found.present[0] if found.present else None
-        if first is not None and first.symptom == symptom:
-            ranked += 1
-            treatable += bool(first.code)
-            halved += bool(first.code) and first.after <= 0.5 * first.figure
-        table.append(lines(True, name, symptom, found))
-        print(found if arguments.words else table[-1], flush=True)
-    for name, healthy in HEALTHY.items():
-        if arguments.only and name not in arguments.only:
-            continue
-        found = diagnose(*healthy(), arguments.steps)
-        clean += not found.present
-        table.append(lines(False, name, "", found))
-        print(found if arguments.words else table[-1], flush=True)
-    if arguments.only:
-        return
-    table.append("")
-    table.append(
-        f"Ranked first: {ranked} of {len(PLANTED)}. Halved by the proposed lines: {halved} of {treatable} that have "
-        f"lines. No symptom: {clean} of {len(HEALTHY)} healthy ones. {arguments.steps:,} steps per driver."
-    )
-    RESULTS.write_text("\n".join(table) + "\n")
-    print("\n".join(table))
-
-
-if __name__ == "__main__":
-    main()
