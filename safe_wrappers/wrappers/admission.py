@@ -18,7 +18,7 @@ from safe_wrappers.control.watchdog.reachability import (
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import actions_are_controls
 from safe_wrappers.plants.mujoco.model import control_range
-from safe_wrappers.wrappers.common.layer import Env
+from safe_wrappers.wrappers.layer import Env
 
 Measured = Callable[[Env], tuple[ArrayLike, ...]]
 """Takes the env; returns what the actions are setpoints of, velocities and, if known, accelerations, shapes (m,)."""

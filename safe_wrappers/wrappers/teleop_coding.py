@@ -13,9 +13,8 @@ from safe_wrappers.control.teleop.port_checks import RunningSum, port_energy
 from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import refuse_changed_actions
-from safe_wrappers.wrappers.common.layer import Env
-from safe_wrappers.wrappers.teleop.link import Packet
-from safe_wrappers.wrappers.teleop.port import PortReading, TeleopPort
+from safe_wrappers.wrappers.layer import Env
+from safe_wrappers.wrappers.teleop import Packet, PortReading, TeleopPort
 
 _STORAGE_J: Final = 0.02
 """What each end of a passivity controller may give out unpaid, unless it is said."""
