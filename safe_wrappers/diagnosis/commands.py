@@ -8,9 +8,9 @@ from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording, box
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, Treatment, wrapped
 from safe_wrappers.errors import SafeWrappersError
-from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check
+from safe_wrappers.plants import RigidModelCheck, rigid_model_check
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
-from safe_wrappers.wrappers.teleop.link import Link
+from safe_wrappers.wrappers.teleop import Link
 from safe_wrappers.wrappers.teleop_channel import TeleopChannel
 
 RATE = 0.05

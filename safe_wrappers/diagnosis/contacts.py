@@ -19,7 +19,7 @@ from safe_wrappers.diagnosis.wheel_slip import wheels
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.protect import protect
-from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
+from safe_wrappers.wrappers.presets import WholeBodyFilter
 
 
 def measure_forces(env: Env, recording: Recording) -> Measured:

@@ -9,7 +9,7 @@ import mujoco
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording, physics
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.teleop.link import Link
+from safe_wrappers.wrappers.teleop import Link
 
 
 class NotMeasuredError(Exception):

@@ -18,7 +18,7 @@ from safe_wrappers.diagnosis.symptom import (
     wrapped,
 )
 from safe_wrappers.plants.mujoco.model import HINGE
-from safe_wrappers.wrappers.slip_limiter import SlipLimiter
+from safe_wrappers.wrappers.presets import SlipLimiter
 
 SLIPS = 0.2
 """Slip ratio from which on a wheel is beyond the peak of its traction on all usual grounds."""
