@@ -11,8 +11,8 @@ from pydantic import AfterValidator
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
+from safe_wrappers.wrappers.stopping_budget import StoppingBudget
 
 from .names import check_name
 

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.learner.safe_action_map import ANCHORS
+from safe_wrappers.wrappers.replaced_actions import ANCHORS
 
 from .section import Section
 from .types import Number, matching

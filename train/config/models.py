@@ -15,8 +15,8 @@ from pydantic.dataclasses import dataclass
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
-from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
+from safe_wrappers.wrappers.replaced_actions import StuckEscape
 
 from .algorithm_settings import HER
 from .algorithms import check_algorithm

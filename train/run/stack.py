@@ -16,13 +16,11 @@ from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.learner.adaption_penalty import AdaptionPenalty
-from safe_wrappers.wrappers.learner.filter_observation import FilterObservation
-from safe_wrappers.wrappers.learner.safe_action_map import SafeActionMap
-from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
+from safe_wrappers.wrappers.learner import AdaptionPenalty, FilterObservation
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.replaced_actions import SafeActionMap, StuckEscape
 
 from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
 from ..config.env_ids import make_env

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.wrappers.learner.action_repeat import ActionRepeat
+from safe_wrappers.wrappers.learner import ActionRepeat
 
 from ..config import ArmConfig
 from ..processes.parent import end_with_parent
