@@ -26,7 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 import safe_wrappers as sw
 from benchmarks.tables import markdown, total
 from safe_wrappers.constraints import PredictiveShield
-from safe_wrappers.train.tables import write_rows
+from safe_wrappers.train.files import write_rows
 
 RESULTS = Path(__file__).parent / "results" / "shielded.csv"
 WAYS = ("no shield", "shielded", "masked")

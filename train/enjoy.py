@@ -11,7 +11,7 @@ from rich.console import Console
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 
-from .atomic import write_bytes
+from .files import write_bytes
 from .evaluation.episode_selection import filmed_seeds, typical_and_worst
 from .policies import load_policy
 from .processes.parallel import environment

@@ -31,7 +31,7 @@ from safe_wrappers.train.run.policy import SpacesEnv
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.run.vec_envs import make_vec_env
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 
 SMALL = "policy_kwargs: {net_arch: [8]}"
 REPLAY = f"learning_starts: 32, batch_size: 8, train_freq: 8, {SMALL}"

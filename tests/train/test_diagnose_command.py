@@ -13,7 +13,7 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.diagnosis.trained import of_file, of_run
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 TINY = """

@@ -19,7 +19,7 @@ from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.run.vec_envs import make_vec_env
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 
 HER = (
     "hyperparameters={policy: MultiInputPolicy, learning_starts: 32, batch_size: 16, train_freq: 8,"

@@ -23,7 +23,7 @@ from safe_wrappers.train.run import training as run_module
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.videos import record as record_module
 
 WALL = 0.0  # in the middle of where episodes start

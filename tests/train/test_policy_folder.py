@@ -28,7 +28,7 @@ from safe_wrappers.train.policies.card import write_card
 from safe_wrappers.train.policies.hub import download, upload
 from safe_wrappers.train.run import Progress, portable
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.tables import write_rows
+from safe_wrappers.train.files import write_rows
 
 REACHER = {
     "name": "x",

@@ -12,7 +12,7 @@ from safe_wrappers.train.config.env_ids import check_env_id
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 
 SILENT = Progress(lambda _: None, lambda _: None)
 

@@ -27,7 +27,7 @@ from safe_wrappers.train.run.callbacks import CheckpointCallback
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.videos.record import video_path
 
 OFF = FilterConfig()

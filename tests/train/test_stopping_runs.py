@@ -16,7 +16,7 @@ from safe_wrappers.train.run.callbacks import EpisodeRows
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import standing
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 
 SILENT = Progress(lambda _: None, lambda _: None)
 PPO = ("total_steps=512", "checkpoint_every=1000000")

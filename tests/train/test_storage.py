@@ -22,7 +22,7 @@ from safe_wrappers.train.processes.lock import FolderHeldError, only_writer
 from safe_wrappers.train.processes.storage import telling_of_storage
 from safe_wrappers.train.run import train_run
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 
 QUIET = Progress(lambda _: None, lambda _: None)
 SAC = (
@@ -213,7 +213,7 @@ def test_a_setting_that_the_first_update_finds_wrong_does_not_block_the_correcte
 
 
 def test_temporary_files_of_killed_processes_go_and_those_of_live_ones_stay(tmp_path):
-    from safe_wrappers.train.atomic import write_text
+    from safe_wrappers.train.files import write_text
 
     def temporary(pid, host):
         path = Path(tmp_path / f".a[1].csv.{host}.{pid}.tmp")

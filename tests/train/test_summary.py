@@ -15,7 +15,7 @@ from safe_wrappers.train.evaluation.summary import (
     write_summary,
 )
 from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
-from safe_wrappers.train.tables import write_rows
+from safe_wrappers.train.files import write_rows
 
 
 def episode(**values):

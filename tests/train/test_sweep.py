@@ -22,7 +22,7 @@ from safe_wrappers.train.run import Progress
 from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
 from safe_wrappers.train.sweep import batch, results, study, sweep_experiment
 from safe_wrappers.train.sweep.space import Space
-from safe_wrappers.train.tables import write_rows
+from safe_wrappers.train.files import write_rows
 
 optuna = pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")
 

@@ -14,7 +14,7 @@ from safe_wrappers.train.evaluation.scene import load_scenes
 from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.report.film_section import films
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.videos import film
 from safe_wrappers.train.videos import record as videos
 from safe_wrappers.train.videos.film import HEIGHT, TITLE, WIDTH

@@ -14,7 +14,7 @@ from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
 from safe_wrappers.train.run.vec_envs import make_vec_env
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 
 SILENT = Progress(lambda steps: None, pytest.fail)
 PROTECTED = FilterConfig(protect={})

@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import re
-import sys
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 import gymnasium as gym
 
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 
-from .names import check_name
-
-_ROBOTICS: Final = re.compile(
-    r"(Fetch|Hand(Reach|Manipulate)|Adroit|AntMaze|PointMaze|FrankaKitchen)\w*(-v\d+)?"
-)
-"""The families of gymnasium-robotics: without the package there is no other way to know that an id is its own."""
+from .types import check_name
 
 
 def check_env_id(env_id: str) -> str:
@@ -28,21 +21,13 @@ def check_env_id(env_id: str) -> str:
     `gymnasium.make`, which imports the module.
 
     Raises:
-        ConfigurationError: An id of gymnasium-robotics, which is not installed.
         UnknownNameError: An id that nobody registers; holds the nearest one.
     """
     if ":" in env_id or _registered(env_id):
         return env_id
     if importlib.util.find_spec("gymnasium_robotics") is not None:
         gym.register_envs(importlib.import_module("gymnasium_robotics"))  # its import registers them
-        if _registered(env_id):
-            return env_id
-    elif _ROBOTICS.fullmatch(env_id):
-        raise ConfigurationError(
-            f"{env_id} is an env of gymnasium-robotics, which is not installed:"
-            " pip install 'safe-wrappers[robotics]'"
-        )
-    return check_name(env_id, gym.registry)
+    return env_id if _registered(env_id) else check_name(env_id, gym.registry)
 
 
 def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
@@ -57,15 +42,10 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
     except SafeWrappersError:
         raise
     except Exception as error:
-        why = f"{type(error).__name__}: {error}"
-        module, _, name = env_id.partition(":")
-        if name.isidentifier() and callable(getattr(sys.modules.get(module), name, None)):
-            why = (
-                f"that is a function or a class, and env takes an id. Register it in the module {module}, "
-                f"gymnasium.register({name + '-v0'!r}, entry_point={name}), and give {module}:{name}-v0"
-            )
         of = f" with kwargs {dict(kwargs)}" if kwargs else ""
-        raise ConfigurationError(f"env: {env_id}{of} cannot be made: {why}") from error
+        raise ConfigurationError(
+            f"env: {env_id}{of} cannot be made: {type(error).__name__}: {error}"
+        ) from error
 
 
 def _registered(env_id: str) -> bool:

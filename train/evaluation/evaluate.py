@@ -11,7 +11,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
-from ..atomic import write_json
+from ..files import write_json
 from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EvaluationConfig, FilterConfig
 from ..processes.job import Progress
@@ -22,7 +22,7 @@ from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger
 from ..run.training import finished_checkpoint
-from ..tables import write_rows
+from ..files import write_rows
 from .scene import Scene, SceneRecorder, save_scenes
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
 

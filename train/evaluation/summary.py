@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from ..atomic import write_json
+from ..files import write_json
 from ..config import ExperimentConfig, FilterConfig
-from ..tables import read_rows, write_rows
+from ..files import read_rows, write_rows
 from .evaluate import conditions, evaluation_folder
 from .has_cost import evaluated_without_cost
 from .intact import check_results

@@ -1,27 +1,54 @@
-"""Jobs: what runs elsewhere, where, and what it reports."""
+"""Jobs: what runs elsewhere, what it reports, and how it ends."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import os
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final
+
+from safe_wrappers.errors import SafeWrappersError
 
 Message = tuple[str, Any]
-"""`steps`, `figures`, `say`, `failed`, or at last `end` with what killed it, "" for nothing."""
+"""`steps`, `figures`, `say`, or at last `end` with what stopped or killed it, "" for nothing."""
+STOPPED: Final = "stopped"
+
+
+class RunStoppedError(SafeWrappersError):
+    """A run was asked to stop; the message says from which step it will go on."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """An experiment was stopped by a signal, `signum`."""
+
+    def __init__(self, signum: int) -> None:
+        super().__init__(signum)
+        self.signum = signum
+
+
+class RunsFailedError(SafeWrappersError):
+    """Some jobs failed, those in `names`; the others were brought to their end."""
+
+    def __init__(self, message: str, names: Iterable[str] = ()) -> None:
+        super().__init__(message)
+        self.names = frozenset(names)
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a job reports to: its steps so far, lines that a person should read, and figures by their names."""
+    """What a job tells, and is told: whether it is to save and stop."""
 
     steps: Callable[[int], None]
     say: Callable[[str], None]
     figures: Callable[[Mapping[str, str]], None] = lambda _: None
+    stopping: Callable[[], bool] = lambda: False
 
 
 @dataclass(frozen=True)
 class Job:
-    """One process's work: `call(*arguments, progress)`; both must pickle."""
+    """One process's work: `call(*arguments, progress)`; both must pickle. `total` is counted in `unit`."""
 
     name: str
     total: int
@@ -30,19 +57,39 @@ class Job:
     arguments: tuple[Any, ...]
 
 
-class Workers(Protocol):
-    """Where jobs run; `at_once` is how many at a time."""
+def work(job: Job, tell: Callable[[Message], object], stopping: Callable[[], bool]) -> str:
+    """Does a job in this process; returns what stopped it, "" for nothing."""
+    import torch
 
-    at_once: int
+    torch.set_num_threads(1)
+    progress = Progress(
+        steps=lambda steps: tell(("steps", steps)),
+        say=lambda text: tell(("say", text)),
+        figures=lambda figures: tell(("figures", dict(figures))),
+        stopping=stopping,
+    )
+    try:
+        job.call(*job.arguments, progress)
+    except RunStoppedError as stop:
+        progress.say(str(stop))
+        return STOPPED
+    except (SafeWrappersError, OSError) as error:
+        return str(error)
+    except Exception:  # whatever a task or a hyperparameter can do wrong: shown, and the other runs go on
+        return traceback.format_exc()
+    return ""
 
-    def start(self, job: Job) -> None:
-        """Begins a job."""
 
-    def messages(self, timeout_s: float) -> Iterator[tuple[str, Message]]:
-        """What jobs have to say, by their names; waits for the first of it, for at most so long."""
-
-    def stop(self, name: str) -> None:
-        """Asks a job to save and end."""
-
-    def kill(self) -> None:
-        """Ends all jobs at once."""
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables for the processes that are started inside."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from safe_wrappers.errors import RunStateError
 
-from ..atomic import write_text
+from ..files import write_text
 from ..config import ExperimentConfig
 from ..evaluation.summary import Summary
 from ..figures.plot_files import PlotFiles

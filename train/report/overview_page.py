@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from ..atomic import write_text
+from ..files import write_text
 from ..config import ExperimentConfig
 from ..evaluation.summary import Summary
 from ..figures.picture import Picture

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
-from ..atomic import write_bytes, write_json
+from ..files import write_bytes, write_json
 from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
 from ..evaluation.episode_selection import ShownEpisode, shown_episode
