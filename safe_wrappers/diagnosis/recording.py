@@ -15,8 +15,7 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import check_timing, one_reward, wrappers_of
-from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
-from safe_wrappers.wrappers.contact_monitor import ContactMonitor
+from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 
 Env = gym.Env[Any, Any]
 Driver = Callable[[Any], Any]

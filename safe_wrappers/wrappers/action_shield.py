@@ -14,7 +14,7 @@ from safe_wrappers.filter.discrete import DiscreteSearch
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.common.layer import Env, Step
+from safe_wrappers.wrappers.layer import Env, Step
 
 _MOST = 1024
 

@@ -21,8 +21,7 @@ from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
-from safe_wrappers.wrappers.common.receiver import action_array
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, action_array
 
 SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""

@@ -19,8 +19,8 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, CBFActionFilter
-from safe_wrappers.wrappers.common.episode_guard import EpisodeGuard
-from safe_wrappers.wrappers.common.receiver import action_array
+from safe_wrappers.wrappers.episode_guard import EpisodeGuard
+from safe_wrappers.wrappers.layer import action_array
 
 Mask = NDArray[np.bool_]
 Rows = NDArray[Any] | list[NDArray[Any]]

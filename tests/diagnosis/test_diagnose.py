@@ -14,7 +14,7 @@ from safe_wrappers.diagnosis.recording import policy_driver, record
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 pytest.importorskip("gymnasium_robotics")
-from benchmarks.diagnose import (
+from planted import (
     ARM,
     CART,
     HEALTHY,

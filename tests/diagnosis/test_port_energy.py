@@ -11,7 +11,7 @@ from safe_wrappers.diagnosis.symptom import NotMeasuredError
 from safe_wrappers.diagnosis.symptoms import port_energy
 
 pytest.importorskip("gymnasium_robotics")
-from benchmarks.diagnose import LateBothWays, Operating
+from planted import LateBothWays, Operating
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 

@@ -14,7 +14,7 @@ from safe_wrappers.diagnosis.symptoms.soft_joints import Springs
 from safe_wrappers.plants import rigid_model_check
 
 pytest.importorskip("gymnasium_robotics")
-from benchmarks.diagnose import Bench, stiffened, waving
+from planted import Bench, stiffened, waving
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 ROCKING = """

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium_robotics")
-from benchmarks.diagnose import ARM, TURNTABLE, Bench, waving
+from planted import ARM, TURNTABLE, Bench, waving
+
 from safe_wrappers.diagnosis.recording import attacking_driver, braking_horizon, random_driver, record
 from safe_wrappers.diagnosis.symptoms import command_steps, late_commands, lever_arms, wheel_slip
 from safe_wrappers.diagnosis.symptoms.loop_margin import loop

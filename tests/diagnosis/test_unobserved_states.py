@@ -15,7 +15,7 @@ from safe_wrappers.diagnosis.symptoms import unobserved_states
 from safe_wrappers.diagnosis.symptoms.unobserved_states import _wander, unseen
 
 pytest.importorskip("gymnasium_robotics")
-from benchmarks.diagnose import HIDDEN, Bench, partly, still, waving
+from planted import HIDDEN, Bench, partly, still, waving
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 ROLLING = """

@@ -27,10 +27,10 @@ from safe_wrappers.train.config.models import ArmConfig
 from safe_wrappers.train.config.stored import stored_arm
 from safe_wrappers.train.experiment import check_training
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
-from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
+from safe_wrappers.wrappers.replaced_actions import StuckEscape
+from safe_wrappers.wrappers.stopping_budget import StoppingBudget
 
 CONFIGS = {p.stem: p.read_text() for p in sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))}
 MINIMAL = {

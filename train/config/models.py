@@ -13,12 +13,10 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictInt, model_validator
 from pydantic.dataclasses import dataclass
 
+from safe_wrappers import LeaseExpiry, OcclusionPenalty, StuckEscape
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
-from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
-from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
 from .algorithms import ALGORITHMS, HER
 from .env_ids import check_env_id

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
 
-import safe_wrappers
+import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.learner.adaption_penalty import AdaptionPenalty
-from safe_wrappers.wrappers.learner.filter_observation import FilterObservation
-from safe_wrappers.wrappers.learner.safe_action_map import SafeActionMap
-from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
-from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
-from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
-from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
-from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
-from ..config.env_ids import make_env
-from ..config.names import check_name
-from ..filter_module import refuse_without_recipe
-from ..local_imports import own_folders
+from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig, make_env
+from ..config.types import check_name
 from .judge import ConstraintJudge
 
 
@@ -56,79 +45,79 @@ def make_stack(
     kwargs = env.kwargs if render_mode is None else {**env.kwargs, "render_mode": render_mode}
     task = make_env(env.id, kwargs)
     if env.cost is not None:
-        task = CostFunction(task, _function(env.cost, "env.cost"))
+        task = sw.CostFunction(task, _function(env.cost, "env.cost"))
     if env.judge is not None:
         task = ConstraintJudge(task, _filtered(task, env.judge))
     if env.occlusion is not None:
-        try:
-            task = OcclusionPenalty(task, **env.occlusion)
-        except TypeError as error:
-            raise ConfigurationError(f"env.occlusion: {error}") from None
+        task = _called("env.occlusion", sw.OcclusionPenalty, task, env.occlusion)
     observed = None if env.observation is None else _filtered(task, env.observation)
     task = _filtered(task, action_filter)
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
     if learner.maps and action_filter.kind != "none":
-        named = ":" in learner.anchor
-        task = SafeActionMap(task, _function(learner.anchor, "learner.anchor") if named else learner.anchor)
+        task = sw.SafeActionMap(task, learner.anchor)
     if observed is not None:
         task = _with_features(task, observed)
     if action_filter.escape is not None:
-        task = StuckEscape(task, **action_filter.escape)
-    recorded: gym.Env[Any, Any] = RecordInterventions(task)
+        task = sw.StuckEscape(task, **action_filter.escape)
+    recorded: gym.Env[Any, Any] = sw.RecordInterventions(task)
     for name, arguments in env.faults.items():
-        try:
-            recorded = FAULTS[name](recorded, **arguments)
-        except TypeError as error:
-            raise ConfigurationError(f"env.faults.{name}: {error}") from None
+        recorded = _called(f"env.faults.{name}", FAULTS[name], recorded, arguments)
     monitored = Monitor(recorded, info_keywords=keys.RUNNING)
-    if not learner.penalised:
-        return monitored
-    return AdaptionPenalty(monitored, **learner.penalties)
+    return sw.AdaptionPenalty(monitored, **learner.penalties) if learner.penalised else monitored
+
+
+def _called(where: str, make: Callable[..., Any], env: gym.Env[Any, Any], given: Mapping[str, Any]) -> Any:
+    """What is made around an env; arguments that are missing or unknown are refused."""
+    try:
+        return make(env, **given)
+    except TypeError as error:
+        raise ConfigurationError(f"{where}: {error}") from error
 
 
 def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[Any, Any]:
     """The task in its filter; as it is if there is none."""
     if action_filter.protect is not None:
-        refuse_without_recipe(task)
-        return safe_wrappers.protect(task, **action_filter.protect)
+        try:
+            return sw.protect(task, **action_filter.protect)
+        except UnsupportedEnvError as error:
+            raise ConfigurationError(
+                f"filter: {error}\n`safe-wrappers init FILE.yaml env=ID` writes these lines as a module with a function"
+                ' for filter: {factory: "module:function"}.'
+            ) from None
     if action_filter.factory is not None:
         factory = _function(action_filter.factory, "filter.factory")
-        try:
-            filtered: gym.Env[Any, Any] = factory(task, **action_filter.kwargs)
-        except TypeError as error:
-            raise ConfigurationError(
-                f"filter: {action_filter.factory} refuses its kwargs: {error}"
-            ) from error
+        filtered: gym.Env[Any, Any] = _called("filter.kwargs", factory, task, action_filter.kwargs)
         return filtered
     return task
 
 
-def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> FilterObservation:
+def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     """The task with what its filter decides by; without one, what a filter around it, which is not stepped, would."""
     if filter_inside(task) is not None:
-        return FilterObservation(task)
+        return sw.FilterObservation(task)
     observer = filter_inside(observed)
     if observer is None:
         raise ConfigurationError(
             "env.observation: the filter has no constraints to observe (a CBFActionFilter has)"
         )
     plant = None if isinstance(observer.plant, MujocoPlant) else observer.plant
-    return FilterObservation(task, observer.constraints, plant)
+    return sw.FilterObservation(task, observer.constraints, plant)
 
 
-def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:
+def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """The lease around a filter; its clearance, if none is given, is what the filter keeps."""
     budget = arguments.get("budget") or {}
-    if "clearance" in budget:
-        return LeaseExpiry(task, **arguments)
-    constraints = getattr(task, "constraints", [])
-    if len(constraints) != 1:
-        raise ConfigurationError(
-            f"lease: the filter has {len(constraints)} constraints; say which one the lease is made from with "
-            "budget: {clearance: {kind: ..., ...}, ...}"
-        )
-    return LeaseExpiry(task, **{**arguments, "budget": {"clearance": constraints[0], **budget}})
+    if "clearance" not in budget:
+        constraints = getattr(task, "constraints", [])
+        if len(constraints) != 1:
+            raise ConfigurationError(
+                f"lease: the filter has {len(constraints)} constraints; say which one the lease is made from with "
+                "budget: {clearance: {kind: ..., ...}, ...}"
+            )
+        budget = {"clearance": constraints[0], **budget}
+    leased: gym.Env[Any, Any] = _called("filter.lease", sw.LeaseExpiry, task, {**arguments, "budget": budget})
+    return leased
 
 
 def _function(name: str, where: str) -> Any:
@@ -138,9 +127,8 @@ def _function(name: str, where: str) -> Any:
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ConfigurationError(
-            f"{where}: cannot import {module_name!r}: {error}. Looked among the installed packages and in"
-            f" {', '.join(own_folders())}."
+            f"{where}: cannot import {module_name!r}: {error}. Modules beside the config and in the folder that one"
+            " works in are found, too."
         ) from None
-    of = f"{module_name} ({getattr(module, '__file__', 'built in')})"
-    check_name(function, [name for name in dir(module) if not name.startswith("_")], of)
+    check_name(function, [name for name in dir(module) if not name.startswith("_")], f"{where}: {module_name}")
     return getattr(module, function)

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from safe_wrappers.wrappers.learner.action_repeat import ActionRepeat
+from safe_wrappers import ActionRepeat
 
 from ..config import ArmConfig
 from .stack import make_stack

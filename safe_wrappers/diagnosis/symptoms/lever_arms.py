@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.estimation.lever_arm import lever_arm_acceleration
+from safe_wrappers.control.estimation.dead_reckoning import lever_arm_acceleration
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, replayed, require_physics
@@ -76,7 +76,7 @@ def lines(env: Env, recording: Recording) -> tuple[str, str]:
     """No wrapper moves a sensor: it is told which one knows of lever arms."""
     return "", (
         "Take the lever arm out before readings are used as the body's own: OcclusionPenalty with a Sensor whose "
-        "Imu(site=..., lever_arm=True) does so; safe_wrappers.control.estimation.lever_arm has the formula."
+        "Imu(site=..., lever_arm=True) does so; safe_wrappers.control.estimation.dead_reckoning has the formula."
     )
 
 

@@ -15,8 +15,7 @@ from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
 from safe_wrappers.diagnosis.symptoms.late_commands import ages
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import wrappers_of
-from safe_wrappers.wrappers.teleop.link import Link
-from safe_wrappers.wrappers.teleop.port import TeleopPort, port_from
+from safe_wrappers.wrappers.teleop import Link, TeleopPort, port_from
 from safe_wrappers.wrappers.teleop_channel import TeleopChannel
 
 _OURS = ("gymnasium.", "safe_wrappers.")
