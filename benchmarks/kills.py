@@ -44,7 +44,7 @@ from benchmarks.tables import RESULTS
 from safe_wrappers.train import cli, experiment
 from safe_wrappers.train.config import ArmConfig, ExperimentConfig, parse_experiment, read_config
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
-from safe_wrappers.train.processes.job import Progress
+from safe_wrappers.train.processes import Progress
 from safe_wrappers.train.run import training
 from safe_wrappers.train.run.callbacks import EpisodeRows
 from safe_wrappers.train.run.checkpoint import latest_checkpoint

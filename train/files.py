@@ -59,7 +59,9 @@ def read_json(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     except ValueError as error:  # of JSON, and of text that is none
-        raise RunStateError(f"{str(path)!r} is unreadable ({error}); delete it to have it made again.") from None
+        raise RunStateError(
+            f"{str(path)!r} is unreadable ({error}); delete it to have it made again."
+        ) from None
     return found
 
 

@@ -21,9 +21,9 @@ from safe_wrappers.train.enjoy import enjoy_command
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.data_pickles import read_pickle
+from safe_wrappers.train.run.stack import make_vec_env
 from safe_wrappers.train.run.start import policy_of_file
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.run.vec_envs import make_vec_env
 
 
 class Touch:

@@ -14,12 +14,11 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
-from safe_wrappers.train.hyperparameters import check_task
-from safe_wrappers.train.run.checkpoint import latest_checkpoint
-from safe_wrappers.train.run.stack import make_stack
-from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.run.vec_envs import make_vec_env
 from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.model import check_task
+from safe_wrappers.train.run.stack import make_stack, make_vec_env
+from safe_wrappers.train.run.training import train_run
 
 HER = (
     "hyperparameters={policy: MultiInputPolicy, learning_starts: 32, batch_size: 16, train_freq: 8,"

@@ -10,7 +10,7 @@ import pytest
 import torch
 from stable_baselines3 import SAC
 
-from safe_wrappers.train.processes.lock import only_writer
+from safe_wrappers.train.files import only_writer
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, save_checkpoint
 
 OPERATIONS = ("open", "os.", "shutil.")

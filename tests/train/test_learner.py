@@ -18,12 +18,12 @@ from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train.config import NAIVE, EvaluationConfig, FilterConfig, LearnerConfig
 from safe_wrappers.train.evaluation.episode_selection import ShownEpisode
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import stack as stack_module
 from safe_wrappers.train.run import training as run_module
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.videos import record as record_module
 
 WALL = 0.0  # in the middle of where episodes start

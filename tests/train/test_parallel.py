@@ -4,8 +4,7 @@ import fake_task
 import pytest
 from rich.console import Console
 
-from safe_wrappers.train.processes import progress_display
-from safe_wrappers.train.processes.job import Job
+from safe_wrappers.train.processes import Job, progress_display
 from safe_wrappers.train.processes.parallel import RunsFailedError, run_jobs
 
 

@@ -23,12 +23,10 @@ from safe_wrappers.train import experiment as experiment_module
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import FilterConfig, parse_experiment
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
-from safe_wrappers.train.policies import load_policy
-from safe_wrappers.train.policies.card import write_card
-from safe_wrappers.train.policies.hub import download, upload
+from safe_wrappers.train.files import write_rows
+from safe_wrappers.train.policies import download, load_policy, upload, write_card
 from safe_wrappers.train.run import Progress, portable
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.files import write_rows
 
 REACHER = {
     "name": "x",

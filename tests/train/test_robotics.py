@@ -8,11 +8,11 @@ import sys
 import pytest
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.train.config.env_ids import check_env_id
+from safe_wrappers.train.config import check_env_id
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
-from safe_wrappers.train.files import read_rows
 
 SILENT = Progress(lambda _: None, lambda _: None)
 
@@ -40,7 +40,7 @@ def test_fetch_reach_is_trained_and_evaluated_by_its_plain_id(fake_experiment):
 def test_a_new_process_registers_them_when_asked():
     pytest.importorskip("gymnasium_robotics")
     code = (
-        "import gymnasium as gym; from safe_wrappers.train.config.env_ids import check_env_id;"
+        "import gymnasium as gym; from safe_wrappers.train.config import check_env_id;"
         "assert 'FetchReach-v4' not in gym.registry; check_env_id('FetchReach-v4');"
         "assert 'FetchReach-v4' in gym.registry"
     )

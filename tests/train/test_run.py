@@ -20,14 +20,13 @@ from safe_wrappers.train import experiment as experiment_module
 from safe_wrappers.train.config import EnvConfig, FilterConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.experiment import train_experiment
-from safe_wrappers.train.processes.lock import only_writer
+from safe_wrappers.train.files import only_writer, read_rows
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run import checkpoint as checkpoint_module
 from safe_wrappers.train.run.callbacks import CheckpointCallback
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
-from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.videos.record import video_path
 
 OFF = FilterConfig()

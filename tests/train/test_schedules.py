@@ -7,9 +7,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from test_run import Reports, run_killed_after
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.train.hyperparameters import LinearFall
 from safe_wrappers.train.run import training as run_module
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.model import LinearFall
 from safe_wrappers.train.run.training import train_run
 
 PPO = (

@@ -18,8 +18,8 @@ from safe_wrappers.train.experiment import _start, generations, train_experiment
 from safe_wrappers.train.report.origin import about
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.reset_options import ResetOptions
+from safe_wrappers.train.run.stack import make_training_env
 from safe_wrappers.train.run.training import finished_checkpoint
-from safe_wrappers.train.run.vec_envs import make_training_env
 
 QUIET = Progress(lambda _: None, lambda _: None)
 TUNED = "arms.filtered.start_from=unfiltered"

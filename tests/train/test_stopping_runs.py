@@ -8,15 +8,14 @@ import threading
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from safe_wrappers.train.processes import stopping
-from safe_wrappers.train.processes.stopping import RunStoppedError, StopRequest, stop_request
+from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.processes import RunStoppedError, StopRequest, stop_request, stopping
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run import callbacks as run_callbacks
 from safe_wrappers.train.run.callbacks import EpisodeRows
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import standing
-from safe_wrappers.train.files import read_rows
 
 SILENT = Progress(lambda _: None, lambda _: None)
 PPO = ("total_steps=512", "checkpoint_every=1000000")

@@ -8,8 +8,7 @@ import pytest
 from test_run import Reports
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
-from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config.stored import stored_arm
+from safe_wrappers.train.config import parse_experiment, stored_arm
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.training import train_run
 

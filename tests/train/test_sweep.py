@@ -16,13 +16,12 @@ from safe_wrappers.errors import ConfigurationError, RunStateError
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import read_config
 from safe_wrappers.train.evaluation.summary import episode_file
+from safe_wrappers.train.files import write_rows
+from safe_wrappers.train.processes import Interrupted
 from safe_wrappers.train.processes.parallel import RunsFailedError
-from safe_wrappers.train.processes.stopping import Interrupted
 from safe_wrappers.train.run import Progress
 from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
-from safe_wrappers.train.sweep import batch, results, study, sweep_experiment
-from safe_wrappers.train.sweep.space import Space
-from safe_wrappers.train.files import write_rows
+from safe_wrappers.train.sweep import Space, batch, results, study, sweep_experiment
 
 optuna = pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")
 

@@ -8,8 +8,7 @@ from rich.console import Console
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train.config import read_config
-from safe_wrappers.train.sweep import sweep_experiment
-from safe_wrappers.train.sweep.space import Space
+from safe_wrappers.train.sweep import Space, sweep_experiment
 
 FAKE = Path(__file__).parent / "fake.yaml"
 MARGIN = "arms.filtered.filter.kwargs.margin"

@@ -23,9 +23,8 @@ from safe_wrappers.errors import RunStateError, UnknownNameError
 from safe_wrappers.train.run import training as run_module
 from safe_wrappers.train.run import vec_envs
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
-from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.stack import ProcessVecEnv, make_stack
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.run.vec_envs import ProcessVecEnv
 
 WAIT_S = 300.0
 """For three generations of processes to import torch on a busy machine."""

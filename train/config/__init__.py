@@ -1,6 +1,5 @@
 """An experiment's settings: a YAML file and overrides, checked and turned into frozen dataclasses."""
 
-from .env_ids import check_env_id, make_env
 from .load import parse_experiment, read_config, set_value
 from .models import (
     NAIVE,
@@ -13,6 +12,7 @@ from .models import (
     NormalizeConfig,
     ParameterConfig,
     SweepConfig,
+    check_env_id,
     stored_arm,
 )
 
@@ -28,7 +28,6 @@ __all__ = [
     "ParameterConfig",
     "SweepConfig",
     "check_env_id",
-    "make_env",
     "parse_experiment",
     "read_config",
     "set_value",

@@ -5,11 +5,14 @@ The tables of `docs/config.md` are made of them.
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
 
+import gymnasium as gym
 from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictInt, model_validator
 from pydantic.dataclasses import dataclass
 
@@ -19,7 +22,6 @@ from safe_wrappers.protect import protect_options
 from safe_wrappers.wrappers.faults import FAULTS
 
 from .algorithms import ALGORITHMS, HER
-from .env_ids import check_env_id
 from .types import (
     Count,
     FolderName,
@@ -33,6 +35,30 @@ from .types import (
     validate,
     with_keys,
 )
+
+
+def check_env_id(env_id: str) -> str:
+    """Returns the id; refuses one that no installed package registers.
+
+    Imports gymnasium-robotics if it may be one of its ids. An id of the form `module:Id-v0` is left to
+    `gymnasium.make`, which imports the module.
+
+    Raises:
+        UnknownNameError: An id that nobody registers; holds the nearest one.
+    """
+    if ":" in env_id or _registered(env_id):
+        return env_id
+    if importlib.util.find_spec("gymnasium_robotics") is not None:
+        gym.register_envs(importlib.import_module("gymnasium_robotics"))  # its import registers them
+    return env_id if _registered(env_id) else check_name(env_id, gym.registry)
+
+
+def _registered(env_id: str) -> bool:
+    try:
+        gym.spec(env_id)
+    except gym.error.Error:
+        return False
+    return True
 
 
 def _check_algorithm(name: str) -> str:

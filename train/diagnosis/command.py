@@ -10,8 +10,8 @@ from rich.console import Console
 
 from safe_wrappers.diagnosis import Diagnosis, diagnose
 
-from ..config.env_ids import make_env
 from ..figures.plot_files import PlotFiles
+from ..run.stack import make_env
 from .page import diagnosis_page
 from .trained import of_file, of_run
 

@@ -11,7 +11,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
-from .job import Job, Message, work
+from . import Job, Message, work
 
 _here: dict[str, Any] = {}
 """In a job's process: the queue of its messages, and the event that stops it."""

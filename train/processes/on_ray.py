@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from safe_wrappers.errors import ConfigurationError
 
-from .job import Job, Message, work
+from . import Job, Message, work
 
 RETRIES: Final = 10
 """Nodes that one job may lose."""

@@ -12,7 +12,7 @@ from typing import Any, Final
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from .job import STOPPED, Interrupted, Job, RunsFailedError, environment
+from . import STOPPED, Interrupted, Job, RunsFailedError, environment
 from .local import LocalWorkers
 
 _POLL_S: Final = 0.2

@@ -72,9 +72,7 @@ def resume(folder: Path, algorithm: str, env: VecEnv, device: str, buffer_size: 
     """
     env = load_normalize(folder, env)
     replay = folder / _REPLAY
-    model = _load(
-        folder, algorithm, device, env, {"buffer_size": 1 if replay.exists() else buffer_size}
-    )
+    model = _load(folder, algorithm, device, env, {"buffer_size": 1 if replay.exists() else buffer_size})
     if isinstance(model, OffPolicyAlgorithm) and replay.exists():
         buffer = read_pickle(replay)
         buffer.device = model.device
@@ -103,8 +101,8 @@ def _load(
         model: BaseAlgorithm = ALGORITHMS[algorithm].load(path, env, device, custom_objects=known)
     except (OSError, ValueError, KeyError) as error:
         raise RunStateError(
-            f"{str(path)!r} cannot be read ({error}). Delete {str(folder)!r}: a run goes on from the checkpoint before"
-            " it, if it has one."
+            f"{str(path)!r} cannot be read ({error}). Delete {str(folder)!r}: a run goes on from the checkpoint"
+            " before it, if it has one."
         ) from error
     return model
 

@@ -1,24 +1,81 @@
-"""The whole stack of one env, from the task to SB3's Monitor, with the learner's map inside or its penalty around."""
+"""The envs of one run, each a whole stack: from the task to SB3's Monitor, with the learner's map or penalty."""
 
 from __future__ import annotations
 
+import functools
 import importlib
+import signal
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.faults import FAULTS
 
-from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig, make_env
+from ..config import NAIVE, ArmConfig, EnvConfig, FilterConfig, LearnerConfig, check_env_id
 from ..config.types import check_name
 from .judge import ConstraintJudge
+
+
+def make_vec_env(arm: ArmConfig) -> VecEnv:
+    """Makes `arm.n_envs` envs, as `arm.vec_env` says."""
+    if arm.vec_env == "dummy":
+        return DummyVecEnv([functools.partial(make_training_env, arm)] * arm.n_envs)
+    return SubprocVecEnv([functools.partial(_in_process, arm)] * arm.n_envs, "spawn")
+
+
+def make_training_env(arm: ArmConfig) -> gym.Env[Any, Any]:
+    """One env as the arm trains in it."""
+    env = make_stack(arm.env, arm.filter, arm.learner)
+    if arm.env.reset_options:
+        env = ResetOptions(env, arm.env.reset_options)
+    return env if arm.action_repeat == 1 else sw.ActionRepeat(env, arm.action_repeat)
+
+
+class ResetOptions(gym.Wrapper[Any, Any, Any, Any]):
+    """Gives options to every reset; a reset's own come on top."""
+
+    def __init__(self, env: gym.Env[Any, Any], options: Mapping[str, Any]) -> None:
+        super().__init__(env)
+        self._options = options
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Resets the env."""
+        return self.env.reset(seed=seed, options={**self._options, **(options or {})})
+
+
+def _in_process(arm: ArmConfig) -> gym.Env[Any, Any]:
+    # Signals to the whole command (Ctrl-C, `timeout`) are for the run, which decides what becomes of its envs.
+    for which in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(which, signal.SIG_IGN)
+    return make_training_env(arm)
+
+
+def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    """Makes an env by the id and the arguments of a config.
+
+    Raises:
+        ConfigurationError: It cannot be made; whatever its own constructor says of its arguments.
+    """
+    check_env_id(env_id)  # a spawned process has not yet registered what the first one did
+    try:
+        return gym.make(env_id, **kwargs)
+    except SafeWrappersError:
+        raise
+    except Exception as error:
+        of = f" with kwargs {dict(kwargs)}" if kwargs else ""
+        raise ConfigurationError(
+            f"env: {env_id}{of} cannot be made: {type(error).__name__}: {error}"
+        ) from error
 
 
 def make_stack(
@@ -45,7 +102,7 @@ def make_stack(
     kwargs = env.kwargs if render_mode is None else {**env.kwargs, "render_mode": render_mode}
     task = make_env(env.id, kwargs)
     if env.cost is not None:
-        task = sw.CostFunction(task, _function(env.cost, "env.cost"))
+        task = sw.CostFunction(task, env.cost)
     if env.judge is not None:
         task = ConstraintJudge(task, _filtered(task, env.judge))
     if env.occlusion is not None:
@@ -82,11 +139,11 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
             return sw.protect(task, **action_filter.protect)
         except UnsupportedEnvError as error:
             raise ConfigurationError(
-                f"filter: {error}\n`safe-wrappers init FILE.yaml env=ID` writes these lines as a module with a function"
-                ' for filter: {factory: "module:function"}.'
+                f"filter: {error}\n`safe-wrappers init FILE.yaml env=ID` writes these lines as a module with a"
+                ' function, for filter: {factory: "module:function"}.'
             ) from None
     if action_filter.factory is not None:
-        factory = _function(action_filter.factory, "filter.factory")
+        factory = _factory(action_filter.factory)
         filtered: gym.Env[Any, Any] = _called("filter.kwargs", factory, task, action_filter.kwargs)
         return filtered
     return task
@@ -120,15 +177,16 @@ def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> gym.Env[An
     return leased
 
 
-def _function(name: str, where: str) -> Any:
+def _factory(name: str) -> Any:
     """What a config calls `module:function`."""
     module_name, _, function = name.partition(":")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ConfigurationError(
-            f"{where}: cannot import {module_name!r}: {error}. Modules beside the config and in the folder that one"
-            " works in are found, too."
+            f"filter.factory: cannot import {module_name!r}: {error}. Modules beside the config and in the working"
+            " folder are found, too."
         ) from None
-    check_name(function, [name for name in dir(module) if not name.startswith("_")], f"{where}: {module_name}")
+    valid = [name for name in dir(module) if not name.startswith("_")]
+    check_name(function, valid, f"filter.factory: {module_name}")
     return getattr(module, function)

@@ -21,7 +21,7 @@ from .data_pickles import pickles_of_model, read_pickle
 
 @dataclass(frozen=True)
 class Start:
-    """Whose policy a run begins with: of a file `path`; or, with an `arm`, of the run of that arm in the folder `path`.
+    """Whose policy a run begins with: of the file `path`; or, with an `arm`, of the run of that arm in that folder.
 
     `name` is as the config has it.
     """

@@ -38,9 +38,9 @@ from .folder import (
 )
 from .model import buffer_size, learner_callbacks, learning_starts, new_model, whole_rollouts
 from .policy import write_policy
+from .stack import make_training_env, make_vec_env
 from .start import Policy, Start, begin_with, policy_of_file, policy_of_model, refuse_misfit
 from .trackers import run_logger
-from .vec_envs import make_training_env, make_vec_env
 
 
 def train_run(
