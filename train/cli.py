@@ -71,8 +71,8 @@ def make_parser(command: str) -> argparse.ArgumentParser:
             add("env", metavar="ENV", help="an id of gymnasium.make")
             add("--policy", type=Path, metavar="RUN", help="a run's folder, or a model.zip of SB3")
             add("--steps", type=int, default=2000, help="control steps of each driver (default: %(default)s)")
-            what = "the page, with the same as JSON beside it (default: %(default)s)"
-            add("--output", type=Path, metavar="FILE", default=Path("diagnosis.html"), help=what)
+            what = "the same as JSON (default: %(default)s)"
+            add("--output", type=Path, metavar="FILE", default=Path("diagnosis.json"), help=what)
         what = "a module that a policy's folder may import; may be given several times"
         add("--imports", action="append", metavar="MODULE", default=[], help=what)
     elif command == "push":
@@ -188,12 +188,9 @@ def _report(_: str, options: argparse.Namespace, overrides: list[str], console: 
 
 
 def _diagnose(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
-    from .diagnosis import diagnose_command
+    from .diagnose import diagnose_command
 
-    words = shlex.join(["safe-wrappers", *sys.argv[1:]])
-    diagnose_command(
-        options.env, options.policy, options.steps, options.output, words, console, options.imports
-    )
+    diagnose_command(options.env, options.policy, options.steps, options.output, console, options.imports)
 
 
 def _enjoy(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:

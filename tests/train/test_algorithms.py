@@ -27,7 +27,8 @@ from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.report.origin import about
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.folder import finished_facts
-from safe_wrappers.train.run.model import check_task, constructor_arguments
+from safe_wrappers.train.run.model import _constructor_arguments as constructor_arguments
+from safe_wrappers.train.run.model import check_task
 from safe_wrappers.train.run.policy import SpacesEnv
 from safe_wrappers.train.run.stack import make_stack, make_vec_env
 from safe_wrappers.train.run.training import train_run
@@ -131,7 +132,7 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
     experiment = one_arm(fake_experiment, algorithm, arm)
     (arm,) = experiment.arms
     folder = run_killed_after(experiment, 1, monkeypatch, arm=0)
-    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    checkpoint = latest_checkpoint(folder / "checkpoints")
     assert checkpoint.timesteps == 64
     model = checkpoint.load_model(algorithm, make_vec_env(arm), "cpu")
     assert type(model) is ALGORITHMS[algorithm]

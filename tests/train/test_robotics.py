@@ -12,7 +12,7 @@ from safe_wrappers.train.config import check_env_id
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
 
 SILENT = Progress(lambda _: None, lambda _: None)
 
@@ -33,7 +33,7 @@ def test_fetch_reach_is_trained_and_evaluated_by_its_plain_id(fake_experiment):
     evaluate_run(arm, 0, folder, experiment.evaluation, arm.filter, SILENT)
     (row,) = read_rows(folder / "evaluation" / "filter_on.csv")
     assert row["length"] == 50
-    model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model("PPO", None, "cpu")
+    model = load_model(latest_checkpoint(folder / "checkpoints").folder, "PPO", "cpu")
     assert type(model.policy).__name__ == "MultiInputActorCriticPolicy"
 
 
