@@ -164,7 +164,6 @@ def random_looks(count):
         near = surfaces.nearest_points(scene, point)
         moving = rng.normal(size=near[1].shape)
         found += of.approach_rows(near[0], near[1], moving, near[2], v, drift, effect, always)
-        found += of.out_of_reach(some_surfaces(rng, 3), np.abs(rng.normal(size=18 + m)), always)
         outline = convex_outline(rng.normal(size=(6, 2))) if i % 2 else np.zeros((0, 2))
         ahead = rng.normal(size=(3, 2))
         ahead /= np.sqrt((ahead**2).sum(axis=1))[:, None]
@@ -189,7 +188,3 @@ def test_a_row_that_is_not_a_number_is_kept():
             wall, np.zeros(1), np.zeros(1), np.array([drift]), np.ones((1, 1)), always
         )
         assert found[1].shape == (rows, 1) and found[2].shape == (rows,)
-    reach = np.ones(19)
-    assert of.out_of_reach(wall, reach, always)[1]
-    reach[6] = np.nan
-    assert not of.out_of_reach(wall, reach, always)[1]
