@@ -9,6 +9,7 @@ from matplotlib.patches import Circle
 import safe_wrappers as sw
 from _crossing import car_tracks, road, tracked
 from _style import FORBIDDEN, INK, OFF, ON, panels
+from safe_wrappers.constraints.obstacles import distances
 
 LAYOUT = {
     "agent": [-0.4, -2.9, math.pi / 2],
@@ -38,7 +39,7 @@ def draw() -> Figure:
     x, y = np.meshgrid(np.linspace(-4.5, 4.5, 73), np.linspace(-2.0, 2.0, 33))
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     for sigmas in (3.0, 2.0, 1.0):
-        gaps = sw.constraints.TrackedDiscs(raw.car_radius, sigmas).distances(points, plant)
+        gaps = distances(sw.constraints.TrackedDiscs(raw.car_radius, sigmas), points, plant)
         for gap in gaps.T:
             ax.contourf(x, y, gap.reshape(x.shape), levels=[-9.0, 0.0], colors=[FORBIDDEN], alpha=0.17)
     for center, mean, seen in zip(

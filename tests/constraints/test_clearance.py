@@ -6,7 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked, asked, bound
+from asking import Asked, bound
 from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
@@ -157,15 +157,6 @@ def test_radius_margin_and_state_error_add_up(tmp_path, radius, state_error):
     assert farthest <= 1.0 - radius - 0.03 - state_error + 1e-6
 
 
-def test_far_away_no_rows_are_asked_for(tmp_path):
-    env = PointMass(tmp_path)
-    env.reset(seed=0)
-    clear = sw.constraints.Clearance([sw.constraints.Disc([50.0, 0.0], 0.3)], 1.5, bodies=["ball"])
-    clear = asked(env, clear)
-    rows = clear.rows()
-    assert rows.normals.shape == (0, 2) and rows.offsets.shape == (0,)
-
-
 def test_spheres_and_boxes_around_an_arm():
     # Reacher's fingertip against a pillar: best effort, so the truth is only asked not to get worse than the
     # unfiltered arm, and the infeasible steps to be told.
@@ -213,15 +204,6 @@ def test_constructor_refuses_nonsense(arguments, message):
         sw.constraints.Clearance(
             **{"obstacles": [sw.constraints.Disc([0, 0], 1)], "braking": 1.0, **arguments}
         )
-
-
-def test_on_an_analytic_plant_the_indices_are_asked_for():
-    plant = sw.AnalyticPlant(
-        f=np.zeros_like, g=lambda x: np.ones((2, 1)), state=lambda env: env.state, control_dt=0.05
-    )
-    plant.bind(gym.make("Pendulum-v1"))
-    with pytest.raises(ConfigurationError, match=r"say where the point is in the state: position=\[0, 1\]"):
-        sw.constraints.Clearance([sw.constraints.Plane([1.0], [-1.0])], 1.0).bind(plant)
 
 
 @pytest.mark.parametrize("frame", [{"bodies": ["ball"]}, {"sites": ["nose"], "geoms": []}])
