@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.nearest_discs import squashed
+from safe_wrappers.control.numerics.planar import squashed
 from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant

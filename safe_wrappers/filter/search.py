@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
-from safe_wrappers.filter.fallback import Fallback
-from safe_wrappers.filter.projection import (
+from safe_wrappers.control.numerics.projection import (
     Projection,
     Status,
     cast_inside,
     keeps_rows,
     project_unchecked,
 )
+from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
+from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.plants.plant import Plant
 
 Rows = tuple[Array, Array]

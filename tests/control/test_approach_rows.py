@@ -6,7 +6,7 @@ import numpy as np
 
 from safe_wrappers.control.backup import approach_rows as of
 from safe_wrappers.control.numerics import surfaces
-from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
+from safe_wrappers.control.numerics.planar import clearances_on_a_course, convex_outline
 
 
 def some_surfaces(rng, d):

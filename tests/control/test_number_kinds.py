@@ -8,10 +8,10 @@ from safe_wrappers.control.estimation import covariance, kalman, observability
 from safe_wrappers.control.filtering import cbf, manipulability
 from safe_wrappers.control.handover import polynomials, smoothstep, splines
 from safe_wrappers.control.legged import predicted_positions, support
+from safe_wrappers.control.numerics import projection
 from safe_wrappers.control.teleop import passivity
 from safe_wrappers.control.vehicle import slip
 from safe_wrappers.control.watchdog import leases, sampling
-from safe_wrappers.filter import projection
 
 EYE = [[1, 0], [0, 1]]
 EYE3 = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]

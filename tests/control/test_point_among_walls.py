@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from safe_wrappers.control.backup import point_among_walls as of
 from safe_wrappers.control.backup.damped_axis import damped_axis
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
-from safe_wrappers.control.numerics.rectangles import apart
+from safe_wrappers.control.numerics.planar import apart
 
 WALLS = [(-3.0, 3.0, -3.0, -2.0), (-3.0, 3.0, 2.0, 3.0), (-3.0, -2.0, -2.0, 2.0), (2.0, 3.0, -2.0, 2.0)]
 BLOCK = (-0.5, 0.5, -0.5, 0.4)

@@ -24,7 +24,7 @@ from safe_wrappers.control.backup.point_among_walls import (
     stop,
 )
 from safe_wrappers.control.numerics.compiled import compiled, hypot
-from safe_wrappers.control.numerics.rectangles import Rectangle, closer, gaps, nearest, one_of
+from safe_wrappers.control.numerics.planar import Rectangle, closer, gaps, nearest, one_of
 
 HAIR_M: Final = 1e-7
 """Extra distance of corrections, for rounding to float32."""

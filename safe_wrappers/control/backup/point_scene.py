@@ -15,7 +15,7 @@ from safe_wrappers.control.backup.point_among_walls import (
 )
 from safe_wrappers.control.backup.point_decision import admits, backup, bounds, near
 from safe_wrappers.control.numerics.compiled import compiled
-from safe_wrappers.control.numerics.rectangles import Rectangle
+from safe_wrappers.control.numerics.planar import Rectangle
 
 PROPOSAL, CANDIDATE, UNRESOLVED = 0, 2, 7
 """What `closest_admitted` returns: a `Stage` of the search, or that it has found no admitted control."""

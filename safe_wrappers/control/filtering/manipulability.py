@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import Array, finite_array, finite_arrays, positive
-from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
 
 EPSILON = float(np.finfo(np.float64).eps)
@@ -78,8 +77,8 @@ def chain_derivative(linear: ArrayLike, angular: ArrayLike) -> Array:
         raise ConfigurationError(f"linear and angular have the shape (..., 3, n), got {v.shape}")
     v, w = np.swapaxes(v, -1, -2), np.swapaxes(w, -1, -2)  # (..., n, 3)
     n = v.shape[-2]
-    carried = cross(w[..., :, None, :], v[..., None, :, :])  # w_k x v_j
-    turned = cross(w[..., :, None, :], w[..., None, :, :])  # w_k x w_j
+    carried = np.cross(w[..., :, None, :], v[..., None, :, :])  # w_k x v_j
+    turned = np.cross(w[..., :, None, :], w[..., None, :, :])  # w_k x w_j
     before = np.tri(n, dtype=bool).T[..., None]  # joint k not after joint j
     moves = np.where(before, carried, np.swapaxes(carried, -2, -3))  # else w_j x v_k
     turns = np.where(before, turned, 0.0)
