@@ -76,8 +76,7 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         return
 
     from .experiment import evaluate_experiment, summarize_experiment, train_experiment
-    from .report import verdict, write_report
-    from .report.terminal_table import comparison_table
+    from .report import comparison_table, verdict, write_report
 
     experiment = parse_experiment(settings[0])
     if options.command in ("train", "compare"):
@@ -153,25 +152,20 @@ _WITHOUT_EXPERIMENT: Final = {
 
 
 def _report(options: argparse.Namespace, experiments: list[ExperimentConfig], console: Console) -> None:
-    """Of one config its page; of several a page each, and one that puts them side by side."""
+    """A page of each config."""
     from .experiment import summarize_experiment
-    from .report import write_overview, write_report
+    from .report import write_report
 
-    folders = [experiment.folder for experiment in experiments]
-    for folder in folders:
-        if folders.count(folder) > 1:
-            raise ConfigurationError(f"report: two configs name the same experiment, {str(folder)!r}.")
-    entries = [(experiment, summarize_experiment(experiment)) for experiment in experiments]
-    for config, (experiment, summary) in zip(options.configs, entries, strict=True):
-        alone = options.output if len(entries) == 1 else None
-        path = write_report(experiment, summary, _compare_command(config, options.overrides), alone)
+    if options.output and len(experiments) > 1:
+        raise ConfigurationError(
+            "report: --output is for a single config; of several each page lies beside its runs."
+        )
+    for config, experiment in zip(options.configs, experiments, strict=True):
+        summary = summarize_experiment(experiment)
+        command = _compare_command(config, options.overrides)
+        path = write_report(experiment, summary, command, options.output)
         console.print(f"Report: {path}", soft_wrap=True, highlight=False)
         console.print(f"Files: {experiment.folder}", soft_wrap=True, highlight=False)
-    if len(entries) > 1:
-        path = options.output or experiments[0].output / "overview.html"
-        again = ["safe-wrappers", "report", *map(str, options.configs), *options.overrides]
-        write_overview(entries, path, shlex.join(again))
-        console.print(f"Overview: {path}", soft_wrap=True, highlight=False)
 
 
 def _compare_command(config: Path, overrides: Sequence[str]) -> str:

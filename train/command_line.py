@@ -110,7 +110,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--output",
         type=Path,
         metavar="FILE",
-        help="of report: where to (default: report.html beside the runs; of several, overview.html); of diagnose "
+        help="of report: where to (default: report.html beside the runs); of diagnose "
         "(default: diagnosis.json); of enjoy: a film of a typical episode "
         "and the worst one, FILM.webp",
     )

@@ -9,8 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from .config import ArmConfig, ExperimentConfig
-from .evaluation.evaluate import evaluate_run
-from .evaluation.intact import check_training_table
+from .evaluation.evaluate import check_training_table, evaluate_run
 from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task, whole_rollouts
 from .policies.card import write_card

@@ -35,8 +35,7 @@ def test_it_prints_a_line_per_episode(run, capsys):
     )
     assert [re.fullmatch(LINE + r", [\d.]+ % changed", line)[1] for line in lines[1:4]] == ["0", "1", "2"]
     assert (
-        lines[4].startswith("filtered, filter on, 3 episodes: return ")
-        and " of 60 steps in violation, " in lines[4]
+        lines[4].startswith("filtered, filter on, mean of 3 episodes: return ") and " 60 steps, " in lines[4]
     )
     assert main(["enjoy", str(run), "--episodes", "1", "--filter", "none"]) == 0
     _, line, _ = capsys.readouterr().out.splitlines()
@@ -58,8 +57,8 @@ def test_both_drives_without_the_filter_and_with_it_and_films_what_was_trained(r
     film = tmp_path / "film.webp"
     assert main(["enjoy", str(run), "--episodes", "2", "--filter", "both", "--output", str(film)]) == 0
     _, off, on, last = capsys.readouterr().out.splitlines()
-    assert off.startswith("filtered, filter off, 2 episodes: return ") and "changed" not in off
-    assert on.startswith("filtered, filter on, 2 episodes: return ") and on.endswith("% changed")
+    assert off.startswith("filtered, filter off, mean of 2 episodes: return ") and "changed" not in off
+    assert on.startswith("filtered, filter on, mean of 2 episodes: return ") and on.endswith("% changed")
     assert last.startswith(f"Film: {film}") and film.exists()
 
 

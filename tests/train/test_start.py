@@ -15,7 +15,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train import experiment as experiment_steps
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.experiment import _start, generations, train_experiment
-from safe_wrappers.train.report.origin import about
+from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.reset_options import ResetOptions
 from safe_wrappers.train.run.training import finished_checkpoint

@@ -13,8 +13,7 @@ from safe_wrappers.errors import RunStateError
 from ..atomic import write_text
 from ..checksums import read_facts
 from ..config import ArmConfig, FilterConfig
-from ..evaluation.evaluate import conditions
-from ..evaluation.intact import check_evaluation
+from ..evaluation.evaluate import check_evaluation, conditions
 from ..evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
 from ..evaluation.summary import CONDITIONS, episode_file, number, seed_row
 from ..run.portable import CONFIG, FILTER, POLICY
