@@ -9,7 +9,7 @@ from test_report import Page
 
 from safe_wrappers.train.config import FilterConfig
 from safe_wrappers.train.evaluation.summary import summarize
-from safe_wrappers.train.policies.card import write_card
+from safe_wrappers.train.policies import write_card
 from safe_wrappers.train.report import write_report
 
 HOSTILE = "\"'><script>alert(1)<b onload=x a='\n```&amp;|# "

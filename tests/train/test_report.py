@@ -14,8 +14,7 @@ from made_up import SILENT as JUDGES_NOTHING
 from made_up import episode, fill, steps, write_evaluation, write_training
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.config import parse_experiment, read_config
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.evaluation.summary import learning_curve, summarize
 from safe_wrappers.train.report import write_report

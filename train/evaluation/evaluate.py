@@ -11,21 +11,16 @@ from typing import Any, Final
 import gymnasium as gym
 
 from safe_wrappers import info as keys
-from safe_wrappers.errors import RunStateError
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
-from ..atomic import write_json
-from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EvaluationConfig, FilterConfig
-from ..processes.job import Progress
-from ..processes.lock import only_writer
-from ..processes.storage import telling_of_storage
-from ..run.folder import EVALUATION, check_finished, finished_facts
+from ..files import only_writer, read_json, write_json, write_rows
+from ..processes import Progress, RunStoppedError
+from ..run.folder import EVALUATION, check_finished
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger
 from ..run.training import finished_checkpoint
-from ..tables import write_rows
 from .scene import Scene, SceneRecorder, save_scenes
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
 
@@ -51,31 +46,6 @@ def conditions(arm: ArmConfig, default_filter: FilterConfig) -> dict[str, Filter
     """The filter that is on in each condition of an arm's evaluation; "filter_on" is left out where there is none."""
     used = arm.filter if arm.filter.kind != "none" else default_filter
     return {"filter_off": FilterConfig()} | ({"filter_on": used} if used.kind != "none" else {})
-
-
-def check_training_table(run: Path) -> None:
-    """Refuses what a run noted of its training, if it is damaged.
-
-    Raises:
-        RunStateError: It is; says which file, and what makes it again.
-    """
-    _check(run, finished_facts(run), "`safe-wrappers train` (or `compare`) puts it back.")
-
-
-def check_evaluation(run: Path) -> None:
-    """Refuses a run's evaluation, if it is damaged.
-
-    Raises:
-        RunStateError: It is; says which file, and what makes it again.
-    """
-    out, remedy = evaluation_folder(run), "`safe-wrappers evaluate` (or `compare`) makes it again."
-    _check(out, read_facts(out / STATE_FILE, remedy), remedy)
-
-
-def _check(folder: Path, facts: dict[str, Any], remedy: str) -> None:
-    wrong = damage(folder, facts.get("files", {}))
-    if wrong is not None:
-        raise RunStateError(f"{wrong}; {remedy}")
 
 
 def evaluate_run(
@@ -104,7 +74,7 @@ def evaluate_run(
             it.
     """
     check_finished(arm, folder)
-    with telling_of_storage(folder), only_writer(folder):
+    with only_writer(folder):
         _evaluate(arm, seed, folder, settings, conditions(arm, default_filter), progress)
 
 
@@ -123,11 +93,11 @@ def _evaluate(
         "filter": filters.get("filter_on", FilterConfig()).plain(),
         "timesteps": checkpoint.timesteps,
     }
-    if _is_done(out, state):
+    if read_json(out / STATE_FILE) == state:
         return
     (out / STATE_FILE).unlink(missing_ok=True)
     shutil.rmtree(out, ignore_errors=True)  # or after a kill there would be rows of two settings
-    policy = TrainedPolicy(arm, checkpoint)
+    policy = TrainedPolicy(arm, checkpoint.folder)
     logger = run_logger(arm, seed, folder)
     for at, (condition, used) in enumerate(filters.items()):
         rows: list[dict[str, Any]] = []
@@ -142,23 +112,15 @@ def _evaluate(
                 for key, value in figures.items():
                     logger.record_mean(f"evaluation_{condition}/{key}", float(value))
                 progress.steps(at * settings.episodes + len(rows))
+                if progress.stopping():
+                    raise RunStoppedError("stopped; this evaluation begins again")
             log = steps.finish()
         logger.dump(checkpoint.timesteps)
         write_rows(out / f"{condition}.csv", EVALUATION_COLUMNS, rows)
         save_scenes(out / f"{condition}.npz", scenes)
         save_steps(out / f"{condition}_steps.npz", log)
     logger.close()
-    write_json(out / STATE_FILE, state | {"files": checksums(sorted(out.iterdir()))})
-
-
-def _is_done(out: Path, state: Mapping[str, Any]) -> bool:
-    """Whether an evaluation like this one is there, whole."""
-    try:
-        found = read_facts(out / STATE_FILE, "")
-    except RunStateError:
-        return False
-    files = found.pop("files", {})
-    return found == state and damage(out, files) is None
+    write_json(out / STATE_FILE, state)
 
 
 def _episode(

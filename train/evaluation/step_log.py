@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array
 
-from ..atomic import write_bytes
+from ..files import write_bytes
 
 MOST_STEPS: Final = 10_000
 """Steps kept of one run under one condition: the first ones. Ten episodes of 1000 steps; 0.1 to 4 MB."""

@@ -15,8 +15,6 @@ import yaml
 
 from safe_wrappers.errors import RunStateError
 
-from ..atomic import write_text
-from ..checksums import read_facts
 from ..config import ArmConfig, ExperimentConfig
 from ..evaluation.episode_selection import compared_pairs, shown_episode
 from ..evaluation.evaluate import evaluated_steps, evaluation_folder
@@ -24,9 +22,8 @@ from ..evaluation.metrics import OF_THE_FILTER, REGISTRY
 from ..evaluation.scene import load_scene
 from ..evaluation.step_log import MOST_STEPS, StepLog, pool
 from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Curve, Summary, judged_by, learning_curve, over_seeds
-from ..run.folder import finished_facts
-from ..run.start import START_FILE
-from ..tables import Row, write_rows
+from ..files import Row, read_json, write_rows, write_text
+from ..run.folder import START_FILE, finished_facts
 from ..videos.record import Video, load_video, video_path, video_problem
 from .drawing import Picture, color_of, data_uri
 from .figures import CONDITIONS, curve_picture, over_the_episode, plane_picture, refusals
@@ -225,7 +222,7 @@ def about(experiment: ExperimentConfig) -> str:
     begun = ""
     for arm in experiment.arms:
         path = experiment.run_folder(arm, experiment.seeds[0]) / START_FILE
-        start = read_facts(path, "delete it, and the page says nothing of the start")
+        start = read_json(path)
         if start:
             begun += (
                 f" Arm {arm.name} began with the policy of {start['from']} after {start['timesteps']:,} steps, which"

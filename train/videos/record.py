@@ -10,18 +10,16 @@ from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
-from safe_wrappers.errors import ConfigurationError, RunStateError
+from safe_wrappers.errors import ConfigurationError
 
-from ..atomic import write_bytes, write_json
-from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
 from ..evaluation.episode_selection import ShownEpisode, shown_episode
 from ..evaluation.evaluate import conditions
-from ..processes.job import Job, Progress
-from ..processes.parallel import RunsFailedError, environment, run_jobs
+from ..files import read_json, write_bytes, write_json
+from ..processes import Job, Progress, RunsFailedError, environment
+from ..processes.parallel import run_jobs
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
-from ..run.trackers import track_film
 from ..run.training import finished_checkpoint
 from .film import film_episodes, for_film
 from .rendering import find_rendering
@@ -44,7 +42,7 @@ def video_path(experiment: ExperimentConfig, arm: ArmConfig, condition: str) -> 
 
 
 def load_video(path: Path) -> Video | None:
-    """Reads a video back; None if there is none, or it is damaged."""
+    """Reads a video back; None if there is none."""
     facts = _facts(path)
     if not facts or not path.exists():
         return None
@@ -52,12 +50,8 @@ def load_video(path: Path) -> Video | None:
 
 
 def _facts(path: Path) -> dict[str, Any]:
-    """What was noted of a film; empty where there is none, or not as it was written."""
-    try:
-        facts = read_facts(path.with_suffix(".json"), "")
-    except RunStateError:
-        return {}
-    return {} if damage(path.parent, facts.get("files", {})) is not None else facts
+    """What was noted of a film; empty where there is none."""
+    return read_json(path.with_suffix(".json"))
 
 
 def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
@@ -71,9 +65,7 @@ def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
 def video_problem(experiment: ExperimentConfig) -> str:
     """The one line that says why there are no videos; empty if nothing is known to stand against them."""
     path = experiment.folder / "videos" / _PROBLEM
-    return str(
-        read_facts(path, "`safe-wrappers evaluate` (or `compare`) writes it again.").get("problem", "")
-    )
+    return str(read_json(path).get("problem", ""))
 
 
 def record_videos(experiment: ExperimentConfig, console: Console) -> None:
@@ -124,10 +116,6 @@ def _record_env(experiment: ExperimentConfig, env: EnvConfig, shown: ShownEpisod
             run_jobs(jobs, experiment.workers, console, "Videos")
     except RunsFailedError as error:
         return f"filming {env.id} failed: {str(error).strip().splitlines()[-1]}"
-    for job in jobs:
-        arm, _, folder, _, path = job.arguments
-        steps = finished_checkpoint(arm, shown.seed, folder).timesteps
-        track_film(arm, shown.seed, folder, path.stem.removeprefix(f"{arm.name}_"), path, steps)
     return ""
 
 
@@ -145,7 +133,7 @@ def record_video(
         progress: Where to report to.
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
-    policy = TrainedPolicy(arm, checkpoint)
+    policy = TrainedPolicy(arm, checkpoint.folder)
     filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
     with closing(for_film(make_stack(filmed, used, arm.learner.in_evaluation))) as env:
         animation, speed, films = film_episodes(policy, env, shown.filmed)
@@ -154,7 +142,6 @@ def record_video(
         "state": _state(arm, used, shown, checkpoint.timesteps),
         "speed": speed,
         "episodes": [(film.title, len(film.changed), sum(film.changed)) for film in films],
-        "files": checksums([path]),
     }
     write_json(path.with_suffix(".json"), facts)
     progress.steps(1)

@@ -18,8 +18,7 @@ import numpy as np
 
 import safe_wrappers  # noqa: F401 (registers its tasks)
 
-from ..config import EnvConfig
-from ..config.env_ids import check_env_id
+from ..config import EnvConfig, check_env_id
 
 _SECONDS: Final = 60.0
 """A GL library that waits for a display never comes back."""
