@@ -46,8 +46,10 @@ def enjoy_command(
         imports: As `load_policy` takes it.
 
     Raises:
-        ConfigurationError: No such run, or the task cannot be drawn in this way.
+        ConfigurationError: No such run, no episode, or the task cannot be drawn in this way.
     """
+    if episodes < 1:
+        raise ConfigurationError(f"--episodes: expected at least 1, got {episodes}")
     trained = load_policy(run, other_filter=action_filter != "trained", imports=imports)
     _check_modes(trained, "human" if window else "rgb_array" if film is not None else None)
 

