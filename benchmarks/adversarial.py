@@ -3,7 +3,6 @@
     python -m benchmarks.adversarial                     # 1,000,000 filtered steps per level, 5 drivers
     python -m benchmarks.adversarial --mismatch          # the plant wrong by 20 % in mass and damping
     python -m benchmarks.adversarial --off --steps 20000 # the drivers unfiltered
-    python -m benchmarks.adversarial --price             # what each inset costs the goal-seeking driver
     python -m benchmarks.adversarial --robot car --steps 500000   # the same for SafeCarGoal, 7 drivers
 
 A violation is a control step in which the env's own truth was broken at any physics substep
@@ -26,16 +25,6 @@ from benchmarks.tables import RESULTS, keep, markdown, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 DRIVERS = {"point": drivers.DRIVERS, "car": car_drivers.DRIVERS}
-VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
-    "point": {
-        "brake and coast, detour": {},
-        "brake and coast": {"detour": False},
-        "coast only, detour": {"brake": False},
-        "coast only": {"brake": False, "detour": False},
-    },
-    "car": {"detour": {}, "no detour": {"detour": False}},
-}
-"""The first is the recipe."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +39,6 @@ class Job:
     mass: float = 1.0
     damping: float = 1.0
     uncertainty: float = 0.0
-    variant: str = "brake and coast, detour"
     robot: str = "point"
 
 
@@ -61,9 +49,7 @@ def run(job: Job) -> dict[str, Any]:
     if job.filtered:
         plant = sw.MujocoPlant()
         plant.perturb(mass=job.mass, damping=job.damping)
-        options = dict(VARIANTS[job.robot][job.variant])
-        if job.uncertainty:
-            options["uncertainty"] = job.uncertainty
+        options = {"uncertainty": job.uncertainty} if job.uncertainty else {}
         env = sw.protect(env, plant=plant, **options)
     raw = env.unwrapped
     driver = DRIVERS[job.robot][job.driver](raw, np.random.default_rng(job.seed))
@@ -95,32 +81,24 @@ def jobs(arguments: argparse.Namespace) -> list[Job]:
     """What to run."""
     robot = arguments.robot
     levels, names = arguments.level, list(DRIVERS[robot])
-    variants = list(VARIANTS[robot])
     steps = arguments.steps // len(names)
-    kind = {"variant": variants[0], "robot": robot}
-    if arguments.price:
-        pairs = itertools.product(levels, variants)
-        filtered = [Job(lv, "goal-seeking", arguments.steps, 1, variant=v, robot=robot) for lv, v in pairs]
-        return filtered + [
-            Job(lv, "goal-seeking", arguments.steps, 1, filtered=False, **kind) for lv in levels
-        ]
     if arguments.mismatch:
         wrong = list(itertools.product((0.8, 1.2), repeat=2))
         grid = itertools.product(levels, names, wrong)
         # True is the plant's times 1 / factor: 0.8 needs 25 % of uncertainty, 1.2 needs 17 %.
         return [Job(lv, d, steps // 4, 2, True, m, c, 0.25) for lv, d, (m, c) in grid]
     return [
-        Job(lv, d, steps // arguments.parts, part, filtered=not arguments.off, **kind)
+        Job(lv, d, steps // arguments.parts, part, filtered=not arguments.off, robot=robot)
         for lv, d, part in itertools.product(levels, names, range(arguments.parts))
     ]
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown: one line per level, driver and variant, episodes and plants pooled."""
+    """Markdown: one line per level and driver, episodes and plants pooled."""
     lines = []
 
     def label(row: dict[str, Any]) -> tuple[Any, ...]:
-        return row["level"], row["driver"], row["variant"] if row["filtered"] else "off"
+        return row["level"], row["driver"], "on" if row["filtered"] else "off"
 
     for key, group in itertools.groupby(sorted(rows, key=label), label):
         part = list(group)
@@ -142,20 +120,19 @@ def main() -> None:
     """Run the jobs in parallel, print the table, keep the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--level", type=int, nargs="+", default=[1, 2], choices=[1, 2])
-    parser.add_argument("--steps", type=int, default=1_000_000, help="per level (with --price: per variant)")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="per level")
     parser.add_argument("--parts", type=int, default=4, help="independent runs per driver")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     parser.add_argument("--robot", choices=list(DRIVERS), default="point")
     mode = parser.add_mutually_exclusive_group()
     mode.add_argument("--mismatch", action="store_true")
     mode.add_argument("--off", action="store_true")
-    mode.add_argument("--price", action="store_true")
     arguments = parser.parse_args()
     if arguments.mismatch and arguments.robot != "point":
         parser.error("--mismatch is for the point: the car's filter declares no uncertainty")
     with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
         rows = pool.map(run, jobs(arguments), chunksize=1)
-    name = next((m for m in ("mismatch", "off", "price") if getattr(arguments, m)), "filtered")
+    name = next((m for m in ("mismatch", "off") if getattr(arguments, m)), "filtered")
     name = name if arguments.robot == "point" else f"{arguments.robot}_{name}"
     keep(RESULTS, f"adversarial_{name}", rows, table(rows))
 

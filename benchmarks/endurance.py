@@ -40,7 +40,6 @@ from benchmarks import chunks, trained_adversary
 from benchmarks.cases import CASES
 from benchmarks.endurance_report import collected, table
 from benchmarks.mujoco_drivers import Maker, corner_seeking
-from benchmarks.scaling import resident_kb
 from benchmarks.searching_drivers import SEARCHES, SearchingDriver
 from benchmarks.tables import RESULTS
 from benchmarks.trained_adversary import EXAMPLES, FLAGS, Tally
@@ -271,7 +270,8 @@ def used_mb() -> float:
     """Memory of this process, MB, without what is free in the allocator: MuJoCo's buffers leave holes of 10 MB."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
-    return resident_kb() / 1024.0
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2.0**20
 
 
 def _process() -> str:

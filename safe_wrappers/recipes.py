@@ -194,9 +194,9 @@ def _joint_speeds(
 
 LOOK_AHEAD_BELOW: Final = {"HalfCheetah": 0.8, "Hopper": 0.7, "Walker2d": 0.7, "Ant": 0.8, "Humanoid": 0.7}
 """Shares of the speed limit. Controls that left more after their own step were never refused by the look-ahead
-(`benchmarks/look_ahead.py`); Swimmer's were, whatever they left."""
+under four kinds of drivers; Swimmer's were, whatever they left."""
 EULER_LOOK_AHEAD: Final = ("Hopper", "Walker2d")
-"""Robots on which a look-ahead by Euler steps leaves no more steps infeasible (`benchmarks/euler_look_ahead.py`)."""
+"""Robots on which a look-ahead by Euler steps leaves no more steps infeasible than one by its own."""
 
 
 def _velocity(robot: str, margin: float = 0.02, horizon: int = 3) -> Callable[..., Recommended]:

@@ -3,10 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from episodes import actions
+from wrapper_examples import CASES, build, example, inside
 
 import safe_wrappers as sw
-from benchmarks.faults.episodes import actions
-from benchmarks.faults.wrapper_examples import CASES, build, example, inside
 from safe_wrappers import info as keys
 from safe_wrappers.wrappers.faults import DroppedRefreshes
 

@@ -24,9 +24,9 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from wrapper_examples import CASES, build
 
 import safe_wrappers as sw
-from benchmarks.faults.wrapper_examples import CASES, build
 from safe_wrappers import info as keys
 from safe_wrappers.errors import SafeWrappersError
 

@@ -1,6 +1,6 @@
 """What Gymnasium asks of a wrapper, over every wrapper that the library exports.
 
-They are found by `safe_wrappers.__all__`; a new one needs an example in benchmarks/faults/wrapper_examples.py.
+They are found by `safe_wrappers.__all__`; a new one needs an example in tests/wrapper_examples.py.
 """
 
 import ast
@@ -14,12 +14,10 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from episodes import actions, lowest, trace
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
-
-import safe_wrappers as sw
-from benchmarks.faults.episodes import actions, lowest, trace
-from benchmarks.faults.wrapper_examples import (
+from wrapper_examples import (
     CASES,
     CHUNKED,
     DISCRETE,
@@ -34,6 +32,8 @@ from benchmarks.faults.wrapper_examples import (
     inside,
     made,
 )
+
+import safe_wrappers as sw
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import UnsupportedEnvError
 

@@ -5,9 +5,8 @@ import contextlib
 import gymnasium as gym
 import numpy as np
 import pytest
-
-from benchmarks.faults.episodes import actions
-from benchmarks.faults.wrapper_examples import CASES, build
+from episodes import actions
+from wrapper_examples import CASES, build
 
 
 @pytest.mark.parametrize(("name", "case"), CASES)

@@ -9,11 +9,11 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from episodes import plain
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import safe_wrappers.envs
-from benchmarks.faults.episodes import plain
 from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS, register_envs
 
 GOAL_IDS = POINT_GOAL_IDS + CAR_GOAL_IDS

@@ -1,1 +1,0 @@
-"""The fault matrix: every wrapper and every constraint under every fault (`python -m benchmarks.fault_matrix`)."""

@@ -1,1 +1,0 @@
-"""Mutants: small mistakes in the code that the tests around it have to find; `python -m benchmarks.mutants`."""
