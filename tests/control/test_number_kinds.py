@@ -21,8 +21,6 @@ SQUARE = [[0, 0], [2, 0], [2, 2], [0, 2]]
 CORNERS = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
 
 CALLS = {
-    "lie_derivatives": (cbf.lie_derivatives, [[1, 2], [3, 4], EYE]),
-    "cbf_rows": (cbf.cbf_rows, [2, [3, 1], 2]),
     "numerical_gradient": (lambda x: cbf.numerical_gradient(lambda y: y @ y, x), [[3, 4]]),
     "complementarity_residuals": (impact.complementarity_residuals, [[1, 0], [0, 2]]),
     "discretise": (covariance.discretise, [CHAIN, EYE, 2]),
