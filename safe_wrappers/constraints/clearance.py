@@ -21,7 +21,7 @@ from safe_wrappers.control.backup.stopping import (
     approaches,
     out_of_reach,
 )
-from safe_wrappers.control.numerics.nearest_discs import squashed
+from safe_wrappers.control.numerics.planar import squashed
 from safe_wrappers.drawing.marks import Mark, segment
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from safe_wrappers.control.backup import stopping as of
 from safe_wrappers.control.backup.stopping import held_limit, held_stop
 from safe_wrappers.control.numerics import surfaces
-from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
+from safe_wrappers.control.numerics.planar import clearances_on_a_course, convex_outline
 
 POSITIVE = st.floats(0.05, 5.0)
 
