@@ -18,7 +18,6 @@ from ..config import ExperimentConfig
 from ..evaluation.episode_selection import compared_pairs, shown_episode
 from ..evaluation.evaluate import evaluated_steps, evaluation_folder
 from ..evaluation.metrics import OF_THE_FILTER, REGISTRY
-from ..evaluation.scene import load_scene
 from ..evaluation.step_log import MOST_STEPS, StepLog, pool
 from ..evaluation.summary import (
     SEEDS_FOR_AN_INTERVAL,
@@ -37,7 +36,7 @@ from .drawing import Picture, color_of, data_uri
 from .figures import CONDITIONS, curve_picture, over_the_episode, plane_picture, refusals
 from .tables import RUN_COLUMNS, SHORT, every_metric, run_rows, short_rows
 from .verdict import compare, percent, verdict
-from .where import place_pictures, scene_picture
+from .where import Scene, place_pictures, scene_pictures
 
 _PACKAGES: Final = (
     "safe-wrappers",
@@ -113,7 +112,7 @@ def write_report(
             for condition, words in CONDITIONS.items()
             if (video := load_video(video_path(experiment, arm, condition))) is not None
         ],
-        scenes=list(_scenes(experiment)),
+        scenes=_scenes(experiment),
         plane=plane_picture(summary, names) if summary.judged else None,
         acting=acting,
         interventions=[] if not acting else [
@@ -184,22 +183,26 @@ def _places(experiment: ExperimentConfig, acting: dict[str, StepLog]) -> Iterato
             yield from place_pictures(filtered.name, acting[filtered.name], bare.name, off.get(bare.name))
 
 
-def _scenes(experiment: ExperimentConfig) -> Iterator[Picture]:
+def _scenes(experiment: ExperimentConfig) -> list[Picture]:
     """The shown episode seen from above, for tasks that publish where things are."""
     shown = shown_episode(experiment)
     pair = next(iter(compared_pairs(experiment)), None)
-    wanted, found = [(experiment.arms[0], "filter_off")], []
+    wanted = [(experiment.arms[0], "filter_off")]
     if pair is not None:
         wanted = [(pair.bare, "filter_off"), (pair.filtered, "filter_on")]
+    scenes = []
     for arm, condition in wanted if shown is not None else ():
         assert shown is not None
-        path = evaluation_folder(experiment.run_folder(arm, shown.seed)) / f"{condition}.npz"
-        scene = load_scene(path, shown.episode_seed)
-        if scene is not None:
-            names = [each.name for each in experiment.arms]
+        folder = experiment.run_folder(arm, shown.seed)
+        places = read_json(evaluation_folder(folder) / f"{condition}_places.json").get(
+            str(shown.episode_seed)
+        )
+        log = evaluated_steps(folder, condition)
+        if places and log is not None and (log.episode_seed == shown.episode_seed).any():
+            color = color_of(arm.name, [each.name for each in experiment.arms])
             title = f"{arm.name}, filter {CONDITIONS[condition]}, from above"
-            found.append((title, scene, color_of(arm.name, names)))
-    yield from (scene_picture(*each, [scene for _, scene, _ in found]) for each in found)
+            scenes.append(Scene(title, color, log, log.episode_seed == shown.episode_seed, places))
+    return scene_pictures(scenes)
 
 
 def _film(video: Video) -> str:
