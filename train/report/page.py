@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
@@ -38,16 +38,7 @@ from .tables import RUN_COLUMNS, SHORT, every_metric, run_rows, short_rows
 from .verdict import compare, percent, verdict
 from .where import Scene, place_pictures, scene_pictures
 
-_PACKAGES: Final = (
-    "safe-wrappers",
-    "gymnasium",
-    "mujoco",
-    "stable-baselines3",
-    "torch",
-    "numpy",
-    "qpsolvers",
-    "daqp",
-)
+_PACKAGES: Final = ("safe-wrappers", "gymnasium", "mujoco", "stable-baselines3", "torch", "numpy", "daqp")
 _CURVES: Final = {
     "return": ("Return", "return per episode"),
     "cost": ("Cost", "cost per episode"),
@@ -131,7 +122,7 @@ def write_report(
         learners={arm.name: arm.learner.kind for arm in experiment.arms if arm.filter.kind != "none"},
         registry=REGISTRY,
         command=command,
-        versions=list(_versions()),
+        versions=[("python", platform.python_version()), *((each, version(each)) for each in _PACKAGES)],
         settings=yaml.safe_dump(values | {"arms": list(values["arms"])}, sort_keys=False),
         every=list(every_metric(experiment, summary)),
     )  # fmt: skip
@@ -237,12 +228,3 @@ def about(experiment: ExperimentConfig) -> str:
         f"{kinds}, {how_long} steps, {seeds} seed{'s' * (seeds > 1)}; evaluation on"
         f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed.{begun}"
     )
-
-
-def _versions() -> Iterator[tuple[str, str]]:
-    yield "python", platform.python_version()
-    for package in _PACKAGES:
-        try:
-            yield package, version(package)
-        except PackageNotFoundError:
-            continue

@@ -68,11 +68,12 @@ def _scene_picture(scene: Scene, inside: NDArray[np.floating]) -> Picture:
             ("goal", places["goal_radius"], _GOAL),
             ("vase", 0.1, _VASE),
         ):
+            size = float(np.max(radius, initial=0.0))
             for at, place in enumerate(places[what]):
                 label = what if at == 0 else None
-                axes.add_patch(Circle(place[:2], radius or 0.0, facecolor=hue, alpha=0.4, label=label))
+                axes.add_patch(Circle(place[:2], size, facecolor=hue, alpha=0.4, label=label))
         for at, place in enumerate(places["goal"], start=1):
-            axes.text(*place[:2], str(at), color=_GOAL, ha="center", va="center", weight="bold")
+            axes.text(place[0], place[1], str(at), color=_GOAL, ha="center", va="center", weight="bold")
         axes.plot(*path.T, color=scene.color, linewidth=1.3, label="path")
         axes.plot(*path[0], "o", markerfacecolor="none", color="black", linestyle="none", label="start")
         for flags, what, mark, size in (
@@ -80,7 +81,7 @@ def _scene_picture(scene: Scene, inside: NDArray[np.floating]) -> Picture:
             (violated, "in violation", BAD, 14),
         ):
             if flags.any():
-                axes.scatter(*path[flags].T, s=size, color=mark, zorder=3, label=what)
+                axes.scatter(path[flags, 0], path[flags, 1], s=size, color=mark, zorder=3, label=what)
 
     reading = (
         f"{violated.sum():,} of {len(path):,} steps in violation, {changed.sum():,} changed by the filter."
@@ -161,7 +162,8 @@ def _place(
             axes.set_aspect("equal")  # a round obstacle is to look round
         shades = LinearSegmentedColormap.from_list("shares", ["#e8e9ea", color])
         cells = axes.hexbin(
-            *places[inside].T,
+            places[inside, 0],
+            places[inside, 1],
             C=flags[inside],
             gridsize=(_CELLS, int(_CELLS * 0.55)),
             extent=(low[0], high[0], low[1], high[1]),
