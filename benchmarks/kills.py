@@ -25,7 +25,6 @@ import json
 import mmap
 import multiprocessing
 import os
-import pickle
 import select
 import shutil
 import signal
@@ -280,7 +279,8 @@ def left_by(run: Path) -> dict[str, str]:
     found |= {f"policy:{name}": tensor.numpy().tobytes() for name, tensor in weights.items()}
     scaling = run / "policy" / "vecnormalize.pkl"
     if scaling.exists():
-        found["scaling"] = pickle.dumps(read_pickle(scaling).obs_rms)
+        known = read_pickle(scaling).obs_rms
+        found["scaling"] = np.concatenate([known.mean, known.var, [known.count]]).tobytes()
     for path in sorted(run.glob("*/*.npz")):
         with np.load(path, allow_pickle=False) as arrays:
             for name in arrays.files:
