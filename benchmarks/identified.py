@@ -25,9 +25,8 @@ import numpy as np
 from scipy.stats import betabinom
 
 import safe_wrappers as sw
-from safe_wrappers.plants.identified.conformal import allowed_misses
-from safe_wrappers.plants.identified.logs import Episode
-from safe_wrappers.plants.identified.windows import shortfalls
+from safe_wrappers.plants.identified.coverage import allowed_misses
+from safe_wrappers.plants.identified.logs import Episode, shortfalls
 
 RESULTS = Path(__file__).parent / "results" / "identified.csv"
 MISS_RATE = 0.1
