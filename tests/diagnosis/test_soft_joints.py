@@ -4,8 +4,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from flexible_joint import manifold
 
-from benchmarks.flexible_joint import manifold
 from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.diagnosis.recording import record
 from safe_wrappers.diagnosis.symptom import NotMeasuredError
