@@ -73,12 +73,14 @@ def phase(folder: Path, expected: int) -> str:
 
 
 def content(path: Path) -> bytes:
-    """What a file says but for the wall clock, and for the checksums of other files."""
+    """What a file says but for the wall clock (SB3's `data` has the start's) and for checksums of other files."""
     if path.suffix == ".json":
         return json.dumps(_timeless(json.loads(path.read_text())), sort_keys=True).encode()
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as file:
-            members = [name for name in sorted(file.namelist()) if Path(name).stem not in WALL_CLOCK]
+            members = [
+                name for name in sorted(file.namelist()) if Path(name).stem not in (*WALL_CLOCK, "data")
+            ]
             return b"".join(name.encode() + file.read(name) for name in members)
     return path.read_bytes()
 
@@ -99,7 +101,7 @@ def left_by(folder: Path, finished: bool = False) -> dict[str, str]:
             over = evaluated if part == "evaluation" else trained
             if (
                 part != "checkpoints"
-                and path.suffix in (".csv", ".json", ".npz", ".zip")
+                and path.suffix in (".csv", ".json", ".npz", ".zip", ".pkl")
                 and (over or not finished)
             ):
                 found[str(path.relative_to(folder))] = hashlib.sha256(content(path)).hexdigest()

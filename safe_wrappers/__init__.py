@@ -12,32 +12,26 @@ from safe_wrappers.control.handover.seam_limits import SeamLimits
 from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
-from safe_wrappers.filter.batch import project_batch
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
 from safe_wrappers.filter.projection import project
 from safe_wrappers.plants import AnalyticPlant, IdentifiedPlant, MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers import faults, occlusion, teleop
 from safe_wrappers.wrappers.action_shield import ActionShield
-from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
-from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.cost_function import CostFunction
-from safe_wrappers.wrappers.learner.action_repeat import ActionRepeat
-from safe_wrappers.wrappers.learner.adaption_penalty import AdaptionPenalty
-from safe_wrappers.wrappers.learner.filter_observation import FilterObservation
-from safe_wrappers.wrappers.learner.safe_action_map import SafeActionMap
-from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
-from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
+from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
+from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
+from safe_wrappers.wrappers.presets import SlipLimiter, WholeBodyFilter
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.replaced_actions import SafeActionMap, StuckEscape
 from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
-from safe_wrappers.wrappers.slip_limiter import SlipLimiter
+from safe_wrappers.wrappers.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.teleop_channel import TeleopChannel
 from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter
-from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
 
 __all__ = [
     "ActionRepeat",
@@ -77,7 +71,6 @@ __all__ = [
     "occlusion",
     "plants",
     "project",
-    "project_batch",
     "protect",
     "teleop",
 ]

@@ -11,10 +11,10 @@ from rich.console import Console
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 
-from .atomic import write_bytes
 from .evaluation.episode_selection import filmed_seeds, typical_and_worst
+from .files import write_bytes
 from .policies import load_policy
-from .processes.parallel import environment
+from .processes import environment
 from .run.policy import TrainedPolicy
 from .videos.film import film_episodes, for_film
 from .videos.rendering import find_rendering

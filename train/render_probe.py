@@ -14,7 +14,7 @@ import numpy as np
 
 import safe_wrappers  # noqa: F401 (registers its tasks)
 
-from .config.env_ids import check_env_id
+from .config import check_env_id
 
 
 def main() -> None:

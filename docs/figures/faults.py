@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from _cart import Cart
 from _style import GRID, ON
 from safe_wrappers.wrappers import faults
-from safe_wrappers.wrappers.common.receiver import CommandReceiver
+from safe_wrappers.wrappers.layer import CommandReceiver
 
 STEP_S, STEPS = 0.05, 100
 KINDS: tuple[tuple[str, dict[str, float]], ...] = (

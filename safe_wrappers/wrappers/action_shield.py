@@ -14,7 +14,7 @@ from safe_wrappers.filter.discrete import DiscreteSearch
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.common.layer import Env, Step
+from safe_wrappers.wrappers.layer import Env, Step
 
 _MOST = 1024
 
@@ -66,7 +66,6 @@ class ActionShield(CBFActionFilter):
         if fallback == "zero":
             raise ConfigurationError("a discrete action has no zero: fallback is brake, hold, or a function")
         CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback, margin=margin)
-        del self._saved_kwargs["solver"]  # nothing is projected
 
     def _take_action_space(self, env: Env) -> None:
         space = env.action_space

@@ -21,11 +21,27 @@ from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
-from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, outside, receiver_inside
-from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
-from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs
+from safe_wrappers.wrappers.chunk_queue import (
+    BASELINES,
+    ChunkQueue,
+    ChunkSizes,
+    Command,
+    Upsampling,
+    blend_bounds,
+    bounds_for_springs,
+)
+from safe_wrappers.wrappers.commands import FallbackController
+from safe_wrappers.wrappers.layer import (
+    SAME_STEP,
+    CommandReceiver,
+    Env,
+    LayerWrapper,
+    Reset,
+    Step,
+    WrapperRng,
+    outside,
+    receiver_inside,
+)
 
 
 class ChunkHandover(LayerWrapper, CommandReceiver):

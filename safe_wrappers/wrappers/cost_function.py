@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
 
 Judge = Callable[[Any], float]
 """Takes the unwrapped env, returns the cost of the step that it has just made."""

@@ -17,12 +17,10 @@ from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.command_gate import CommandGate
-from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Env, Reset, Step
-from safe_wrappers.wrappers.common.receiver import action_array, whole_steps
-from safe_wrappers.wrappers.lease.admission import Admission, Measured
-from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, budget_from
+from safe_wrappers.wrappers.admission import Admission, Measured
+from safe_wrappers.wrappers.commands import CommandGate, FallbackController
+from safe_wrappers.wrappers.layer import Env, Reset, Step, action_array, whole_steps
+from safe_wrappers.wrappers.stopping_budget import BoundBudget, BudgetLike, budget_from
 
 
 class LeaseExpiry(CommandGate):

@@ -19,10 +19,16 @@ from safe_wrappers.plants.env_checks import one_reward, read_attribute, refuse_v
 from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
-from safe_wrappers.wrappers.occlusion.imu import EgoMotion, Imu
-from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
-from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng
+from safe_wrappers.wrappers.occlusion import (
+    EgoMotion,
+    Imu,
+    Sensor,
+    Track,
+    sensor_from,
+    track_from,
+    tracked_things,
+)
 
 
 class OcclusionPenalty(LayerWrapper):

@@ -13,7 +13,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards, reward_numbers
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
 
 COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
 """The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""

@@ -17,14 +17,18 @@ from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.command_gate import CommandGate
-from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Env, Reset, Step
-from safe_wrappers.wrappers.common.receiver import SAME_STEP, action_array
-from safe_wrappers.wrappers.teleop.coding import Coding, Down, Passivity, Up, coding_from
-from safe_wrappers.wrappers.teleop.link import Line, Link, link_from
-from safe_wrappers.wrappers.teleop.port import TeleopPort, port_from
-from safe_wrappers.wrappers.teleop.round_trip import RoundTripCeiling, RoundTripWatch
+from safe_wrappers.wrappers.commands import CommandGate, FallbackController
+from safe_wrappers.wrappers.layer import SAME_STEP, Env, Reset, Step, action_array
+from safe_wrappers.wrappers.teleop import (
+    Line,
+    Link,
+    RoundTripCeiling,
+    RoundTripWatch,
+    TeleopPort,
+    link_from,
+    port_from,
+)
+from safe_wrappers.wrappers.teleop_coding import Coding, Down, Passivity, Up, coding_from
 
 Missing = Literal["hold", "zero", "fallback"]
 """What acts while no command arrives."""

@@ -19,8 +19,8 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, CBFActionFilter
-from safe_wrappers.wrappers.common.episode_guard import EpisodeGuard
-from safe_wrappers.wrappers.common.receiver import action_array
+from safe_wrappers.wrappers.episode_guard import EpisodeGuard
+from safe_wrappers.wrappers.layer import action_array
 
 Mask = NDArray[np.bool_]
 Rows = NDArray[Any] | list[NDArray[Any]]
@@ -49,7 +49,6 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         constraints: As for `CBFActionFilter`; so are the other arguments.
         plant: Not bound yet; every env gets a copy. None reads its MuJoCo model.
         fallback: See there.
-        solver: See there.
         margin: See there.
 
     Attributes:
@@ -76,7 +75,6 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         constraints: Sequence[Constraint | dict[str, Any]],
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         super().__init__(env)
@@ -84,7 +82,7 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         envs = single_envs(env)
         plants = [copy.deepcopy(plant) for _ in envs]
         self.filters = [
-            CBFActionFilter(single, constraints, own, fallback, solver, margin)
+            CBFActionFilter(single, constraints, own, fallback, margin)
             for single, own in zip(envs, plants, strict=True)
         ]
         space = envs[0].action_space

@@ -32,7 +32,7 @@ def test_the_stage_and_the_control_are_those_of_the_general_search(options, subs
     env = sw.CBFActionFilter(PointWorld(substeps, clip=5.0), [sw.constraints.WallClearance(**options)])
     low, high = (end.astype(np.float64) for end in (env.action_space.low, env.action_space.high))
     box = low, high, env.action_space.dtype
-    searched = SafetyFilter(env.plant, [Searched(**options)], "brake", "daqp", *box)
+    searched = SafetyFilter(env.plant, [Searched(**options)], "brake", *box)
     rng, stages = np.random.default_rng(3), []
     for episode in range(12):
         env.reset(seed=episode)

@@ -41,9 +41,9 @@ def general_search(env):
     )
     low, high = space.low.astype(float), space.high.astype(float)
     # In double precision: rounding would hide what differs, and where it is a tie make a difference of its own.
-    env.filter = SafetyFilter(env.plant, env.constraints, "brake", "daqp", low, high)
+    env.filter = SafetyFilter(env.plant, env.constraints, "brake", low, high)
     env.filter.start()
-    return SafetyFilter(env.plant, [same], "brake", "daqp", low, high)
+    return SafetyFilter(env.plant, [same], "brake", low, high)
 
 
 def both(env, searched, proposal):

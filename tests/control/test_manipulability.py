@@ -12,7 +12,6 @@ from safe_wrappers.control.filtering.manipulability import (
     chain_derivative,
     manipulability,
     manipulability_gradient,
-    signed_manipulability,
     task_rows,
     validated_threshold,
     worst_joint_rates,
@@ -280,22 +279,3 @@ def test_what_a_sample_leaves_unseen_is_seen_as_often_as_it_says():
 def test_nonsense_is_refused(call, message):
     with pytest.raises(ConfigurationError, match=message):
         call()
-
-
-@given(j=jacobians)
-def test_one_by_reflections_is_the_determinant_or_the_product_of_singular_values(j):
-    m, n = j.shape
-    scale = max(float(np.prod(np.linalg.norm(j, axis=1))), 1e-300)  # Hadamard's bound
-    found = signed_manipulability(j.T.copy())
-    if m == n:
-        assert abs(found - np.linalg.det(j)) <= 1e-13 * scale
-    else:
-        assert abs(abs(found) - float(manipulability(j))) <= 1e-13 * scale
-
-
-def test_one_by_reflections_is_zero_at_rank_loss():
-    for row in np.random.default_rng(0).normal(size=(20, 3)):
-        assert signed_manipulability(np.outer(row, [1.0, 0.3])) == 0.0
-    assert signed_manipulability(np.zeros((2, 2))) == 0.0
-    assert signed_manipulability(np.ones((1, 2))) == 0.0
-    assert signed_manipulability(np.array([[0.0, 1.0], [1.0, 0.0]])) == -1.0

@@ -15,7 +15,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
-from safe_wrappers.train.run.checkpoint import _move
 
 torch.set_num_threads(1)
 ENVS = {"safe_action": filtered, "both": penalised, "adaption_penalty": penalised}
@@ -291,23 +290,3 @@ def test_no_whole_episode_is_sb3s_error_and_an_unknown_mode_ours():
         sw.SafeWrappersError, match="or 'adaption_penalty', got 'naive'; the naive learner uses"
     ):
         by_hand("naive")
-
-
-def test_moved_into_a_larger_buffer_episodes_stay_whole():
-    model = learn("safe_action", buffer_size=90)  # 45 rows per env, 60 steps: the oldest are overwritten
-    old = model.replay_buffer
-    old.truncate_last_trajectory()
-    spaces = model.observation_space, model.action_space
-    new = type(old)(400, *spaces, env=model.get_env(), device="cpu", n_envs=2, mode="safe_action")
-    _move(old, new)
-    assert new.size() == old.size() == 45 and old.pos != 0
-    assert (new._current_ep_start == new.pos).all()
-    for env in range(2):
-        steps = new.observations["observation"][:45, env, 1]
-        drawn = np.flatnonzero(new.ep_length[:45, env])
-        assert len(drawn) == np.count_nonzero(old.ep_length[:, env]) > 20
-        for row in drawn:
-            start, length = new.ep_start[row, env], new.ep_length[row, env]
-            assert start <= row < start + length
-            assert steps[start : start + length].tolist() == list(range(length))
-    assert len(new.sample(64).rewards) == 64

@@ -7,8 +7,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps
 from safe_wrappers.train.evaluation.scene import load_scenes
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.tables import read_rows
 
 SILENT = Progress(lambda steps: None, pytest.fail)
 

@@ -12,8 +12,7 @@ from made_up import episode, fill, steps, write_evaluation, write_training
 from PIL import Image
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.config import parse_experiment, read_config
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.evaluation.metrics import METRICS, REGISTRY, absent
 from safe_wrappers.train.evaluation.summary import summarize

@@ -14,8 +14,8 @@ from safe_wrappers.train.evaluation.summary import (
     summarize,
     write_summary,
 )
+from safe_wrappers.train.files import write_rows
 from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
-from safe_wrappers.train.tables import write_rows
 
 
 def episode(**values):

@@ -11,10 +11,10 @@ from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train.evaluation.episode_selection import shown_episode
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.evaluation.scene import load_scenes
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.report.film_section import films
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.tables import read_rows
 from safe_wrappers.train.videos import film
 from safe_wrappers.train.videos import record as videos
 from safe_wrappers.train.videos.film import HEIGHT, TITLE, WIDTH

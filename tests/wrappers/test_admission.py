@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.wrappers.lease.admission import Admission
+from safe_wrappers.wrappers.admission import Admission
 
 LIMITS = {"max_acceleration": 2.0, "max_speed": 1.0, "max_jerk": 8.0}
 

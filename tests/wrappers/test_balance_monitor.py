@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.wrappers.balance_monitor import PRESSING
+from safe_wrappers.wrappers.monitors import PRESSING
 
 FLOATS = (keys.BALANCE_FRICTION_USED, keys.BALANCE_ZMP_MARGIN, keys.BALANCE_SUPPORTED, keys.BALANCE_AIRBORNE)
 MOMENTA = (keys.BALANCE_LINEAR_MOMENTUM, keys.BALANCE_ANGULAR_MOMENTUM)

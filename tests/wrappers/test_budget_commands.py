@@ -5,7 +5,7 @@ import pytest
 from braked_cart import BrakedCart, cart_plant
 
 import safe_wrappers as sw
-from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget
+from safe_wrappers.wrappers.stopping_budget import BoundBudget
 
 HOLD, BRAKING = 0.1, 4.0
 

@@ -228,7 +228,6 @@ def test_an_empty_list_or_no_list_is_refused(constraints):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"solver": "gurobbi"}, UnknownNameError, "'gurobbi' is not installed; installed: .*clarabel.*daqp"),
         ({"fallback": "stop"}, UnknownNameError, "no fallback 'stop'; choose brake, hold, zero"),
         ({"margin": -0.1}, ConfigurationError, "margin must be a finite number >= 0 .* got -0.1"),
         ({"margin": np.nan}, ConfigurationError, "margin must be a finite number"),

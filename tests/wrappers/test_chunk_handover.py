@@ -17,9 +17,8 @@ from slow_handover import BLENDS, Slow, measured
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
-from safe_wrappers.wrappers.common.layer import WrapperRng
-from safe_wrappers.wrappers.common.receiver import CommandReceiver
 from safe_wrappers.wrappers.faults import ClockSkew, DroppedRefreshes, FrozenPolicy, RepeatedCommands
+from safe_wrappers.wrappers.layer import CommandReceiver, WrapperRng
 
 HOLD = 0.1
 TYPES = {

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.wrappers.handover.queue import ChunkQueue
+from safe_wrappers.wrappers.chunk_queue import ChunkQueue
 
 HOLD = 0.1
 

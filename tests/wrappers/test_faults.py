@@ -14,7 +14,6 @@ from wrapper_examples import build
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.receiver import CommandReceiver
 from safe_wrappers.wrappers.faults import (
     FAULTS,
     ClockSkew,
@@ -25,6 +24,7 @@ from safe_wrappers.wrappers.faults import (
     Outages,
     RepeatedCommands,
 )
+from safe_wrappers.wrappers.layer import CommandReceiver
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 FULL = np.array([1.0, 0.0], np.float32)

@@ -12,7 +12,7 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.control.watchdog.leases import jerk_limited_stop
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.lease.admission import Admission
+from safe_wrappers.wrappers.admission import Admission
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 DT, WALL, DRIVE, BRAKING, JERK = 0.02, 2.0, 1.5, 3.0, 10.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget
+from safe_wrappers.wrappers.stopping_budget import BoundBudget
 
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action is not finite")
 FULL = np.array([1.0, 0.0])

@@ -11,7 +11,7 @@ import safe_wrappers as sw
 from safe_wrappers.checks import settings_from
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
 from safe_wrappers.serialize import plain_data
-from safe_wrappers.wrappers.teleop.round_trip import RoundTripWatch
+from safe_wrappers.wrappers.teleop import RoundTripWatch
 
 ROOM = CLAMP_Y - TOOL_RADIUS
 HOLD = 0.001

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
+from safe_wrappers.wrappers.occlusion import Sensor, sensor_from
 
 
 def test_what_is_measured_and_how_well():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.serialize import plain_data
-from safe_wrappers.wrappers.teleop.link import LONGEST_DELAY_S, Line, link_from
+from safe_wrappers.wrappers.teleop import LONGEST_DELAY_S, Line, link_from
 
 TICK = 0.001
 

@@ -7,9 +7,9 @@ from teleop_worlds import Energies, ceiling, channel, clamp, place
 import safe_wrappers as sw
 from safe_wrappers.control.teleop.wave_line import WaveLine
 from safe_wrappers.envs.teleop_operator import TeleopOperator
-from safe_wrappers.wrappers.teleop import coding as codings
-from safe_wrappers.wrappers.teleop.coding import Up, WaveCoding
-from safe_wrappers.wrappers.teleop.link import Packet
+from safe_wrappers.wrappers import teleop_coding as codings
+from safe_wrappers.wrappers.teleop import Packet
+from safe_wrappers.wrappers.teleop_coding import Up, WaveCoding
 
 B = 40.0
 NETWORKS = {

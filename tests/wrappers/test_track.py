@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.occlusion.track import Track, track_from
+from safe_wrappers.wrappers.occlusion import Track, track_from
 
 
 def test_a_number_holds_for_every_coordinate_a_list_is_one_each_a_matrix_is_itself():

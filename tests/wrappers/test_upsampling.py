@@ -7,7 +7,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.handover.sizes import Upsampling
+from safe_wrappers.wrappers.chunk_queue import Upsampling
 
 
 @pytest.mark.parametrize(("entries", "steps"), [(2, 3), (5, 4), (9, 33)])

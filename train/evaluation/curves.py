@@ -10,7 +10,7 @@ from scipy import stats
 from safe_wrappers.checks import Array
 
 from ..config import ArmConfig, ExperimentConfig
-from ..tables import read_rows
+from ..files import read_rows
 from .summary import SEEDS_FOR_AN_INTERVAL, interquartile_mean
 
 _MOST_BINS = 40

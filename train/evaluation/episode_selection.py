@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ..config import ArmConfig, ExperimentConfig
-from ..tables import read_rows
+from ..files import read_rows
 from .evaluate import evaluation_folder
 
 

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
 from safe_wrappers import info as keys
-from safe_wrappers.errors import RunStateError
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
-from ..atomic import write_json
-from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EvaluationConfig, FilterConfig
-from ..processes.job import Progress
-from ..processes.lock import only_writer
-from ..processes.storage import telling_of_storage
+from ..files import only_writer, read_json, write_json, write_rows
+from ..processes import Progress, RunStoppedError
 from ..run.folder import EVALUATION, check_finished
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger
 from ..run.training import finished_checkpoint
-from ..tables import write_rows
 from .scene import Scene, SceneRecorder, save_scenes
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
 
@@ -78,7 +73,7 @@ def evaluate_run(
             it.
     """
     check_finished(arm, folder)
-    with telling_of_storage(folder), only_writer(folder):
+    with only_writer(folder):
         _evaluate(arm, seed, folder, settings, default_filter, progress)
 
 
@@ -99,11 +94,11 @@ def _evaluate(
         "timesteps": checkpoint.timesteps,
         "recording": _RECORDING,
     }
-    if _is_done(out, state):
+    if read_json(out / STATE_FILE) == state:
         return
     (out / STATE_FILE).unlink(missing_ok=True)
     shutil.rmtree(out, ignore_errors=True)  # or after a kill there would be rows of two settings
-    policy = TrainedPolicy(arm, checkpoint)
+    policy = TrainedPolicy(arm, checkpoint.folder)
     logger = run_logger(arm, seed, folder)
     for at, (condition, used) in enumerate(filters.items()):
         evaluation = _Evaluation(arm, used)
@@ -117,22 +112,14 @@ def _evaluate(
                 if key != "episode_seed":
                     logger.record_mean(f"evaluation_{condition}/{key}", float(value))
             progress.steps(at * settings.episodes + len(rows))
+            if progress.stopping():
+                raise RunStoppedError("stopped; this evaluation begins again")
         logger.dump(checkpoint.timesteps)
         write_rows(out / f"{condition}.csv", EVALUATION_COLUMNS, rows)
         save_scenes(out / f"{condition}.npz", scenes)
         save_steps(out / f"{condition}_steps.npz", evaluation.steps.finish())
     logger.close()
-    write_json(out / STATE_FILE, state | {"files": checksums(sorted(out.iterdir()))})
-
-
-def _is_done(out: Path, state: Mapping[str, Any]) -> bool:
-    """Whether an evaluation like this one is there, whole."""
-    try:
-        found = read_facts(out / STATE_FILE, "")
-    except RunStateError:
-        return False
-    files = found.pop("files", {})
-    return found == state and damage(out, files) is None
+    write_json(out / STATE_FILE, state)
 
 
 class _Evaluation:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array
 
-from ..atomic import write_bytes
+from ..files import write_bytes
 from .step_log import is_violation
 
 _STATIC = ("hazard_positions", "hazard_radius", "goal_radius", "vase_positions")

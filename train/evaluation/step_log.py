@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 
-from ..atomic import write_bytes
+from ..files import write_bytes
 from .coordinates import CoordinateReader
 
 MOST_STEPS: Final = 10_000

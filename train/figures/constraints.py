@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..evaluation.step_log import StepLog
-from ..tables import Row
+from ..files import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted, per_arm
 

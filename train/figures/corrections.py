@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter
 
 from ..evaluation.step_log import StepLog
 from ..evaluation.summary import number
-from ..tables import Row
+from ..files import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted, per_arm
 

@@ -10,7 +10,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from ..evaluation.curves import Curve
 from ..evaluation.summary import number
-from ..tables import Row
+from ..files import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted
 

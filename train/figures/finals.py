@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..evaluation.summary import Estimate, Summary, number
-from ..tables import Row
+from ..files import Row
 from .canvas import arm_color, draw
 from .picture import Picture, Plotted
 from .plane import CONDITIONS

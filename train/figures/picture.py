@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..tables import Row
+from ..files import Row
 
 Look = Literal["fill", "line", "dot", "ring", "disc"]
 Key = tuple[str, Look]

@@ -8,7 +8,7 @@ from typing import Any, Final
 from matplotlib.axes import Axes
 
 from ..evaluation.summary import Estimate, Summary, number
-from ..tables import Row
+from ..files import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted
 

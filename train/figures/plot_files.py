@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from urllib.parse import quote
 
-from ..tables import write_rows
+from ..files import write_rows
 from .picture import Plotted
 
 

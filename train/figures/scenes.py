@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from ..evaluation.scene import Scene
-from ..tables import Row
+from ..files import Row
 from .canvas import BAD, GOAL, HAZARD, INK, MARK, VASE, arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 
 from ..evaluation.step_log import StepLog
-from ..tables import Row
+from ..files import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Look, Picture, Plotted, per_arm
 

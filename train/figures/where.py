@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from ..evaluation.step_log import StepLog
-from ..tables import Row
+from ..files import Row
 from .canvas import BAD, INK, MARK, draw
 from .picture import Picture, Plotted
 from .telling import telling_pair

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from safe_wrappers.errors import RunStateError
 
-from ..atomic import write_text
 from ..config import ExperimentConfig
 from ..evaluation.summary import Summary
 from ..figures.plot_files import PlotFiles
+from ..files import write_text
 from . import sections
 from .explanation import explanations
 from .film_section import films

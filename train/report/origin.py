@@ -10,10 +10,9 @@ from typing import Final
 
 import yaml
 
-from ..checksums import read_facts
 from ..config import ArmConfig, ExperimentConfig
-from ..run.folder import finished_facts
-from ..run.start import START_FILE
+from ..files import read_json
+from ..run.folder import START_FILE, finished_facts
 from .markup import details, table, text
 
 _PACKAGES: Final = (
@@ -75,7 +74,7 @@ def _begun(experiment: ExperimentConfig) -> Iterator[str]:
     """What arms began with that did not begin at random, as their runs recorded it."""
     for arm in experiment.arms:
         path = experiment.run_folder(arm, experiment.seeds[0]) / START_FILE
-        start = read_facts(path, "delete it, and the page says nothing of the start")
+        start = read_json(path)
         if start:
             yield (
                 f"Arm {arm.name} began with the policy of {start['from']} after {start['timesteps']:,} steps, which"

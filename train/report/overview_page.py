@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from ..atomic import write_text
 from ..config import ExperimentConfig
 from ..evaluation.summary import Summary
 from ..figures.picture import Picture
 from ..figures.plane import judged_rows, plane_limits, plane_picture
 from ..figures.plot_files import PlotFiles
+from ..files import write_text
 from .experiment_page import check_reportable, report_path
 from .explanation import explanations
 from .markup import document, pictures, section, text

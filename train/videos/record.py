@@ -9,18 +9,16 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from safe_wrappers.errors import ConfigurationError, RunStateError
+from safe_wrappers.errors import ConfigurationError
 
-from ..atomic import write_bytes, write_json
-from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
 from ..evaluation.episode_selection import ShownEpisode, shown_episode
 from ..evaluation.evaluate import conditions
-from ..processes.job import Job, Progress
-from ..processes.parallel import RunsFailedError, environment, run_jobs
+from ..files import read_json, write_bytes, write_json
+from ..processes import Job, Progress, RunsFailedError, environment
+from ..processes.parallel import run_jobs
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
-from ..run.trackers import track_film
 from ..run.training import finished_checkpoint
 from .film import film_episodes, for_film
 from .rendering import find_rendering
@@ -56,12 +54,7 @@ def load_video(path: Path) -> Video | None:
     facts = path.with_suffix(".json")
     if not (path.exists() and facts.exists()):
         return None
-    try:
-        values = read_facts(facts, "")
-    except RunStateError:
-        return None
-    if damage(path.parent, values.get("files", {})) is not None:
-        return None
+    values = read_json(facts)
     episodes = [Filmed(**episode) for episode in values["episodes"]]
     return Video(path.read_bytes(), values["speed"], episodes)
 
@@ -77,9 +70,7 @@ def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
 def video_problem(experiment: ExperimentConfig) -> str:
     """The one line that says why there are no videos; empty if nothing is known to stand against them."""
     path = experiment.folder / "videos" / _PROBLEM
-    return str(
-        read_facts(path, "`safe-wrappers evaluate` (or `compare`) writes it again.").get("problem", "")
-    )
+    return str(read_json(path).get("problem", ""))
 
 
 def record_videos(experiment: ExperimentConfig, console: Console) -> None:
@@ -142,10 +133,6 @@ def _record_arms(
             run_jobs(jobs, experiment.workers, console, "Videos")
     except RunsFailedError as error:
         return f"filming {env.id} failed: {str(error).strip().splitlines()[-1]}"
-    for job in jobs:
-        arm, _, folder, _, path = job.arguments
-        steps = finished_checkpoint(arm, shown.seed, folder).timesteps
-        track_film(arm, shown.seed, folder, path.stem.removeprefix(f"{arm.name}_"), path, steps)
     return ""
 
 
@@ -163,7 +150,7 @@ def record_video(
         progress: Where to report to.
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
-    policy = TrainedPolicy(arm, checkpoint)
+    policy = TrainedPolicy(arm, checkpoint.folder)
     filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
     env = for_film(make_stack(filmed, used, arm.learner.in_evaluation))
     try:
@@ -175,7 +162,6 @@ def record_video(
         "state": _state(arm, used, shown, checkpoint.timesteps),
         "speed": speed,
         "episodes": [asdict(Filmed(film.title, len(film.changed), sum(film.changed))) for film in films],
-        "files": checksums([path]),
     }
     write_json(path.with_suffix(".json"), facts)
     progress.steps(1)
@@ -200,11 +186,7 @@ def _up_to_date(
         return False
     timesteps = finished_checkpoint(arm, shown.seed, experiment.run_folder(arm, shown.seed)).timesteps
     expected = json.loads(json.dumps(_state(arm, used, shown, timesteps)))
-    try:
-        found = read_facts(facts, "")
-    except RunStateError:
-        return False
-    return found.get("state") == expected and damage(path.parent, found.get("files", {})) is None
+    return read_json(facts).get("state") == expected
 
 
 def _render_modes(env: EnvConfig) -> tuple[str, ...]:

@@ -1,82 +1,18 @@
 """The joints between the world and a named frame, and the frame's Jacobian over them at many configurations."""
 
-import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits import joints as of_joints
-from safe_wrappers.control.filtering.manipulability import signed_manipulability
-from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS, SLIDE
-from safe_wrappers.plants.mujoco.native import mj_kinematics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 FrameKind = Literal["site", "body", "geom"]
-
-
-class Task(NamedTuple):
-    """What of a twist a task is about, and by which joints: m rows of the six, and n columns of the chain's."""
-
-    rows: NDArray[np.int64]
-    weights: Array
-    columns: NDArray[np.int64]
-    own: bool  # whether the rows are in the frame's own axes; else the world's
-
-
-class _Frame(NamedTuple):
-    """A model's and its data's addresses, and views of the data."""
-
-    model: int
-    data: int
-    qpos: Array
-    anchors: Array
-    axes: Array
-    origin: Array
-    turn: Array
-
-
-@compiled
-def _manipulability(
-    frame: _Frame, task: Task, joints: NDArray[np.int64], slides: NDArray[np.bool_], positions: Array
-) -> Array:
-    found, twist = np.empty(len(positions)), np.empty(6)
-    transposed = np.empty((task.columns.size, task.rows.size))
-    for i in range(len(positions)):
-        finite = True
-        for j in range(frame.qpos.size):
-            finite = finite and math.isfinite(positions[i, j])
-            frame.qpos[j] = positions[i, j]
-        if not finite:
-            found[i] = math.nan
-            continue
-        mj_kinematics(frame.model, frame.data)
-        for c in range(task.columns.size):
-            _twist(frame, joints[task.columns[c]], slides[task.columns[c]], task.own, twist)
-            for r in range(task.rows.size):
-                transposed[c, r] = task.weights[r] * twist[task.rows[r]]
-        found[i] = signed_manipulability(transposed)
-    return found
-
-
-@compiled
-def _twist(frame: _Frame, joint: int, slides: bool, own: bool, twist: Array) -> None:
-    """Write the frame's twist per rate of a joint."""
-    axis, anchor, turn = frame.axes[joint], frame.anchors[joint], frame.turn
-    for j in range(3):
-        k, n = (j + 1) % 3, (j + 2) % 3
-        across = axis[k] * (frame.origin[n] - anchor[n]) - axis[n] * (frame.origin[k] - anchor[k])
-        twist[j], twist[3 + j] = (axis[j], 0.0) if slides else (across, axis[j])
-    if own:
-        for j in (0, 3):
-            x, y, z = twist[j], twist[j + 1], twist[j + 2]
-            for k in range(3):
-                twist[j + k] = turn[k] * x + turn[3 + k] * y + turn[6 + k] * z
 
 
 class SerialChain:
@@ -97,7 +33,7 @@ class SerialChain:
         index = plant.named(kind, name)
         self._plant, self._what = plant, f"the {kind} {name!r}"
         body = index if kind == "body" else int(getattr(model, f"{kind}_bodyid")[index])
-        carriers: list[int] = []
+        carriers, self._body = list[int](), body
         while body:
             first = int(model.body_jntadr[body])
             carriers += range(first, first + int(model.body_jntnum[body])) if first >= 0 else []
@@ -151,25 +87,18 @@ class SerialChain:
 
         Rows: velocity of the frame's origin, then angular velocity, in the world's axes.
         """
-        model, data, joints, k = self._model, self._data, self.joints, len(qpos)
-        arms, axes = np.empty((k, len(joints), 3)), np.empty((k, len(joints), 3))
-        turns = np.empty((k, 9))
+        model, data, k = self._model, self._data, len(qpos)
+        jacobians, turns = np.empty((k, 6, len(self.joints))), np.empty((k, 9))
+        linear, angular = np.empty((2, 3, model.nv))
         origin, turn = getattr(data, self._place)[self._index], getattr(data, self._turn)[self._index]
         for i, q in enumerate(qpos):
             data.qpos[:] = q
             mujoco.mj_kinematics(model, data)
-            arms[i], axes[i], turns[i] = origin - data.xanchor[joints], data.xaxis[joints], turn
-        linear = np.where(self._slides, axes, np.cross(axes, arms))
-        angular = np.where(self._slides, 0.0, axes)
-        both = np.concatenate([linear, angular], axis=-1)
-        return np.swapaxes(both, -1, -2), turns.reshape(k, 3, 3)
-
-    def manipulability(self, qpos: Array, task: Task) -> Array:
-        """`signed_manipulability` of a task at positions (k, nq), shape (k,); NaN where a position is not finite."""
-        data = self._data
-        place = getattr(data, self._place)[self._index], getattr(data, self._turn)[self._index]
-        frame = _Frame(self._model._address, data._address, data.qpos, data.xanchor, data.xaxis, *place)
-        return _manipulability(frame, task, self.joints, self._slides[:, 0], qpos)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_jac(model, data, linear, angular, origin, self._body)
+            jacobians[i, :3], jacobians[i, 3:] = linear[:, self.dofs], angular[:, self.dofs]
+            turns[i] = turn
+        return jacobians, turns.reshape(k, 3, 3)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Configurations with these joints uniform in their ranges, shape (count, nq).

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, name_list, positive
-from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain, Task
+from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering import manipulability as of_arm
 from safe_wrappers.errors import ConfigurationError
@@ -123,8 +123,6 @@ class BoundSingularityMargin(BoundRollout):
             raise ConfigurationError(
                 f"{count} joints cannot move {what} in {wanted} directions at once ({task}); the joints are {there}"
             )
-        own = self.spec.frame == "own"
-        self._what = Task(self.spec._rows, self.spec._weights, np.array(self._columns), own)
         # With as many joints as directions w is the determinant but for its sign, which turns at a singular pose.
         self._signed, self._side = count == wanted, 1.0
         found = np.abs(self._measure(sampled))
@@ -165,8 +163,10 @@ class BoundSingularityMargin(BoundRollout):
 
     def _measure(self, qpos: Array) -> Array:
         """w, shape (k,), below zero beyond the singular pose; NaN where a position is not finite."""
-        w = self._chain.manipulability(qpos, self._what)
-        return np.asarray(self._side * w if self._signed else np.abs(w))
+        w, finite = np.full(len(qpos), np.nan), np.isfinite(qpos).all(axis=1)
+        task = self._task(qpos[finite])
+        w[finite] = self._side * np.linalg.det(task) if self._signed else of_arm.manipulability(task)
+        return w
 
     def now(self) -> Array:
         self._chain.place(self.plant.pose())

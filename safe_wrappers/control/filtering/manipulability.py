@@ -13,14 +13,12 @@ loss.
 Jacobians are of shape (..., m, n); what is not finite raises `ConfigurationError`.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import Array, finite_array, finite_arrays, positive
-from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
 
@@ -41,36 +39,6 @@ def manipulability(jacobian: ArrayLike) -> Array:
     # A dependent row leaves rounding on the diagonal, in proportion to its own length.
     noise = n * EPSILON * np.linalg.norm(j, axis=-1)
     return np.asarray(np.prod(np.where(diagonal > noise, diagonal, 0.0), axis=-1))
-
-
-@compiled
-def signed_manipulability(transposed: Array) -> float:
-    """`manipulability` of one finite Jacobian whose transpose is given, (n, m), and overwritten.
-
-    With as many joints as directions it is the determinant, which changes its sign at a singular pose.
-    """
-    n, m = transposed.shape
-    product = 1.0 if n >= m else 0.0
-    for c in range(min(m, n)):  # Householder's reflections; the determinant of each is -1
-        above = squares = 0.0
-        for r in range(c):
-            above += transposed[r, c] * transposed[r, c]
-        for r in range(c, n):
-            squares += transposed[r, c] * transposed[r, c]
-        first, length = transposed[c, c], math.sqrt(squares)
-        # A dependent row leaves rounding on the diagonal, in proportion to its own length.
-        if length == 0.0 or (n > m and length <= n * EPSILON * math.sqrt(above + squares)):
-            return 0.0
-        product *= first if c == n - 1 else math.copysign(length, first)
-        transposed[c, c] = first + math.copysign(length, first)
-        scale = 1.0 / (squares + abs(first) * length)  # twice over the vector's squared length
-        for d in range(c + 1, m):
-            along = 0.0
-            for r in range(c, n):
-                along += transposed[r, c] * transposed[r, d]
-            for r in range(c, n):
-                transposed[r, d] -= scale * along * transposed[r, c]
-    return product
 
 
 def manipulability_gradient(jacobian: ArrayLike, derivative: ArrayLike) -> Array:

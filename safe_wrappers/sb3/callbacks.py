@@ -1,0 +1,216 @@
+"""Callbacks: what the filter did in the log, a price on cost, a margin that changes."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.sb3.gymnasium_vec_env import GymnasiumVecEnv
+
+
+class InterventionCallback(BaseCallback):
+    """Logs interventions, corrections and costs of the training rollouts under `interventions/`.
+
+    The logger gets means since its last dump, of what the task and the layers of the stack report:
+
+    - `interventions/step_<name>`: over all steps of all envs; `InfoKey.log` in `safe_wrappers.info` is the name of
+      each, such as `step_rate` or `step_cost`;
+    - `interventions/rate`, `correction_mean` and the other figures of `safe_wrappers.info.EPISODE`: over the episodes
+      that ended, from `RecordInterventions`.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from stable_baselines3 import PPO
+        >>> from safe_wrappers.sb3 import InterventionCallback
+        >>> from safe_wrappers.wrappers.record_interventions import RecordInterventions
+        >>> env = RecordInterventions(gym.make("Pendulum-v1"))
+        >>> model = PPO("MlpPolicy", env, n_steps=256, n_epochs=1, device="cpu")
+        >>> _ = model.learn(256, callback=InterventionCallback())
+    """
+
+    def _on_step(self) -> bool:
+        log_steps(self.logger, self.locals["infos"])
+        for info in self.locals["infos"]:
+            log_episode(self.logger, info, keys.RUNNING_PREFIX)
+        return True
+
+
+class InterventionEvalCallback(EvalCallback):
+    """Logs `RecordInterventions`' episode values under `eval/interventions/`, beside `eval/mean_reward`.
+
+    Same arguments as SB3's `EvalCallback`, which dumps the log before any child callback runs.
+    """
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        # SB3's hook into `evaluate_policy`, called at every step of every evaluation env, before the dump.
+        super()._log_success_callback(locals_, globals_)
+        if locals_["done"]:
+            log_episode(self.logger, locals_["info"], "eval/interventions/")
+
+
+def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:
+    """Adds one step of every env to the logger's running means."""
+    for info in infos:
+        for key in keys.KEYS.values():
+            if key.log and key.name in info:
+                logger.record_mean(f"{keys.RUNNING_PREFIX}step_{key.log}", key.number(info[key.name]))
+
+
+def log_episode(logger: Logger, info: Mapping[str, Any], prefix: str) -> None:
+    """Adds an episode's summary, if this info has one, to the logger's running means."""
+    for key, value in info.get(keys.EPISODE_SUMMARY, {}).items():
+        # SB3 already logs length and return of an episode as rollout/ep_len_mean and ep_rew_mean.
+        if key not in ("length", "return"):
+            logger.record_mean(prefix + ("rate" if key == "intervention_rate" else key), float(value))
+
+
+class LagrangianMultiplier(BaseCallback):
+    """Makes a constrained learner of an SB3 algorithm: PPO with it is PPO-Lagrangian, SAC with it SAC-Lagrangian.
+
+    The learner stores `(r - m c) / (1 + m)` instead of the reward r; c is the step's cost (``info["cost"]``), m >= 0
+    the multiplier. After every episode, whose costs add up to C, `m <- max(0, m + rate (C - cost_limit))` (Ray,
+    Achiam and Amodei, Benchmarking Safe Exploration in Deep RL, 2019, with one value function for both). The limit
+    holds on average and at the end of training, if at all; a filter holds it at every step, from the first one on.
+    With a limit of 0 the multiplier can only rise.
+
+    Returns that SB3 logs stay the task's own. The multiplier is saved with the model, as `lagrangian_multiplier`, and
+    goes on from there. An off-policy learner replays what was stored at the multiplier of that time. Behind a
+    VecNormalize that scales rewards, m is in scaled reward per cost.
+
+    Args:
+        cost_limit: Cost per episode that is allowed, at least 0.
+        rate: Of the multiplier, in reward per cost, for each unit of cost above the limit. Above 0.
+        initial: The multiplier at the start, reward per cost, at least 0.
+
+    Raises:
+        ConfigurationError: Numbers outside these ranges; in training: an env that reports no cost or one that is
+            not finite, hindsight replay, or an off-policy learner behind a VecNormalize: both replay the env's own
+            rewards.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> from stable_baselines3 import PPO
+        >>> from safe_wrappers.sb3 import LagrangianMultiplier
+        >>> model = PPO("MlpPolicy", gym.make("SafePointGoal1-v0"), n_steps=64, n_epochs=1, device="cpu")
+        >>> _ = model.learn(128, callback=LagrangianMultiplier(cost_limit=25.0))
+    """
+
+    def __init__(self, cost_limit: float, rate: float = 1e-3, initial: float = 0.0) -> None:
+        super().__init__()
+        self.cost_limit = non_negative("cost_limit", cost_limit, "cost per episode")
+        self.rate = positive("rate", rate, "reward per cost, for each unit of cost")
+        self.initial = non_negative("initial", initial, "reward per cost")
+
+    @property
+    def multiplier(self) -> float:
+        """Reward per cost."""
+        return float(getattr(self.model, "lagrangian_multiplier", self.initial))
+
+    def _on_training_start(self) -> None:
+        if isinstance(self.model, OffPolicyAlgorithm) and self.model.get_vec_normalize_env() is not None:
+            raise ConfigurationError(
+                "LagrangianMultiplier: an off-policy learner behind a VecNormalize stores the env's own rewards,"
+                " without a price on cost; leave VecNormalize out, or use an on-policy learner"
+            )
+        if isinstance(getattr(self.model, "replay_buffer", None), HerReplayBuffer):
+            raise ConfigurationError(
+                "LagrangianMultiplier: hindsight replay asks the task for rewards anew, without a price on cost; use"
+                " another replay buffer"
+            )
+        self._episode_cost = np.zeros(self.training_env.num_envs)
+
+    def _on_step(self) -> bool:
+        infos: Sequence[dict[str, Any]] = self.locals["infos"]
+        if not all(keys.COST in info for info in infos):
+            raise ConfigurationError(
+                "LagrangianMultiplier needs info['cost'] at every step: the goal and velocity tasks have it, and"
+                " sw.CostFunction(env, cost) gives it to any other"
+            )
+        costs = np.array([info[keys.COST] for info in infos], dtype=np.float64)
+        if not np.isfinite(costs).all():
+            raise ConfigurationError(f"info['cost'] must be finite, got {costs.tolist()}")
+        multiplier = self.multiplier
+        # SB3 stores this very array after its callbacks.
+        rewards = self.locals["rewards"]
+        rewards[:] = (rewards - multiplier * costs) / (1.0 + multiplier)
+        self._episode_cost += costs
+        for i in np.flatnonzero(self.locals["dones"]):
+            multiplier = max(0.0, multiplier + self.rate * (self._episode_cost[i] - self.cost_limit))
+            self._episode_cost[i] = 0.0
+        self.model.lagrangian_multiplier = float(multiplier)  # type: ignore[attr-defined]
+        self.logger.record("interventions/lagrangian_multiplier", multiplier)
+        return True
+
+
+_STAIRS = 100
+"""A margin changes in so many equal steps: each binds the constraints anew."""
+
+
+class MarginCurriculum(BaseCallback):
+    """Sets the margin that a `CBFActionFilter` adds to those of its constraints, between rollouts.
+
+    Linear in the share of the training's steps, in hundredths, until the share `until`; constant from there. The
+    share is that of the model's own step count: a training that was saved and goes on has the margin of the place
+    where it stands. Evaluation envs keep theirs.
+
+    Args:
+        start: At the first step, in the constraints' own unit (m, rad/s, ...), at least 0: constraints keep at least
+            their own margins.
+        end: From `until` on, likewise.
+        until: Share of the training's steps, above 0 and at most 1.
+
+    Raises:
+        ConfigurationError: Numbers outside these ranges; at the training's start: an env without such a filter.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> from stable_baselines3 import PPO
+        >>> from safe_wrappers.sb3 import MarginCurriculum
+        >>> env = sw.protect(gym.make("Reacher-v5"))
+        >>> model = PPO("MlpPolicy", env, n_steps=64, n_epochs=1, device="cpu")
+        >>> _ = model.learn(256, callback=MarginCurriculum(start=1.0, end=0.0, until=0.5))
+    """
+
+    def __init__(self, start: float, end: float = 0.0, until: float = 1.0) -> None:
+        super().__init__()
+        self.start = non_negative("start", start, "the constraints' own units")
+        self.end = non_negative("end", end, "the constraints' own units")
+        self.until = positive("until", until, "a share of the training's steps")
+        if self.until > 1.0:
+            raise ConfigurationError(f"until is a share of the training's steps, at most 1, got {until}")
+        self._margin: float | None = None
+
+    def margin(self, share: float) -> float:
+        """The added margin when this share of the training's steps is done."""
+        done = min(int(_STAIRS * share / self.until + 1e-9), _STAIRS) / _STAIRS
+        return (1.0 - done) * self.start + done * self.end
+
+    def _on_training_start(self) -> None:
+        self._margin = None
+        if isinstance(self.training_env.unwrapped, GymnasiumVecEnv):
+            raise ConfigurationError(
+                "MarginCurriculum changes the filters of single envs, and a GymnasiumVecEnv decides for all at once;"
+                " use a DummyVecEnv of protected envs"
+            )
+        if not self.training_env.has_attr("added_margin"):
+            raise ConfigurationError(
+                "MarginCurriculum needs envs in a CBFActionFilter, such as sw.protect(env)"
+            )
+
+    def _on_rollout_start(self) -> None:
+        # SB3's total is that of the whole training, of one that goes on, too.
+        margin = self.margin(self.model.num_timesteps / self.model._total_timesteps)
+        if margin != self._margin:
+            self.training_env.env_method("set_margin", margin)
+            self._margin = margin
+        self.logger.record("interventions/added_margin", margin)
+
+    def _on_step(self) -> bool:
+        return True

@@ -1,0 +1,325 @@
+"""Replay buffers with the action that the filter executed."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from safe_wrappers import info as keys
+from safe_wrappers.errors import ActionError, ConfigurationError
+
+Values = NDArray[Any]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+Infos = list[dict[str, Any]]
+
+_SAME: Final = 1e-3  # two scaled actions that differ by less differ by rounding only, not by their unit
+
+
+class ExecutedActionReplayBuffer(ReplayBuffer):
+    """SB3's replay buffer for SAC, TD3 and DDPG, with the action that the filter executed.
+
+    SB3 stores the policy's action a ("naive" in Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023).
+    Where the filter changed it to a_safe, this buffer stores
+
+    - mode "safe_action": (s, a_safe, s', r) instead;
+    - mode "both": (s, a_safe, s', r) beside (s, a, s', r - penalty), with the task's reward r and the penalty of the
+      `AdaptionPenalty` in the env. Batches are drawn uniformly from all transitions.
+
+    Unchanged steps are stored as SB3 stores them, bit for bit. Of a step whose policy action is not finite only the
+    executed one is stored. Returns are one-step whatever SB3's `n_steps` says.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> from stable_baselines3 import SAC
+        >>> from safe_wrappers.sb3 import ExecutedActionReplayBuffer
+        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
+        >>> env = sw.AdaptionPenalty(env, penalty=0.1)
+        >>> model = SAC(
+        ...     "MlpPolicy",
+        ...     env,
+        ...     buffer_size=1000,
+        ...     replay_buffer_class=ExecutedActionReplayBuffer,
+        ...     replay_buffer_kwargs={"mode": "both"},
+        ... )
+
+    Args:
+        buffer_size: Env steps to keep, over all envs; a changed step counts once.
+        observation_space: Not a Dict; for those there is `ExecutedActionDictReplayBuffer`.
+        action_space: A bounded Box.
+        device, n_envs, handle_timeout_termination, more: As in SB3.
+        optimize_memory_usage: As in SB3, mode "safe_action" only.
+        mode: "safe_action" or "both".
+
+    Attributes:
+        actions, rewards: In mode "both" the policy's actions and penalised rewards.
+        executed_actions, task_rewards: Mode "both": the second transition, scaled actions (buffer_size, n_envs, nu)
+            and rewards (buffer_size, n_envs).
+        changed: Mode "both": where there is a second transition, (buffer_size, n_envs).
+
+    Raises:
+        ConfigurationError: An unknown mode or unsuitable spaces; at the first step, an env without a filter, without
+            the penalty that "both" needs, with one in "safe_action", or with a wrapper outside the filter that
+            changes actions.
+        ActionError: An executed action that is not finite.
+    """
+
+    modes: ClassVar[Sequence[str]] = ("safe_action", "both")
+    others: ClassVar[str] = "the naive learner and the adaption penalty alone use SB3's own ReplayBuffer"
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        mode: str = "safe_action",
+        **more: Any,
+    ) -> None:
+        if mode not in self.modes:
+            expected = " or ".join(map(repr, self.modes))
+            raise ConfigurationError(f"mode: expected {expected}, got {mode!r}; {self.others}")
+        if not (isinstance(action_space, spaces.Box) and action_space.is_bounded()):
+            raise ConfigurationError(f"expected a bounded Box of actions, got {action_space}")
+        if isinstance(observation_space, spaces.Dict) != isinstance(self, DictReplayBuffer):
+            raise ConfigurationError(
+                "use ExecutedActionDictReplayBuffer for Dict observations (with HER: ExecutedActionHerReplayBuffer)"
+                f" and ExecutedActionReplayBuffer for all others; {type(self).__name__} got {observation_space}"
+            )
+        if mode == "both" and optimize_memory_usage:
+            raise ConfigurationError("mode 'both' does not work with optimize_memory_usage; leave it out")
+        more |= {"device": device, "n_envs": n_envs, "optimize_memory_usage": optimize_memory_usage}
+        more["handle_timeout_termination"] = handle_timeout_termination
+        super().__init__(buffer_size, observation_space, action_space, **more)
+        self.mode = mode
+        self._low, self._high = action_space.low, action_space.high
+        if mode == "both":
+            self.executed_actions = np.zeros_like(self.actions)
+            self.task_rewards = np.zeros_like(self.rewards)
+            self.changed = np.zeros(self.rewards.shape, dtype=np.bool_)
+
+    def add(
+        self, obs: Any, next_obs: Any, action: Values, reward: Values, done: Values, infos: Infos
+    ) -> None:
+        """Stores one step of every env; `action` is the policy's, scaled, and `infos` hold the executed one."""
+        policy = action.reshape((self.n_envs, self.action_dim))
+        self._check(infos)
+        executed = self._scaled(infos, keys.EXECUTED_ACTION)
+        if not np.isfinite(executed).all():
+            raise ActionError(f"an executed action is not finite: {[i[keys.EXECUTED_ACTION] for i in infos]}")
+        finite: Flags = np.asarray(np.isfinite(policy).all(axis=1))
+        escaping = np.array([bool(info.get(keys.CBF_ESCAPING, False)) for info in infos])
+        judged = finite & ~escaping
+        chosen, given = policy[judged], self._scaled(infos, keys.PROPOSED_ACTION)[judged]
+        if not (np.abs(chosen - given) < _SAME).all():
+            raise self._foreign(f"scaled to [-1, 1], the policy chose {chosen} and the filter got {given}")
+        changed = np.array([bool(info[keys.CBF_INTERVENED]) for info in infos]) | escaping | ~finite
+        # Unscaling and scaling again is not the identity in floating point: unchanged actions stay the policy's.
+        executed = np.where(changed[:, None], executed, policy)
+        if self.mode == "safe_action":
+            super().add(obs, next_obs, executed, reward, done, infos)
+            return
+        task = np.array([info[keys.ADAPTION_TASK_REWARD] for info in infos], dtype=np.float64)
+        self._keep(infos, executed, task, changed, finite)
+        policy = np.where(finite[:, None], policy, executed)
+        super().add(obs, next_obs, policy, np.where(finite, reward, task), done, infos)
+
+    def _keep(self, infos: Infos, executed: Values, task: Values, changed: Flags, finite: Flags) -> None:
+        """Store what SB3's buffer has no place for, at the present slot."""
+        if self.mode == "both":
+            self.executed_actions[self.pos], self.task_rewards[self.pos] = executed, task
+            self.changed[self.pos] = changed & finite
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """Draws a batch, uniformly from all stored transitions, with replacement."""
+        if self.mode == "safe_action":
+            return super().sample(batch_size, env)
+        slots, envs, second = drawn = self._draw(batch_size)
+        rewards = np.where(second, self.task_rewards[slots, envs], self.rewards[slots, envs])
+        before, after = (picked(part, slots, envs) for part in (self.observations, self.next_observations))
+        return self._batch(drawn, before, after, rewards, env)
+
+    def _batch(self, drawn: Indices, before: Any, after: Any, rewards: Any, env: VecNormalize | None) -> Any:
+        """The drawn transitions with these observations and rewards, as SB3 takes them."""
+        slots, envs, second = drawn
+        actions = self.actions[slots, envs]
+        if self.mode == "both":
+            actions = np.where(second[:, None], self.executed_actions[slots, envs], actions)
+        dones = self.dones[slots, envs] * (1 - self.timeouts[slots, envs])
+        kind: Any = DictReplayBufferSamples if isinstance(self, DictReplayBuffer) else ReplayBufferSamples
+        return kind(
+            observations=self._observed(before, env),
+            actions=self.to_torch(actions),
+            next_observations=self._observed(after, env),
+            dones=self.to_torch(dones.reshape(-1, 1)),
+            rewards=self.to_torch(self._normalize_reward(rewards.reshape(-1, 1), env)),
+        )
+
+    def _observed(self, observations: Any, env: VecNormalize | None) -> Any:
+        seen: Any = self._normalize_obs(observations, env)
+        if isinstance(seen, Mapping):
+            return {key: self.to_torch(value) for key, value in seen.items()}
+        return self.to_torch(seen)
+
+    def _draw(self, count: int) -> Indices:
+        """Slots, envs and which of the two transitions (1 is the executed one), shape (3, count), uniformly."""
+        drawn = np.empty((3, 0), dtype=np.int64)
+        while drawn.shape[1] < count:
+            # Rejection sampling: at least half of the candidates exist. Counting the changed steps of a full buffer
+            # for every batch would cost more. NumPy's global generator is the one that SB3 seeds and uses.
+            tries = np.stack([np.random.randint(0, n, 2 * count) for n in (self.size(), self.n_envs, 2)])
+            slots, envs, second = tries
+            drawn = np.hstack([drawn, tries[:, (second == 0) | self.changed[slots, envs]]])
+        return drawn[:, :count]
+
+    def _scaled(self, infos: Infos, key: str) -> Values:
+        """Actions from the infos as `policy.scale_action` makes them, (n_envs, nu), in its precision."""
+        given = np.array([np.asarray(info[key], dtype=self.action_space.dtype) for info in infos])
+        if given.shape[1:] != self.action_space.shape:
+            shapes = f"{given.shape[1:]}, the action space {self.action_space.shape}"
+            raise self._foreign(f"{key} has shape {shapes}")
+        scaled: Values = 2.0 * ((given - self._low) / (self._high - self._low)) - 1.0
+        return scaled.reshape((self.n_envs, self.action_dim))
+
+    def _check(self, infos: Infos) -> None:
+        for at, info in enumerate(infos):
+            for key in (keys.EXECUTED_ACTION, keys.PROPOSED_ACTION, keys.CBF_INTERVENED):
+                if key not in info:
+                    raise ConfigurationError(
+                        f"env {at} has no info[{key!r}]: ExecutedActionReplayBuffer needs a CBFActionFilter inside"
+                        " the env; without a filter use SB3's own ReplayBuffer"
+                    )
+            if self.mode != "safe_action" and keys.ADAPTION_PENALTY not in info:
+                raise ConfigurationError(
+                    f"env {at} has no info[{keys.ADAPTION_PENALTY!r}]: mode {self.mode!r} stores a penalised"
+                    " transition; wrap the env in AdaptionPenalty(env, penalty=...), or use mode 'safe_action'"
+                )
+            if self.mode == "safe_action" and keys.ADAPTION_PENALTY in info:
+                raise ConfigurationError(
+                    f"env {at} has an AdaptionPenalty: mode 'safe_action' would charge it to the executed action,"
+                    " which is the safe one; use mode 'both', or take the wrapper away"
+                )
+
+    def _foreign(self, what: str) -> ConfigurationError:
+        return ConfigurationError(
+            f"the filter's actions are not the policy's ({what}): a wrapper outside the filter changes actions, so"
+            " the executed action is not in the policy's units; take that wrapper away (SB3 scales actions to [-1, 1]"
+            " itself), or learn from the policy's action (SB3's own ReplayBuffer)"
+        )
+
+
+def picked(stored: Any, slots: Indices, envs: Indices) -> Any:
+    """A copy of the observations of some slots and envs."""
+    if isinstance(stored, Mapping):
+        return {key: part[slots, envs] for key, part in stored.items()}
+    return stored[slots, envs]
+
+
+class ExecutedActionDictReplayBuffer(ExecutedActionReplayBuffer, DictReplayBuffer):
+    """`ExecutedActionReplayBuffer` for Dict observations; same arguments and modes."""
+
+
+class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer):
+    """SB3's `HerReplayBuffer`, with the action that the filter executed and with the penalty in relabelled rewards.
+
+    HER (Andrychowicz et al., NeurIPS 2017) replays most transitions with a goal g' that the episode did reach, and
+    the task's reward for it, r' = `compute_reward(achieved, g', info)`. Of a step that the filter changed
+
+    - mode "safe_action" replays (s, g', a_safe, s', r');
+    - mode "adaption_penalty" replays (s, g', a, s', r' - penalty), with what `AdaptionPenalty` took at the time;
+    - mode "both" replays both.
+
+    Unchanged steps are drawn as SB3 draws them, bit for bit with the same seed. The reward has to be a function of
+    the goals alone: wrappers that change rewards, such as `OcclusionPenalty`, are not in `compute_reward`.
+
+    Example:
+        >>> import gymnasium as gym, gymnasium_robotics, safe_wrappers as sw
+        >>> from stable_baselines3 import SAC
+        >>> from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
+        >>> gym.register_envs(gymnasium_robotics)
+        >>> model = SAC(
+        ...     "MultiInputPolicy",
+        ...     sw.protect(gym.make("FetchReach-v4")),
+        ...     buffer_size=1000,
+        ...     replay_buffer_class=ExecutedActionHerReplayBuffer,
+        ...     replay_buffer_kwargs={"mode": "safe_action", "n_sampled_goal": 4},
+        ... )
+
+    Args:
+        env, n_sampled_goal, goal_selection_strategy, copy_info_dict: As in `HerReplayBuffer`; SB3 passes `env`.
+        args, more: The others as in `ExecutedActionReplayBuffer`; observations as in `HerReplayBuffer`.
+
+    Attributes:
+        penalties: Modes "both" and "adaption_penalty": of each step, (buffer_size, n_envs), reward.
+
+    Raises:
+        ConfigurationError, ActionError: As `ExecutedActionReplayBuffer`.
+    """
+
+    modes: ClassVar[Sequence[str]] = ("safe_action", "both", "adaption_penalty")
+    others: ClassVar[str] = "the naive learner uses SB3's own HerReplayBuffer"
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
+        if self.mode != "safe_action":
+            # In double precision, so that a penalty comes off a relabelled reward as it came off the task's own.
+            self.penalties = np.zeros(self.rewards.shape)
+
+    def _keep(self, infos: Infos, executed: Values, task: Values, changed: Flags, finite: Flags) -> None:
+        super()._keep(infos, executed, task, changed, finite)
+        self.penalties[self.pos] = np.where(finite, [info[keys.ADAPTION_PENALTY] for info in infos], 0.0)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """Draws a batch, uniformly from all transitions of whole episodes; most of them get a new goal.
+
+        Raises:
+            RuntimeError: No episode has ended yet (SB3's: give a larger `learning_starts`).
+        """
+        if self.mode == "safe_action" or not self.ep_length.any():
+            return HerReplayBuffer.sample(self, batch_size, env)
+        slots, envs, _ = drawn = self._draw(batch_size)
+        replayed = int(self.her_ratio * batch_size)
+        goals = self._sample_goals(slots[:replayed], envs[:replayed])
+        # SB3 puts the transitions with their own goals first.
+        slots, envs, second = drawn = np.roll(drawn, -replayed, axis=1)
+        real = batch_size - replayed
+        before, after = (picked(part, slots, envs) for part in (self.observations, self.next_observations))
+        before["desired_goal"][real:] = after["desired_goal"][real:] = goals
+        rewards = self.rewards[slots, envs]
+        if self.mode == "both":
+            rewards = np.where(second, self.task_rewards[slots, envs], rewards)
+        penalties = np.where(second, 0.0, self.penalties[slots, envs])
+        relabelled = self._task_rewards(after["achieved_goal"][real:], goals, slots[real:], envs[real:])
+        rewards[real:] = relabelled - penalties[real:]
+        return self._batch(drawn, before, after, rewards, env)
+
+    def _draw(self, count: int) -> Indices:
+        """Slots, envs and which of the two transitions, uniformly from whole episodes, by SB3's own random calls."""
+        whole = self.ep_length > 0
+        first = np.flatnonzero(whole)
+        second = np.flatnonzero(whole & self.changed) if self.mode == "both" else first[:0]
+        drawn = np.random.choice(len(first) + len(second), size=count, replace=True)
+        slots, envs = np.unravel_index(np.concatenate([first, second])[drawn], whole.shape)
+        return np.stack([slots, envs, drawn >= len(first)])
+
+    def _task_rewards(self, achieved: Values, goals: Values, slots: Indices, envs: Indices) -> Values:
+        """The task's rewards for having reached `achieved`, (n,)."""
+        if self.env is None:
+            raise ConfigurationError(
+                "this buffer was loaded and has no env to relabel rewards with: call set_env(vec_env), or load it"
+                " with the model's load_replay_buffer"
+            )
+        infos: Any = copy.deepcopy(self.infos[slots, envs]) if self.copy_info_dict else [{} for _ in slots]
+        (rewards,) = self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])
+        return np.asarray(rewards, dtype=np.float64)

@@ -1,0 +1,429 @@
+"""ChunkQueue: which command a robot executes while chunks arrive late, broken or not at all."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.checks import Array, positive, whole_number
+from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
+from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, Seam, drawn_out, join
+from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE, shortest_latched_blend, smoothstep
+from safe_wrappers.control.handover.splines import hermite_series
+from safe_wrappers.control.handover.vibration import shortest_smoothstep
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.queries.rigid_model import RigidModelCheck
+from safe_wrappers.wrappers.layer import whole_steps
+
+REPLACE: Final = "replace"
+ENSEMBLE: Final = "ensemble"
+BASELINES: Final = (REPLACE, ENSEMBLE)
+"""What is done without a bound on the seam: the new chunk at once, or the mean of all chunks at hand."""
+
+
+class Command(NamedTuple):
+    """What to send in a control step."""
+
+    control: NDArray[Any]  # shape (m,), in the env's dtype and inside its box
+    observed: int  # control step whose observation the command was made from; -1 before there was any
+    starved: bool  # the queue is empty: the fallback gave it
+    limited: bool  # held back beyond the blend to keep the rate limit
+    took_over: bool  # a chunk took over with it
+    refused: bool  # a chunk that has arrived was refused
+    seam: bool  # there is a seam before it: another chunk, another source, or the fallback began
+    blend_steps: int  # control steps of the blend that begins with this command; 0 if none does
+    stretched: bool  # that blend is longer than without the machine's limits
+
+
+class Chunk(NamedTuple):
+    """A chunk on its way, or there."""
+
+    commands: Array  # shape (h, m), the first one for the control step of the observation
+    observed: int  # control step of the observation
+    due: int  # control step at which it is there
+
+
+class ChunkQueue:
+    """Which command comes next, counted in control steps.
+
+    A chunk that was observed at step k and is there at step t is consumed from its entry t - k on. A chunk of one has
+    no left-over to blend with: only a change of its source (`switch`), to and from the fallback too, is faded over.
+
+    Args:
+        space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
+        control_dt: Control interval, s.
+        blend: A blend of `control/handover/seams.py`, "replace" or "ensemble".
+        fewest: A blend takes at least so many control steps.
+        rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
+        decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
+        check: Of the machine's limits; None accepts all blends.
+        overlap: A smoothstep that the next seam comes before the end of is not cut short: what is left of it fades
+            out beside the next one. A left-over that is shorter than a blend is drawn out. What keeps the rate limit
+            is then the sending alone.
+    """
+
+    def __init__(
+        self,
+        space: gym.spaces.Box,
+        control_dt: float,
+        blend: str,
+        fewest: int,
+        rate_limit: Array,
+        decay: float,
+        check: SeamCheck | None = None,
+        overlap: bool = False,
+    ) -> None:
+        self._control_dt, self._blend, self._fewest, self._decay = control_dt, blend, fewest, decay
+        self._rate_limit, self._check = rate_limit, check
+        self._overlap = overlap and blend == "smoothstep"
+        step = np.asarray(rate_limit * control_dt)
+        # The difference of two commands, divided by the interval again, must not come out above the limit.
+        self._step = np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)
+        dtype: Any = space.dtype
+        self._dtype = np.dtype(dtype)
+        largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
+        self._low = np.maximum(np.asarray(space.low, np.float64), -largest)
+        self._high = np.minimum(np.asarray(space.high, np.float64), largest)
+        self._none = np.zeros((0, self._low.size))
+        self._source = ""
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode: nothing sent, nothing planned; the source stays the one that was named last."""
+        self.now = 0
+        self._observed = -1
+        self._sent = self._none
+        self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
+        self._asked = self._none  # the chunk in force as it came; it ends with the plan
+        self._coming: list[Chunk] = []
+        self._averaged: list[Chunk] = []
+        self._in_force = self._source
+        self._acting: str | None = None
+        self._fade: tuple[Array, int, int] | None = (
+            None  # a change of source: the latched command, steps, done
+        )
+
+    def submit(self, commands: Array, observed: int, due: int) -> bool:
+        """A chunk, shape (h, m), observed at a control step, is on its way; False if it is refused.
+
+        Refused are a chunk with an entry that is not finite, and one whose observation is in the future or not newer
+        than all before it.
+        """
+        newest = max([self._observed, *(c.observed for c in self._coming)])
+        if not newest < observed <= self.now or not np.isfinite(commands).all():
+            return False
+        boxed = np.clip(commands, self._low, self._high)
+        self._coming.append(Chunk(boxed, observed, due))
+        return True
+
+    def switch(self, source: str) -> None:
+        """Chunks that take over from now on are somebody else's; the change is blended, from the last command."""
+        self._source = source
+
+    def next(self, admits: Callable[[Array], bool], fallback: Callable[[], Array]) -> Command:
+        """The command of this control step.
+
+        Args:
+            admits: Whether a chunk that has arrived may take over, by its commands from this control step on, shape
+                (h, m).
+            fallback: Called when nothing is planned; returns a finite control of shape (m,).
+        """
+        admitted, refused = self._admitted(admits)
+        newest = self._observed
+        self._coming = [c for c in self._coming if c.due > self.now]
+        seam, blend_steps, stretched = False, 0, False
+        if admitted:
+            joined = self._take_over(admitted)
+            refused |= joined is None
+            seam, blend_steps, stretched = joined or (False, 0, False)
+        control, limited = self._planned()
+        starved = control is None
+        if control is None:
+            control = np.clip(fallback(), self._low, self._high)
+        acting = None if starved else self._in_force
+        if acting != self._acting and len(self._sent):
+            # A longer chunk that takes over blends by itself; everything else starts from the last command.
+            if not seam and self._blend in BLENDS:
+                blend_steps = self._fade_steps(control)
+                self._fade = (self._sent[-1], blend_steps, 0)
+            seam = True
+        self._acting = acting
+        sent, held = self._sendable(self._faded(control))
+        self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], sent[None].astype(np.float64)])
+        self.now += 1
+        took_over = self._observed > newest
+        held |= limited
+        return Command(sent, self._observed, starved, held, took_over, refused, seam, blend_steps, stretched)
+
+    def _admitted(self, admits: Callable[[Array], bool]) -> tuple[list[Chunk], bool]:
+        """The chunks that may take over now, the newest observation first; and whether one was refused."""
+        admitted: list[Chunk] = []
+        refused = False
+        for chunk in reversed([c for c in self._coming if c.due <= self.now]):
+            left = chunk.commands[self.now - chunk.observed :]
+            if not (len(left) and admits(left)):  # it came too late, or must not
+                refused = True
+                continue
+            admitted.append(chunk)
+            if self._blend != ENSEMBLE:
+                break
+        return admitted, refused
+
+    def _take_over(self, admitted: list[Chunk]) -> tuple[bool, int, bool] | None:
+        """Let the newest of these take over, or all in an ensemble; None if no blend keeps the machine's limits.
+
+        Returns whether it is a seam, its blend's steps, and whether these limits stretched it.
+        """
+        newest = admitted[0]
+        fresh = newest.commands[self.now - newest.observed :]
+        joined: Seam | None = None
+        if self._blend in BLENDS and len(newest.commands) > 1:
+            joined = self._joined(fresh)
+            if joined is None:
+                return None
+        self._coming = [c for c in self._coming if c.observed > newest.observed]
+        self._observed, self._in_force = newest.observed, self._source
+        if self._blend == ENSEMBLE:
+            self._averaged += reversed(admitted)
+            return len(self._sent) > 0, 0, False
+        if joined is None:
+            self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
+            return self._blend == REPLACE and len(self._sent) > 0, 0, False
+        self._plan, self._limited, self._asked = joined.plan, joined.limited, fresh
+        self._fade = None
+        return len(self._sent) > 0, joined.steps, joined.stretched
+
+    def _joined(self, fresh: Array) -> Seam | None:
+        """The blend into a chunk's rest, shape (n, m); None if none keeps the machine's limits."""
+        prior = self._plan
+        if self._overlap and len(prior):
+            fading = (prior - self._asked[-len(prior) :])[: len(fresh)]
+            fresh = fresh.copy()
+            fresh[: len(fading)] += fading
+            fresh = np.clip(fresh, self._low, self._high)
+            prior = drawn_out(prior, len(fresh))
+        blend: Any = self._blend  # checked by the wrapper
+        motion = self._sent, prior, fresh
+        return join(
+            *motion,
+            self._control_dt,
+            blend=blend,
+            fewest=self._fewest,
+            rate_limit=self._rate_limit,
+            low=self._low,
+            high=self._high,
+            accepts=None if self._check is None else partial(self._check.accepts, blend, *motion),
+            hold_back=not self._overlap,
+        )
+
+    def _planned(self) -> tuple[Array | None, bool]:
+        if self._blend == ENSEMBLE:
+            self._averaged = [c for c in self._averaged if c.observed + len(c.commands) > self.now]
+            if not self._averaged:
+                return None, False
+            votes = np.array([c.commands[self.now - c.observed] for c in self._averaged])
+            weights = np.exp(-self._decay * np.arange(len(votes)))
+            return np.asarray(weights @ votes / weights.sum()), False
+        if not len(self._plan):
+            return None, False
+        control, limited = self._plan[0], bool(self._limited[0])
+        self._plan, self._limited = self._plan[1:], self._limited[1:]
+        return control, limited
+
+    def _fade_steps(self, target: Array) -> int:
+        """Control steps between the latched command and the new one that keep the limits, were both at rest."""
+        change = np.abs(target - self._sent[-1])
+        shortest = 0.0 if self._check is None else self._check.shortest_fade(change)
+        bounded = np.isfinite(self._rate_limit)
+        if bounded.any():
+            shortest_by_rate = shortest_latched_blend(change[bounded], self._rate_limit[bounded])
+            shortest = max(shortest, float(shortest_by_rate.max()))
+        return max(self._fewest, whole_steps(shortest, self._control_dt) - 1)
+
+    def _faded(self, control: Array) -> Array:
+        if self._fade is None:
+            return control
+        latched, steps, done = self._fade
+        if done >= steps:
+            self._fade = None
+            return control
+        self._fade = (latched, steps, done + 1)
+        weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
+        return np.asarray(latched + weight * (control - latched))
+
+    def _sendable(self, control: Array) -> tuple[NDArray[Any], bool]:
+        """The command in the env's dtype, within the box and the limit, and whether it had to be held back."""
+        control = np.clip(control, self._low, self._high)
+        if self._blend not in BLENDS or not len(self._sent):
+            return control.astype(self._dtype), False
+        last = self._sent[-1]
+        kept = np.clip(control, last - self._step, last + self._step)
+        sent = kept.astype(self._dtype)
+        # Rounding alone may break the limit by a hair: one number back, which is not called holding back.
+        too_far = np.abs(sent - last) > self._step
+        sent = np.where(too_far, np.nextafter(sent, last.astype(self._dtype)), sent)
+        hair = 2.0 * float(np.finfo(self._dtype).eps) * np.maximum(np.abs(control), np.abs(last))
+        return sent, bool((np.abs(control - kept) > hair).any())
+
+
+class ChunkSizes(NamedTuple):
+    """In control steps, by the names of real-time chunking: H, s, and the least and the most of d."""
+
+    entries: int  # chunk_size
+    steps_per_entry: int  # control steps from one entry to the next
+    chunk: int  # H, the control steps that a chunk has a command for; with one step per entry its entries
+    horizon: int  # execution_horizon s
+    delay: tuple[int, int]  # the least and the largest inference_delay d; d <= s <= H - d holds for both
+
+    @classmethod
+    def checked(
+        cls, chunk_size: Any, execution_horizon: Any, inference_delay: Any, steps_per_entry: Any
+    ) -> "ChunkSizes":
+        """The sizes as the user gave them, or an error that says what would fit."""
+        entries = whole_number("chunk_size", chunk_size, 1, "control steps")
+        horizon = whole_number("execution_horizon", execution_horizon, 1, "control steps")
+        apart = whole_number("steps_per_entry", steps_per_entry, 1, "control steps")
+        if entries == 1 and apart > 1:
+            raise ConfigurationError(f"steps_per_entry = {apart}: one entry leads to no other")
+        size = (entries - 1) * apart + 1
+        delay = _delay(inference_delay)
+        if horizon > size:
+            has = _size(entries, apart, "")
+            raise ConfigurationError(
+                f"execution_horizon = {horizon} is more than {has}: choose it up to {size}"
+            )
+        if not delay[1] <= horizon <= size - delay[1]:
+            late, between = (
+                delay[1],
+                f"choose s from {max(delay[1], 1)} to {size - delay[1]}, or longer chunks",
+            )
+            fits = between if 2 * late <= size else f"no s fits, choose H >= {2 * late}"
+            raise ConfigurationError(
+                f"inference_delay d = {late}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} "
+                f"break d <= s <= H - d: a late chunk has {max(size - late, 0)} commands left; {fits}"
+            )
+        return cls(entries, apart, size, horizon, delay)
+
+
+def blend_bounds(
+    sizes: ChunkSizes,
+    space: gym.spaces.Box,
+    control_dt: float,
+    blend: str,
+    blend_time: float | None,
+    rate_limit: float | Sequence[float] | None,
+    limits: SeamLimits | None = None,
+) -> tuple[int, Array]:
+    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
+    fewest, rate_limits = 0, np.full(space.shape, np.inf)
+    given = {"blend_time": blend_time, "rate_limit": rate_limit, "limits": limits}
+    named = [name for name, one in given.items() if one is not None]
+    if blend in BASELINES:
+        if named:
+            bounded = ", ".join(BLENDS)
+            baseline = f"blend={blend!r} is a baseline that bounds nothing"
+            raise ConfigurationError(
+                f"{baseline}: blend_time, rate_limit, limits and flexible are for {bounded}"
+            )
+        return fewest, rate_limits
+    if blend_time is not None:
+        fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
+        available = sizes.chunk - sizes.delay[1]
+        if fewest >= available and sizes.chunk > 1:
+            left = f"{available} control steps of {control_dt} s"
+            longer = f"blend_time = {blend_time} s is longer than a chunk's rest, {left}"
+            raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
+    if rate_limit is not None:
+        rate_limits = _rate_limits(rate_limit, rate_limits.size)
+        resolution = _rounding(space)
+        if (rate_limits * control_dt <= resolution).any():
+            least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
+            raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
+    if not named:
+        fewest = sizes.chunk - sizes.horizon - sizes.delay[1]  # the least left-over
+        if fewest == 0:
+            has = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"
+            raise ConfigurationError(f"{has}: no left-over to blend with: pass rate_limit or blend_time")
+    return fewest, rate_limits
+
+
+def bounds_for_springs(
+    check: RigidModelCheck,
+    share: float,
+    space: gym.spaces.Box,
+    blend_time: float | None,
+    rate_limit: float | Sequence[float] | None,
+) -> tuple[float, Sequence[float] | float | None]:
+    """Blend time, s, and rate limit, each the stricter of the user's and of what springs ask.
+
+    These ask for the time from which on a smoothstep leaves at most a share of a step's energy in them, and for the
+    steepest rate of such a blend over the whole action range, if every component has one.
+    """
+    shortest = shortest_smoothstep(share, check.resonances[0])
+    own = np.full(space.shape, np.inf) if rate_limit is None else _rate_limits(rate_limit, space.shape[0])
+    rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / shortest, own)
+    return max(shortest, blend_time or 0.0), rates.tolist() if np.isfinite(rates).all() else rate_limit
+
+
+def _size(entries: int, apart: int, letter: str) -> str:
+    if apart == 1:
+        return f"chunk_size{letter} = {entries}"
+    return f"chunk_size {entries} at {apart} control steps per entry, H = {(entries - 1) * apart + 1} control steps"
+
+
+def _delay(value: Any) -> tuple[int, int]:
+    if not isinstance(value, list | tuple):
+        return (whole_number("inference_delay", value, 0, "control steps"),) * 2
+    counts = [whole_number("inference_delay", delay, 0, "control steps") for delay in value]
+    if len(counts) != 2 or counts[0] > counts[1]:
+        raise ConfigurationError(f"inference_delay is d control steps or [least, most], got {value!r}")
+    return counts[0], counts[1]
+
+
+def _rate_limits(rate_limit: Any, controls: int) -> Array:
+    unit = "action units per second"
+    if not isinstance(rate_limit, list | tuple | np.ndarray):
+        return np.full(controls, positive("rate_limit", rate_limit, unit))
+    if len(rate_limit) != controls:
+        wanted = f"one number, or one for each of the {controls} action components"
+        raise ConfigurationError(f"rate_limit is {wanted}; got {rate_limit!r}")
+    return np.array([positive("rate_limit", each, unit) for each in rate_limit])
+
+
+def _rounding(space: gym.spaces.Box) -> float:
+    """The most that rounding to the actions' dtype may add to the difference of two commands in the box."""
+    ends = np.abs(np.concatenate([space.low, space.high]).astype(np.float64))
+    largest = float(ends[np.isfinite(ends)].max(initial=1.0))
+    dtype: Any = space.dtype
+    return 2.0 * float(np.finfo(dtype).eps) * largest
+
+
+class Upsampling:
+    """Chunks of entries that lie some control steps apart, as commands on a cubic Hermite spline through the entries.
+
+    A chunk ends with its last entry. Between entries the spline may overshoot their range.
+    """
+
+    def __init__(self, entries: int, steps: int) -> None:
+        self._steps = steps
+        if steps > 1:
+            times = np.arange(entries) * float(steps)
+            unit = np.eye(entries)
+            rates = np.asarray(np.gradient(unit, axis=1)) / steps
+            # The spline is linear in the entries: one matrix for all chunks.
+            self._weights = hermite_series(times, unit, rates, np.arange((entries - 1) * steps + 1)).T
+
+    def bears_knots(self, chunk: Array, check: SeamCheck, control_dt: float) -> bool:
+        """Whether the torque steps where the spline's pieces meet keep the machine's limits."""
+        return self._steps == 1 or check.bears_knots(chunk, self._steps * control_dt)
+
+    def commands(self, chunk: Array) -> Array:
+        """The commands of a chunk (H, m), shape ((H - 1) steps + 1, m); at the entries these bit for bit."""
+        if self._steps == 1:
+            return chunk
+        commands = self._weights @ chunk
+        commands[:: self._steps] = chunk
+        return commands

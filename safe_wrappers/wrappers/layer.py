@@ -1,0 +1,182 @@
+"""Base of this library's wrappers, of those that are told how old a command is, and their random numbers."""
+
+import inspect
+import math
+import warnings
+import zlib
+from collections.abc import Mapping
+from typing import Any, ClassVar, Final, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.checks import OF_NUMBERS, numbers_of, shown
+from safe_wrappers.errors import ActionError, UnsupportedEnvError
+from safe_wrappers.plants.default import PlantTemplate
+from safe_wrappers.plants.env_checks import wrappers_of
+from safe_wrappers.serialize import recorded
+from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.wrappers.episode_guard import EpisodeGuard
+
+Env = gym.Env[Any, Any]
+Reset = tuple[Any, dict[str, Any]]
+"""What `reset` returns: observation and info."""
+Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
+"""What `step` returns: observation, reward, terminated, truncated and info."""
+
+
+_WRAPPERS = __name__.rpartition(".")[0]
+
+
+class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """A wrapper with a place in the stack, whose arguments are recorded in the env's spec."""
+
+    layer: ClassVar[Layer]
+
+    def __init__(self, env: Env) -> None:
+        refuse_vector_env(env, type(self).__name__)
+        refuse_order(env, self.layer, type(self).__name__)
+        gym.Wrapper.__init__(self, env)
+        self.await_reset()
+        self.warned: set[str] = set()
+        innermost = not any(isinstance(inner, LayerWrapper) for inner in wrappers_of(env))
+        self._passes_numbers = innermost and isinstance(env.action_space, gym.spaces.Box)
+
+    def _pass_on(self, action: Any) -> Step:
+        """Step the env with an action that this wrapper only passes on, to the env itself if it is finite."""
+        self._refuse_what_is_not_finite(action)
+        return self.env.step(action)
+
+    def _refuse_what_is_not_finite(self, action: Any) -> None:
+        if self._passes_numbers:
+            given = numbers_of(action)
+            if given is None or not np.isfinite(given).all():
+                raise ActionError(
+                    f"expected an action of finite numbers, got {shown(action)}; the env was not stepped"
+                )
+
+    def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
+        """Warn, unless `warned` has it, at the line that called the outermost of this library's wrappers."""
+        if what in self.warned:
+            return
+        self.warned.add(what)
+        level, frame = 1, inspect.currentframe()
+        while frame is not None and str(frame.f_globals.get("__name__")).startswith(_WRAPPERS):
+            level, frame = level + 1, frame.f_back
+        warnings.warn(message, category, stacklevel=level)
+
+    def _record(self, arguments: Mapping[str, Any], **plain: Any) -> None:
+        """Record the constructor's arguments (its `locals()`), some as plain data; a plant as a template."""
+        if plain.get("plant") is not None:
+            plain["plant"] = PlantTemplate(plain["plant"])
+        gym.utils.RecordConstructorArgs.__init__(self, **recorded(arguments, **plain))
+
+
+def refuse_vector_env(env: Any, name: str) -> None:
+    """An error that says how to wrap each env of a vector env."""
+    if isinstance(env, gym.vector.VectorEnv):
+        raise UnsupportedEnvError(
+            f"{name} wraps single envs, got {env!r}; wrap each env of it: gym.make_vec(id, num_envs=...,"
+            f" vectorization_mode='sync', wrappers=[sw.protect, lambda env: sw.{name}(env, ...)])"
+        )
+
+
+class WrapperRng:
+    """Random numbers apart from the env's, which paired runs need unchanged; a reset's seed starts them anew.
+
+    The env's first seed is used where none was ever given. `stream` keeps it apart from others of the same seed.
+    """
+
+    def __init__(self, stream: str) -> None:
+        self._stream = zlib.crc32(stream.encode())
+        self._generator: np.random.Generator | None = None
+
+    def reset(self, env: Env, seed: int | None) -> None:
+        """Call it after the env's own reset."""
+        if seed is None and self._generator is None:
+            seed = env.unwrapped.np_random_seed
+        if seed is not None:
+            self._generator = np.random.default_rng([self._stream, abs(int(seed))])
+
+    @property
+    def draw(self) -> np.random.Generator:
+        """The generator; an error before the first reset."""
+        if self._generator is None:
+            raise gym.error.ResetNeeded("call reset before step")
+        return self._generator
+
+
+SAME_STEP: Final = 1e-6
+"""Control steps: times that are closer count as the same."""
+
+
+def whole_steps(time_s: float, control_dt: float) -> int:
+    """Control steps that cover a time, rounded up."""
+    return math.ceil(time_s / control_dt - SAME_STEP)
+
+
+class CommandReceiver:
+    """Base of `ChunkHandover`, `LeaseExpiry`, `TeleopChannel` and the faults.
+
+    What carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call
+    the action was made from the newest observation.
+    """
+
+    control_dt: float
+    """Control interval, s."""
+    _steps_done: int
+    _observed_s: float | None
+
+    @property
+    def now_s(self) -> float:
+        """Seconds of the episode so far, on the clock of control steps."""
+        return self._steps_done * self.control_dt
+
+    def set_observation_time(self, observed_s: float | None) -> None:
+        """Say which observation the next action is made from.
+
+        Args:
+            observed_s: When that observation was returned, s on the clock of `now_s`. None: no action arrives, the
+                next step's is disregarded.
+
+        Raises:
+            ActionError: Not a finite time.
+        """
+        given = None if observed_s is None else numbers_of(observed_s)
+        if observed_s is not None and (given is None or given.ndim or not np.isfinite(given)):
+            raise ActionError(
+                f"observed_s is a time in seconds, or None for nothing; got {shown(observed_s)}"
+            )
+        self._observed_s = observed_s
+
+    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
+        """Whether a chunk may be executed that ends with this command, shape (m,), so many control steps from now."""
+        return True
+
+    def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
+        """Whether a chunk may be executed, shape (h, m): the commands of the next h control steps."""
+        return self.admits(commands[-1], len(commands))
+
+
+def receiver_inside(env: Env) -> CommandReceiver | None:
+    """The outermost receiver among an env's wrappers."""
+    return next((inner for inner in wrappers_of(env) if isinstance(inner, CommandReceiver)), None)
+
+
+def outside(action: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> float:
+    """The L2 norm by which an action (m,) left its box, of a chunk (h, m) the largest; NaN and inf count as 0."""
+    if ((action >= low) & (action <= high)).all():
+        return 0.0
+    beyond = np.where(np.isfinite(action), action - np.clip(action, low, high), 0.0)
+    return max(math.hypot(*one) for one in np.atleast_2d(beyond).tolist())  # squares may overflow
+
+
+def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None) -> NDArray[Any]:
+    """A copy of an action, in its own dtype unless told; an `ActionError` for another shape or no numbers."""
+    given = numbers_of(action)
+    if given is None:
+        raise ActionError(f"expected an action of shape {shape}, {OF_NUMBERS}, got {shown(action)}")
+    if given.shape != shape:
+        raise ActionError(f"expected an action of shape {shape}, got shape {given.shape}")
+    return given if dtype is None else given.astype(dtype, copy=False)

@@ -1,0 +1,282 @@
+"""Wrappers for who learns through a filter: what it sees, is paid for, and how often it decides."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from gymnasium import spaces
+
+from safe_wrappers import info as keys
+from safe_wrappers.checks import Array, non_negative, positive, whole_number
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards, reward_numbers
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.serialize import plain_data
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
+from safe_wrappers.wrappers.chunk_handover import macro_info
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
+
+
+class ActionRepeat(LayerWrapper):
+    """Executes an action for several control steps, each of which the filter inside checks anew.
+
+    Rewards are summed up, and the info keys of this library merged over the control steps (`safe_wrappers.info`). A
+    learner explores farther with actions that last, and sees sooner what the filter makes of them: at 50 control
+    steps per second, the noise of a Gaussian policy averages out before the robot has moved.
+
+    Args:
+        env: A filter, recorders and penalties, which count control steps, belong inside.
+        repeat: Control steps per action; fewer where the episode ends.
+
+    Raises:
+        ConfigurationError: `repeat` is not a whole number of at least 1, or the env's steps are chunks already.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.ActionRepeat(sw.protect(gym.make("SafePointGoal1-v0")), repeat=4)
+        >>> _ = env.reset(seed=0)
+        >>> _, reward, _, _, info = env.step(env.action_space.sample())
+    """
+
+    layer: ClassVar = Layer.HANDOVER
+
+    def __init__(self, env: Env, repeat: int) -> None:
+        LayerWrapper.__init__(self, env)
+        self.repeat = whole_number("repeat", repeat, least=1)
+        self._record({"repeat": self.repeat})
+
+    def step(self, action: Any) -> Step:
+        """Step the env with the same action until `repeat` control steps are made or the episode ends."""
+        total: Any = 0.0
+        infos = []
+        for _ in range(self.repeat):
+            observation, reward, terminated, truncated, info = self._pass_on(action)
+            total = total + reward_numbers(reward)
+            infos.append(info)
+            if terminated or truncated:
+                break
+        return observation, total, terminated, truncated, macro_info(infos)
+
+
+class AdaptionPenalty(LayerWrapper):
+    """Takes a penalty off the reward at every step at which the filter changed the action, or an escape replaced it.
+
+    The learner keeps its own action a, and its reward is r(s, a_safe) less a function of the correction
+    c = |a_safe - a| (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023), the sum of
+
+    - `penalty`,
+    - `per_correction * c`,
+    - `per_squared * c^2`,
+    - `bounded * (1 - exp(-c^2 / scale^2))`, which never costs more than `bounded` (the reward of Yang et al., CBF-RL,
+      2025, as a penalty).
+
+    Wrappers that scale or clip rewards belong inside, and `RecordInterventions` and SB3's `Monitor` too. With
+    hindsight replay use `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the penalty off relabelled
+    rewards too.
+
+    Args:
+        env: With a `CBFActionFilter` inside.
+        penalty: For every changed step, in units of the task's reward, at least 0.
+        per_correction: For each unit of `cbf/correction` (L2 norm, action units) of a changed step, at least 0.
+        per_squared: For each unit of its square, at least 0.
+        bounded: What a large correction costs, in units of the task's reward, at least 0.
+        scale: Of `bounded`: a correction of this size, in action units, costs 63 % of it. Above 0.
+
+    Info, at every step: ``adaption/penalty`` and ``adaption/task_reward`` (float), whose difference is the reward.
+
+    Raises:
+        ConfigurationError: No filter inside, a second AdaptionPenalty, no penalty, one that is negative, or a `scale`
+            without `bounded`.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
+        >>> env = sw.AdaptionPenalty(env, penalty=0.1)
+        >>> _ = env.reset(seed=0)
+        >>> _, reward, _, _, info = env.step(env.action_space.sample())
+        >>> float(reward) == info["adaption/task_reward"] - info["adaption/penalty"]
+        True
+    """
+
+    layer: ClassVar = Layer.ADAPTION
+
+    def __init__(
+        self,
+        env: Env,
+        penalty: float = 0.0,
+        per_correction: float = 0.0,
+        per_squared: float = 0.0,
+        bounded: float = 0.0,
+        scale: float = 1.0,
+    ) -> None:
+        LayerWrapper.__init__(self, env)
+        refuse_vector_rewards(env, "AdaptionPenalty")
+        if filter_inside(env) is None:
+            example = "AdaptionPenalty(sw.protect(env), penalty=...)"
+            raise ConfigurationError(f"AdaptionPenalty needs a CBFActionFilter inside: {example}")
+        self.penalty = non_negative("penalty", penalty, "the task's reward")
+        self.per_correction = non_negative("per_correction", per_correction, "reward per action unit")
+        self.per_squared = non_negative("per_squared", per_squared, "reward per squared action unit")
+        self.bounded = non_negative("bounded", bounded, "the task's reward")
+        self.scale = positive("scale", scale, "action units")
+        if not (self.penalty or self.per_correction or self.per_squared or self.bounded):
+            raise ConfigurationError(
+                "AdaptionPenalty: give penalty (per step), per_correction (per unit of cbf/correction), per_squared"
+                " (per squared unit), bounded (the most that a correction may cost), or several of them"
+            )
+        if self.scale != 1.0 and not self.bounded:
+            raise ConfigurationError(
+                f"scale = {self.scale:g} says at what correction `bounded` bends: give bounded, or no scale"
+            )
+        names = ("penalty", "per_correction", "per_squared", "bounded", "scale")
+        self._record({name: getattr(self, name) for name in names})
+
+    def of(self, correction: float) -> float:
+        """The penalty of a changed step, in units of the task's reward, for a correction in action units."""
+        share = correction / self.scale
+        return (
+            self.penalty
+            + self.per_correction * correction
+            + self.per_squared * correction * correction
+            - self.bounded * math.expm1(-share * share)
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
+        """Resets the env; its info holds the keys of a step, as 0."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        info[keys.ADAPTION_PENALTY] = info[keys.ADAPTION_TASK_REWARD] = 0.0
+        return observation, info
+
+    def step(self, action: Any) -> Step:
+        """Steps the env; an unchanged step's reward passes through untouched."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        penalty = 0.0
+        info[keys.ADAPTION_TASK_REWARD] = one_reward(reward, "AdaptionPenalty")
+        changed, correction = info[keys.CBF_INTERVENED], info[keys.CBF_CORRECTION]
+        if info.get(keys.CBF_ESCAPING, False):  # StuckEscape gave the filter another action than this one
+            changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))
+        if changed:
+            penalty = self.of(float(correction))
+            reward = float(reward) - penalty
+        info[keys.ADAPTION_PENALTY] = penalty
+        return observation, reward, terminated, truncated, info
+
+
+KEY: Final = "filter"
+"""Of the features in a Dict observation."""
+
+
+class FilterObservation(LayerWrapper):
+    """Appends to the observation what the filter decides by, so that the filtered task is Markov for the learner.
+
+    The features are bounded in [-1, 1] and have the same shape at every step: of each constraint its
+    `BoundConstraint.features` (the smallest h; of obstacles the nearest ones, their direction, clearance and closing
+    speed; the side of a detour), then the last correction, in shares of the action box.
+
+    It shows the constraints' truth, for example exact positions where the task's own observation has a lidar. So
+    compare with an unfiltered learner that sees the same: without a filter inside, give the constraints.
+
+    A flat observation (a Box of one dimension) becomes longer, a Dict gets the key ``"filter"``, and any other
+    becomes a Dict with ``"observation"`` and ``"filter"``.
+
+    Args:
+        env: With a `CBFActionFilter` inside, or without one and with `constraints`.
+        constraints: What to observe in an env without a filter, as for `CBFActionFilter`; nothing is filtered.
+        plant: Likewise.
+        neighbours: How many obstacles of each constraint are shown, the nearest.
+
+    Raises:
+        ConfigurationError: No filter and no constraints, or both; or a Dict observation that has the key already.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")), neighbours=4)
+        >>> env.observation_space.shape  # 60 of the task's own
+        (80,)
+    """
+
+    layer: ClassVar = Layer.OBSERVATION
+
+    def __init__(
+        self,
+        env: Env,
+        constraints: Sequence[Constraint | dict[str, Any]] | None = None,
+        plant: Plant | None = None,
+        neighbours: int = 4,
+    ) -> None:
+        arguments = dict(locals())
+        LayerWrapper.__init__(self, env)
+        inside = filter_inside(env)
+        if inside is None and constraints is None:
+            wanted = (
+                "FilterObservation(sw.protect(env)), or constraints=[...] to observe them without a filter"
+            )
+            raise ConfigurationError(f"FilterObservation needs a filter inside or constraints: {wanted}")
+        if inside is not None and (constraints is not None or plant is not None):
+            raise ConfigurationError(
+                "FilterObservation shows what the filter inside decides by; leave constraints and plant out"
+            )
+        self.neighbours = whole_number("neighbours", neighbours, least=0)
+        if constraints is not None:
+            observer = CBFActionFilter(env, constraints, plant)
+            arguments["constraints"] = [plain_data(c) for c in observer.constraints]
+        self._record(arguments, plant=plant)
+        self._acts = inside is not None
+        self._observer = inside if inside is not None else observer
+        low, high = np.ravel(self._observer.action_space.low), np.ravel(self._observer.action_space.high)  # type: ignore[attr-defined]
+        self._low, self._high = low.astype(np.float64), high.astype(np.float64)
+        count = sum(c.feature_count(self.neighbours) for c in self._observer.filter.bound) + low.size
+        self.observation_space = self._space(env.observation_space, count)
+
+    def _space(self, space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
+        features = spaces.Box(-1.0, 1.0, (count,), np.float32)
+        if isinstance(space, spaces.Dict):
+            if KEY in space.spaces:
+                raise ConfigurationError(f"the observation has a key {KEY!r} already: {sorted(space.spaces)}")
+            return spaces.Dict({**space.spaces, KEY: features})
+        if (
+            isinstance(space, spaces.Box)
+            and len(space.shape) == 1
+            and space.dtype in (np.float32, np.float64)
+        ):
+            ones = np.ones(count)
+            low, high = np.concatenate([space.low, -ones]), np.concatenate([space.high, ones])
+            return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
+        return spaces.Dict({"observation": space, KEY: features})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
+        """Reset the env; no correction yet."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        if not self._acts:
+            self._observer.filter.start()
+        return self._with_features(observation, np.zeros(self._low.size)), info
+
+    def step(self, action: Any) -> Step:
+        """Step the env, and look at the state that it has reached as the filter will."""
+        observation, reward, terminated, truncated, info = self._pass_on(action)
+        if self._acts:
+            correction = info[keys.EXECUTED_ACTION] - info[keys.PROPOSED_ACTION]
+        else:
+            correction = np.zeros(self._low.size)
+            given = np.nan_to_num(np.asarray(action, dtype=np.float64))
+            self._observer.filter.executed(np.clip(given, self._low, self._high))
+        self._observer.filter.observe()
+        return self._with_features(observation, correction), reward, terminated, truncated, info
+
+    def _with_features(self, observation: Any, correction: Array) -> Any:
+        observed = self._observer.filter
+        shares = np.clip(correction / (self._high - self._low), -1.0, 1.0)
+        if observed.margin == observed.margin:
+            parts = [c.features(self.neighbours) for c in observed.bound]
+        else:  # the state is not a number, and nothing was judged
+            parts = [np.full(c.feature_count(self.neighbours), np.nan) for c in observed.bound]
+        features = np.concatenate([*parts, shares])
+        space = self.observation_space
+        if isinstance(space, spaces.Box):
+            return np.concatenate([observation, features]).astype(space.dtype)
+        if isinstance(self.env.observation_space, spaces.Dict):
+            return {**observation, KEY: features.astype(np.float32)}
+        return {"observation": observation, KEY: features.astype(np.float32)}

@@ -1,0 +1,386 @@
+"""ContactMonitor and BalanceMonitor: what contacts and balance did in each control step."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.control.contact.friction_cone import normal_and_tangential
+from safe_wrappers.control.contact.impact import complementarity_residuals, normal_impulse, peak_force
+from safe_wrappers.control.legged.support_distances import support_distances
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.mujoco.contacts import (
+    ContactForecast,
+    ContactReader,
+    Contacts,
+    can_touch_the_world,
+    chosen_bodies,
+)
+from safe_wrappers.plants.mujoco.model import fixed_bodies
+from safe_wrappers.plants.mujoco.replay import Replay
+from safe_wrappers.plants.queries.momentum import MomentumReader
+from safe_wrappers.plants.queries.next_impact import NextImpact
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
+
+
+class StepMonitor(LayerWrapper, ABC):
+    """Makes each control step of a MuJoCo env once more, visits its physics, and warns once where it ends elsewhere.
+
+    Raises:
+        UnsupportedEnvError: No MuJoCo model.
+        ConfigurationError: A `ChunkHandover` inside, whose step is many control steps, or a second of its kind.
+    """
+
+    layer: ClassVar = Layer.MONITOR
+    partial: ClassVar[str]
+    """Its info key for steps that could not be replayed."""
+
+    def __init__(self, env: Env) -> None:
+        LayerWrapper.__init__(self, env)
+        raw: Any = env.unwrapped
+        name = type(self).__name__
+        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
+            raise UnsupportedEnvError(f"{name} needs an env with MuJoCo's .model and .data; {raw} has none")
+        self._replay = Replay(raw)
+
+    def step(self, action: Any) -> Step:
+        """Step the env, and look at the physics of that step."""
+        self._replay.before()
+        answer = self._pass_on(action)
+        raw: Any = self.unwrapped
+        self._begin(raw.model)
+        whole = self._replay.after(self._visit)
+        if not whole:
+            message = (
+                f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
+                f"substeps, or MuJoCo has reset it; only the contacts left behind are read (info[{self.partial!r}])"
+            )
+            self._warn_once("partial", message)
+            self._begin(raw.model)
+            self._visit(raw.data, float(raw.model.opt.timestep))
+        answer[4].update(self._figures(raw.data) | {self.partial: not whole})
+        return answer
+
+    @abstractmethod
+    def _begin(self, model: mujoco.MjModel) -> None:
+        """Forget what was visited; the env may have made itself another model, or was unpickled."""
+
+    @abstractmethod
+    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+        """Look at one evaluation of the physics, which acts for some time, s."""
+
+    @abstractmethod
+    def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
+        """The info of what was visited and of the state after the step."""
+
+
+class ContactMonitor(StepMonitor):
+    """Reports forces, impulses and violations of a MuJoCo env's contacts, and the next impact; changes nothing.
+
+    It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
+    of its own, from the state before it and with the inputs that the env has left. An env that changes its inputs or
+    its state between substeps cannot be replayed.
+
+    Args:
+        env: Its unwrapped env has MuJoCo's `.model` and `.data`.
+        bodies: Names of the bodies to watch; None watches all.
+        against: Names of what they touch, "world" among them; None is everything. A contact counts if one of its
+            bodies is in each list.
+        restitution: e of every impact, from 0 (plastic) to 1 (elastic); with it the next impact is predicted.
+        stiffness: k of every contact, both sides in series, N/m; with it the peak force of that impact, too.
+
+    Info, at every step (0 and False after a reset; not finite where the simulation's contacts are not):
+    ``contact/peak_force`` (N), the largest normal force between two bodies, summed over their contacts;
+    ``contact/impulse`` (N s) of all watched contacts; ``contact/penetration`` (m), the deepest; ``contact/residual``
+    (N m), the largest ``|gap * force|``, 0 for rigid contacts; ``contact/judged`` (int), how many contacts that was;
+    ``contact/pull`` (N), the largest force that pulls, and ``contact/open_force`` (N), the largest across an open
+    gap, both NaN where none was judged; ``contact/partial`` (bool): not replayed, the figures are those of the
+    contacts left behind, for one substep. With `restitution`, of the state after the step or reset:
+    ``contact/next_time`` (s) until two geoms touch that do not touch yet, at their present speeds, inf if none
+    approach; ``contact/next_impulse`` (N s) and ``contact/next_force`` (N) of that impact alone, NaN without one.
+
+    Raises:
+        UnsupportedEnvError: No MuJoCo model, or impacts to predict of a height field or of flexible parts.
+        UnknownNameError: No body of that name; the message lists those there are.
+        ConfigurationError: Not a list of names, a restitution or stiffness outside its range, a stiffness alone, or a
+            `ChunkHandover` inside, whose step is many control steps.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.ContactMonitor(gym.make("HalfCheetah-v5"), against=["world"])
+        >>> _ = env.reset(seed=0)
+        >>> forces = [env.step(env.action_space.low)[4]["contact/peak_force"] for _ in range(20)]
+        >>> max(forces) > 100.0
+        True
+    """
+
+    partial: ClassVar = keys.CONTACT_PARTIAL
+
+    def __init__(
+        self,
+        env: Env,
+        bodies: Sequence[str] | None = None,
+        against: Sequence[str] | None = None,
+        restitution: float | None = None,
+        stiffness: float | None = None,
+    ) -> None:
+        StepMonitor.__init__(self, env)
+        raw: Any = env.unwrapped
+        self._contacts = Contacts(raw.model, bodies, against)
+        self.bodies = None if bodies is None else list(bodies)
+        self.against = None if against is None else list(against)
+        self._restitution = restitution if restitution is None else _restitution(restitution)
+        self._stiffness = stiffness if stiffness is None else positive("stiffness", stiffness, "N/m")
+        if restitution is None and stiffness is not None:
+            raise ConfigurationError(
+                "stiffness is for the impacts that are predicted: give their restitution, too"
+            )
+        self._next: NextImpact | None = None
+        if restitution is not None:
+            self._next = NextImpact(raw.model, self._contacts.watched)
+        own = {"restitution": self._restitution, "stiffness": self._stiffness}
+        self._record({"bodies": self.bodies, "against": self.against, **own})
+        self._begin(raw.model)
+
+    @property
+    def peak_bodies(self) -> tuple[str, str] | None:
+        """Names of the two bodies that had the `contact/peak_force` of the last step; None where there was none."""
+        return self._names(self._peak_bodies)
+
+    @property
+    def next_bodies(self) -> tuple[str, str] | None:
+        """Names of the two bodies of the next impact, after the last step or reset; None where none is predicted."""
+        return self._names(self._next_bodies)
+
+    def _names(self, bodies: tuple[int, int] | None) -> tuple[str, str] | None:
+        if bodies is None:
+            return None
+        model = self.unwrapped.model  # type: ignore[attr-defined]
+        first, second = (model.body(i).name if i < model.nbody else "" for i in bodies)
+        return first, second
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
+        """Reset the env; its info holds the keys of a step, as 0."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        raw: Any = self.unwrapped
+        self._begin(raw.model)
+        info.update(self._figures(raw.data), **{self.partial: False})
+        return observation, info
+
+    def _begin(self, model: mujoco.MjModel) -> None:
+        if self._contacts.model is not model:
+            self._contacts = Contacts(model, self.bodies, self.against)
+            if self._next is not None:
+                self._next = NextImpact(model, self._contacts.watched)
+        self._gaps: list[float] = []
+        self._forces: list[float] = []
+        self._impulse = self._peak = 0.0
+        self._peak_bodies: tuple[int, int] | None = None
+        self._next_bodies: tuple[int, int] | None = None
+
+    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+        pairs: dict[tuple[int, int], float] = {}
+        for bodies, gap, force in self._contacts.read(data):
+            self._gaps.append(gap)
+            self._forces.append(force)
+            self._impulse += force * time_s
+            pairs[bodies] = pairs.get(bodies, 0.0) + force
+        for bodies, force in pairs.items():
+            if force > self._peak:
+                self._peak, self._peak_bodies = force, bodies
+
+    def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
+        peak, impulse, depth, residual = self._peak, self._impulse, 0.0, 0.0
+        pull: float = keys.NOT_JUDGED
+        across: float = keys.NOT_JUDGED
+        if self._gaps:
+            gaps, forces = np.array(self._gaps), np.array(self._forces)
+            if np.isfinite(gaps).all() and np.isfinite(forces).all():
+                residuals = complementarity_residuals(gaps, forces)
+                depth, residual = float(residuals.penetration.max()), float(residuals.product.max())
+                pull = float(residuals.tension.max())
+                across = float(np.abs(forces).max(initial=0.0, where=gaps > 0.0))
+            else:
+                peak = impulse = depth = residual = math.nan
+        return {
+            keys.CONTACT_PEAK_FORCE: peak,
+            keys.CONTACT_IMPULSE: impulse,
+            keys.CONTACT_PENETRATION: depth,
+            keys.CONTACT_RESIDUAL: residual,
+            keys.CONTACT_JUDGED: len(self._gaps),
+            keys.CONTACT_PULL: pull,
+            keys.CONTACT_OPEN_FORCE: across,
+            **self._predicted(data),
+        }
+
+    def _predicted(self, data: mujoco.MjData) -> dict[str, float]:
+        """The next impact from a state; nothing where none was asked for."""
+        if self._next is None:
+            return {}
+        impact = self._next.of(data)
+        self._next_bodies = impact.bodies
+        impulse: float = keys.NOT_JUDGED
+        force: float = keys.NOT_JUDGED
+        if impact.bodies is not None:
+            assert self._restitution is not None
+            impulse = float(normal_impulse(impact.mass, -impact.speed, self._restitution))
+            if self._stiffness is not None:
+                force = float(peak_force(impact.speed, impact.mass, self._stiffness))
+        return {
+            keys.CONTACT_NEXT_TIME: keys.NOT_JUDGED if math.isnan(impact.time_s) else impact.time_s,
+            keys.CONTACT_NEXT_IMPULSE: impulse,
+            keys.CONTACT_NEXT_FORCE: force,
+        }
+
+
+def _restitution(given: float) -> float:
+    value = non_negative("restitution", given, "a share of the speed")
+    if value > 1.0:
+        raise ConfigurationError(f"restitution is from 0 (plastic) to 1 (elastic), got {given!r}")
+    return value
+
+
+PRESSING: Final = 0.01
+"""Share of the robot's weight from which on a contact counts in `balance/friction_used`: lighter ones only scrape."""
+
+
+class BalanceMonitor(StepMonitor):
+    """Reports momentum, used friction and support of a robot on fixed ground; changes nothing.
+
+    Like `ContactMonitor` it makes each control step once more, and looks at the robot's contacts with what does not
+    move at every evaluation of the physics. There is a zero moment point only while three or more contact points, not
+    on a line, are in one plane (within 1 cm and 0.05 rad) and something presses on it. Torsional and rolling friction
+    and forces of the env's own are left out.
+
+    Args:
+        env: Its unwrapped env has MuJoCo's `.model` and `.data`.
+        friction_share: Of the model's friction coefficient that is taken as the whole, in (0, 1].
+        inset: Kept inside the support polygon, m.
+        bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves.
+
+    Info, at every step (0 and False after a reset): of the robot after the step ``balance/linear_momentum`` (kg m/s)
+    and ``balance/angular_momentum`` about its centre of mass (kg m^2/s), arrays (3,); ``balance/friction_used``, the
+    largest ``|f_t| / (friction_share mu f_n)`` of a contact that carries at least 1 % of the weight;
+    ``balance/zmp_margin`` (m), from the edge of the support polygon minus the inset, 0 without a polygon;
+    ``balance/supported`` and ``balance/airborne``, shares of the evaluations with a polygon and without a contact;
+    ``balance/partial`` (bool): not replayed, the figures are those of the contacts left behind (0 if not finite).
+
+    Raises:
+        UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.
+        UnknownNameError: No body of that name; the message lists those there are.
+        ConfigurationError: A share or an inset out of its range, bodies that do not move, or a wrong order.
+
+    Source: appendix "Centroidal Dynamics and Floating-Base Control".
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.BalanceMonitor(gym.make("Ant-v5"))
+        >>> _ = env.reset(seed=0)
+        >>> infos = [env.step(0 * env.action_space.low)[4] for _ in range(20)]
+        >>> infos[0]["balance/airborne"], infos[-1]["balance/supported"] > 0.0
+        (1.0, True)
+    """
+
+    partial: ClassVar = keys.BALANCE_PARTIAL
+
+    def __init__(
+        self, env: Env, friction_share: float = 1.0, inset: float = 0.0, bodies: Sequence[str] | None = None
+    ) -> None:
+        StepMonitor.__init__(self, env)
+        raw: Any = env.unwrapped
+        self.friction_share = positive("friction_share", friction_share, "shares of the model's friction")
+        if self.friction_share > 1.0:
+            raise ConfigurationError(f"friction_share is in (0, 1], got {friction_share}")
+        self.inset = non_negative("inset", inset, "m")
+        self._robot = _Robot(raw.model, bodies)
+        self.bodies = None if bodies is None else list(bodies)
+        self._record({"friction_share": self.friction_share, "inset": self.inset, "bodies": self.bodies})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
+        """Reset the env; its info holds the keys of a step, as 0."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        info.update(_NOTHING | {key: np.zeros(3) for key in _MOMENTA}, **{self.partial: False})
+        return observation, info
+
+    def _begin(self, model: mujoco.MjModel) -> None:
+        if self._robot.model is not model:
+            self._robot = _Robot(model, self.bodies)
+        self._robot.contacts.clear()
+
+    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+        self._robot.contacts.read(data)
+
+    def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
+        found = self._robot.grounded()
+        figures: dict[str, Any] = dict(_NOTHING) if found is None else self._of_contacts(found)
+        momentum = self._robot.momentum.read(data)
+        figures[keys.BALANCE_LINEAR_MOMENTUM] = np.zeros(3) if momentum is None else momentum.linear
+        figures[keys.BALANCE_ANGULAR_MOMENTUM] = np.zeros(3) if momentum is None else momentum.angular
+        return figures
+
+    def _of_contacts(self, found: ContactForecast) -> dict[str, Any]:
+        """The figures of finite contacts."""
+        if not found.steps:
+            return dict(_NOTHING)
+        normal, tangential = normal_and_tangential(found.force, found.normal)
+        held = self.friction_share * found.friction * normal
+        loaded = (normal >= PRESSING * self._robot.weight_n()) & (held > 0.0)
+        used = np.linalg.norm(tangential[loaded], axis=1) / held[loaded]
+        distances = support_distances(found.step, found.point, found.normal, found.force)
+        return {
+            keys.BALANCE_FRICTION_USED: float(used.max(initial=0.0)),
+            keys.BALANCE_ZMP_MARGIN: float(distances.min()) - self.inset if distances.size else 0.0,
+            keys.BALANCE_SUPPORTED: distances.size / found.steps,
+            keys.BALANCE_AIRBORNE: (found.steps - np.unique(found.step).size) / found.steps,
+        }
+
+
+_MOMENTA: Final = (keys.BALANCE_LINEAR_MOMENTUM, keys.BALANCE_ANGULAR_MOMENTUM)
+_NOTHING: Final = dict.fromkeys(
+    (keys.BALANCE_FRICTION_USED, keys.BALANCE_ZMP_MARGIN, keys.BALANCE_SUPPORTED, keys.BALANCE_AIRBORNE), 0.0
+)
+
+
+class _Robot:
+    """The bodies that are the robot, and what reads them."""
+
+    def __init__(self, model: mujoco.MjModel, roots: Sequence[str] | None) -> None:
+        self.model = model
+        self._own = _trees(model, roots)
+        moving = self._own & ~fixed_bodies(model) & (model.body_mass > 0.0)
+        which = "of this model" if roots is None else f"of bodies={list(roots)}"
+        if not moving.any():
+            raise ConfigurationError(f"no body {which} moves and has mass")
+        if not (can_touch_the_world(model) & self._own).any():
+            raise UnsupportedEnvError(f"no body {which} can touch the fixed world with friction")
+        self._massive = np.flatnonzero(moving)
+        self.contacts = ContactReader(model)
+        self.momentum = MomentumReader(model, self._massive)
+
+    def weight_n(self) -> float:
+        """Now: an env may change masses."""
+        return float(self.model.body_mass[self._massive].sum() * np.linalg.norm(self.model.opt.gravity))
+
+    def grounded(self) -> ContactForecast | None:
+        """Its contacts with the fixed world that have been read; None where they are no finite numbers."""
+        found = self.contacts.forecast(finite=True)
+        mine = self._own[found.body]
+        arrays = ("step", "body", "point", "normal", "force", "friction")
+        found = found._replace(**{name: getattr(found, name)[mine] for name in arrays})
+        finite = all(np.isfinite(array).all() for array in (found.point, found.normal, found.force))
+        return found if finite else None
+
+
+def _trees(model: mujoco.MjModel, roots: Sequence[str] | None) -> NDArray[np.bool_]:
+    """Which bodies are, or hang from, the named ones, shape (nbody,); None is all."""
+    own = chosen_bodies(model, "bodies", roots)[:-1]
+    for i, parent in enumerate(model.body_parentid):  # a parent's id is smaller than its children's
+        own[i] |= own[parent]
+    return own

@@ -1,0 +1,411 @@
+"""What an `OcclusionPenalty` is made of: sensors, inertial units and tracks."""
+
+from collections.abc import Callable, Sequence, Sized
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
+from safe_wrappers.control.estimation.covariance import checked_covariance, checked_noise
+from safe_wrappers.control.estimation.dead_reckoning import DeadReckoning, rigid_transform
+from safe_wrappers.control.estimation.tracks import Motion
+from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.plants.mujoco.model import named
+from safe_wrappers.plants.queries.line_of_sight import LineOfSight
+from safe_wrappers.serialize import plain_numbers
+
+__all__ = ["Imu", "Sensor", "Track"]
+
+
+@dataclass
+class Imu:
+    """An accelerometer and a gyroscope at a site of the sensor's body, from which follows where the body is.
+
+    It integrates by itself, as such units do, and reports at the end of each control step.
+
+    Args:
+        site: Name of the site; its axes are those of the readings.
+        accelerometer_std: Of the noise of a control step's mean acceleration, m/s².
+        gyro_std: Of the noise of a control step's mean turn rate, and of that at its end, rad/s.
+        fix_every_s: How often the true pose and velocity of the body are given to the reckoning, s; None: at a reset
+            alone.
+        lever_arm: Whether the reckoning knows where on the body the unit sits; False takes the body's origin.
+
+    Raises:
+        ConfigurationError: A number outside its range.
+    """
+
+    site: str
+    accelerometer_std: float = 0.0
+    gyro_std: float = 0.0
+    fix_every_s: float | None = None
+    lever_arm: bool = True
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.site, str):
+            raise ConfigurationError(f"site is the name of a site, got {self.site!r}")
+        check_fields(self, non_negative, ["accelerometer_std"], "m/s^2")
+        check_fields(self, non_negative, ["gyro_std"], "rad/s")
+        check_fields(self, positive, ["fix_every_s"], "s")
+        if not isinstance(self.lever_arm, bool | np.bool_):
+            raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
+        self.lever_arm = bool(self.lever_arm)
+
+
+class EgoMotion:
+    """Where a sensor's body is taken to be, by dead reckoning from the readings of its `Imu`.
+
+    Attributes:
+        position: Of the body's origin, shape (3,), m.
+        velocity: Shape (3,), m/s.
+        specific_force: Mean of the accelerometer's readings over the last step, in the axes of its middle, shape
+            (3,), m/s².
+        rate: The gyroscope's reading at its end, shape (3,), rad/s.
+
+    Raises:
+        ConfigurationError: An `Imu` on another body than the sensor.
+        UnknownNameError: No site of that name.
+    """
+
+    def __init__(self, imu: Imu, sight: LineOfSight) -> None:
+        self.imu, self._sight, model = imu, sight, sight.model
+        self._site = named(model, "site", imu.site)
+        body = int(model.site_bodyid[self._site])
+        if body != sight.body:
+            where = f"{model.body(body).name!r} and not on {model.body(sight.body).name!r}, as the sensor is"
+            raise ConfigurationError(f"the IMU's site {imu.site!r} is on the body {where}")
+        axes = np.zeros(9)
+        mujoco.mju_quat2Mat(axes, model.site_quat[self._site])
+        arm = model.site_pos[self._site] if imu.lever_arm else np.zeros(3)
+        self._gravity = np.array(model.opt.gravity)
+        self._reckoning = DeadReckoning(rigid_transform(axes.reshape(3, 3), arm), self._gravity)
+        self.specific_force = self.rate = np.zeros(3)
+        self._since_fix_s = 0.0
+        self._at_site = np.zeros(3), np.eye(3)
+
+    @property
+    def position(self) -> Array:
+        """Of the body's origin, shape (3,), m, world axes."""
+        return self._reckoning.position
+
+    @property
+    def velocity(self) -> Array:
+        """Of the body's origin, shape (3,), m/s, world axes."""
+        return self._reckoning.velocity
+
+    @property
+    def angular_velocity(self) -> Array:
+        """Shape (3,), rad/s, world axes."""
+        return self._reckoning.angular_velocity
+
+    @property
+    def rotation(self) -> Array:
+        """The body's axes as columns, shape (3, 3)."""
+        return np.asarray(self._reckoning.orientation.as_matrix())
+
+    def fix(self) -> None:
+        """Take the body's true motion, at the state that was read last."""
+        sight = self._sight
+        self._at_site = self._read()
+        linear, _ = sight.velocity(sight.body)
+        position = np.array(sight.data.xpos[sight.body])
+        body = rigid_transform(np.array(sight.data.xmat[sight.body]).reshape(3, 3), position)
+        self._reckoning.fix(position, linear, body.rotation, self.rate)
+        self._since_fix_s = 0.0
+
+    def advance(self, time_s: float, noise: Array) -> None:
+        """Read what the step to the present state did, and reckon on.
+
+        Args:
+            time_s: Length of the step.
+            noise: Nine standard normal numbers: of the mean acceleration, the mean turn rate, and that at the end.
+        """
+        if time_s <= 0.0:
+            return
+        velocity, axes = self._at_site
+        self._at_site = after, new_axes = self._read()
+        turned = rigid_transform(axes.T @ new_axes, np.zeros(3)).rotation
+        turn = turned.as_rotvec()
+        middle = axes @ type(turned).from_rotvec(0.5 * turn).as_matrix()
+        force = ((after - velocity) / time_s - self._gravity) @ middle
+        self.specific_force = force + self.imu.accelerometer_std * noise[:3]
+        turn = turn + self.imu.gyro_std * time_s * noise[3:6]
+        self.rate = self.rate + self.imu.gyro_std * noise[6:]
+        self._reckoning.advance(self.specific_force, turn, self.rate, time_s)
+        self._since_fix_s += time_s
+        if self.imu.fix_every_s is not None and self._since_fix_s >= self.imu.fix_every_s - 1e-9:
+            self.fix()
+
+    def _read(self) -> tuple[Array, Array]:
+        """Velocity of the site (3,), m/s, and its axes (3, 3) in the world; the gyroscope's reading without noise."""
+        data, six = self._sight.data, np.zeros(6)
+        mujoco.mj_objectVelocity(self._sight.model, data, mujoco.mjtObj.mjOBJ_SITE, self._site, six, 0)
+        axes = np.array(data.site_xmat[self._site]).reshape(3, 3)
+        self.rate = six[:3] @ axes
+        return six[3:], axes
+
+
+@dataclass
+class Sensor:
+    """A camera, or any other sensor that needs a line of sight, on a body of the model.
+
+    It measures the tracked point's position (and velocity) relative to itself, in its own axes, with Gaussian noise.
+
+    Args:
+        camera: Name of a camera in the model, which looks along its own -z; or
+        site: name of a site, which looks along its own z.
+        view_deg: Full opening angle of the cone that it sees, degrees. None: a camera's `fovy`, a site's all around.
+        range_m: Farther away it sees nothing, m; None: as far as there is.
+        occluder_groups: Geom groups (0 to 5) that block its sight; None: all of them.
+        position_std: Of a measured position, m: a number for every axis, or a covariance matrix (d x d, m^2) in world
+            axes. None: it does not measure positions.
+        velocity_std: Likewise of a measured velocity, m/s and m^2/s^2. None: it does not measure velocities.
+        dropout: Probability that a measurement of what is in sight is lost, for each track and step, below 1.
+        lever_arm: Whether the estimator knows where on its body the sensor sits; False takes the body's origin.
+        imu: An `Imu` on the same body, from which the estimator reckons where that body is, or the dict of one; None:
+            it knows.
+
+    Raises:
+        ConfigurationError: Both or neither of camera and site, nothing measured, or a number outside its range.
+    """
+
+    camera: str | None = None
+    site: str | None = None
+    view_deg: float | None = None
+    range_m: float | None = None
+    occluder_groups: Sequence[int] | None = None
+    position_std: Any = 0.05
+    velocity_std: Any = None
+    dropout: float = 0.0
+    lever_arm: bool = True
+    imu: Imu | dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.camera is None) == (self.site is None):
+            given = f"camera={self.camera!r}, site={self.site!r}"
+            raise ConfigurationError(f"a sensor sits at a camera or at a site: name one of them; got {given}")
+        for name in ("camera", "site"):
+            if not isinstance(getattr(self, name), str | None):
+                raise ConfigurationError(f"{name} is a name, got {getattr(self, name)!r}")
+        check_fields(self, positive, ["view_deg"], "degrees")
+        check_fields(self, positive, ["range_m"], "m")
+        check_fields(self, non_negative, ["dropout"], "probability per step")
+        if self.dropout >= 1.0:
+            raise ConfigurationError(f"dropout is a probability below 1, got {self.dropout}")
+        if self.occluder_groups is not None:
+            self.occluder_groups = _groups(self.occluder_groups)
+        if self.position_std is None and self.velocity_std is None:
+            raise ConfigurationError("the sensor measures nothing: give position_std, velocity_std or both")
+        if not isinstance(self.lever_arm, bool | np.bool_):
+            raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
+        self.lever_arm = bool(self.lever_arm)
+        if self.imu is not None:
+            self.imu = settings_from(Imu, self.imu, "imu")
+        for name in ("position_std", "velocity_std"):
+            setattr(self, name, plain_numbers(getattr(self, name)))
+
+    def matrices(self, coordinates: int) -> tuple[Array, Array]:
+        """C (m, 2d) and the noise covariance R (m, m) for states (position, velocity) of d coordinates."""
+        state = np.eye(2 * coordinates)
+        parts = {"position_std": state[:coordinates], "velocity_std": state[coordinates:]}
+        measured = {name: part for name, part in parts.items() if getattr(self, name) is not None}
+        noise = np.zeros((coordinates * len(measured),) * 2)
+        for i, name in enumerate(measured):
+            block = slice(i * coordinates, (i + 1) * coordinates)
+            noise[block, block] = _noise(name, getattr(self, name), coordinates)
+        return np.concatenate(list(measured.values())), noise
+
+    def measured(
+        self, sight: LineOfSight, d: int, truth: Array, velocities: Array | None, ego: EgoMotion | None = None
+    ) -> Array:
+        """Positions (k, 3), m, and velocities (k, d), m/s, as they are measured, noise aside, shape (k, m).
+
+        Where the sensor's body is taken to be is the ego-motion's, if there is one, else the model's.
+        """
+        body = np.array(sight.data.xpos[sight.body])
+        eye, axes = sight.position, sight.rotation
+        if ego is None:
+            turned, believed = np.eye(3), eye if self.lever_arm else body
+        else:
+            # From the world's axes to where the body's believed orientation puts what is seen along them.
+            turned = ego.rotation @ np.array(sight.data.xmat[sight.body]).reshape(3, 3).T
+            believed = ego.position + (turned @ (eye - body) if self.lever_arm else 0.0)
+        parts = []
+        if self.position_std is not None:
+            parts.append(from_sensor(to_sensor(truth, axes, eye), turned @ axes, believed)[:, :d])
+        if velocities is not None:
+            linear, angular = sight.velocity(sight.body)
+            apparent = velocities - lever_arm_velocity(linear, angular, eye - body)[:d]
+            own = (
+                (linear, angular, body) if ego is None else (ego.velocity, ego.angular_velocity, ego.position)
+            )
+            own_velocity = lever_arm_velocity(own[0], own[1], believed - own[2])[:d]
+            parts.append(apparent @ turned[:d, :d].T + own_velocity)
+        return np.concatenate(parts, axis=1)
+
+    def data(self) -> dict[str, Any]:
+        """Plain data, from which it can be made again."""
+        return asdict(self)
+
+
+def _groups(given: Any) -> list[int]:
+    groups = list(given) if isinstance(given, Sequence | np.ndarray) else []
+    if not groups or not all(isinstance(g, int | np.integer) and 0 <= g < mujoco.mjNGROUP for g in groups):
+        wanted = f"a list of geom groups, 0 to {mujoco.mjNGROUP - 1}, or None for all"
+        raise ConfigurationError(f"occluder_groups is {wanted}; got {given!r}")
+    return [int(g) for g in groups]
+
+
+def _noise(name: str, given: Any, coordinates: int) -> Array:
+    if not isinstance(given, list):
+        return positive(name, given, "m or m/s") ** 2 * np.eye(coordinates)
+    return checked_noise(f"{name} as a covariance", given, coordinates)
+
+
+def sensor_from(given: Any) -> Sensor:
+    """A sensor itself, the name of a camera, or the dict of a recorded one."""
+    if isinstance(given, str):
+        return Sensor(camera=given)
+    if isinstance(given, Sensor | dict):
+        return settings_from(Sensor, given, "a sensor")
+    raise ConfigurationError(f"sensor is a Sensor(...), or the name of a camera of the model; got {given!r}")
+
+
+@dataclass
+class Track:
+    """What an `OcclusionPenalty` follows: bodies of the model, or points that the env publishes, and how they move.
+
+    At a reset the track starts from the true position plus noise of `start_position_std`, and from the mean velocity.
+
+    Args:
+        bodies: Name of a body, or a pattern ("car*", "car[012]") for every body that fits, in the model's order.
+        published: Instead of bodies: name of an attribute of the env, positions of shape (k, 2) or (k, 3), m.
+        acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds
+            q t^3 / 3 to the variance of a position. A number, one per coordinate (0 along a coordinate that does not
+            wander), or a matrix, d x d. It has no default.
+        reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
+        mean_velocity: m/s, one per coordinate; None: zeros.
+        start_position_std: m, a number or one per coordinate.
+        start_velocity_std: m/s, a number or one per coordinate.
+        turn_noise: Of a velocity that turns at a rate of its own (a coordinated turn), intensity of the white noise
+            in that rate's derivative, rad^2/s^3: after t seconds unseen it adds `turn_noise` t to the rate's
+            variance. None: a velocity that does not turn. In the plane alone.
+        start_turn_std: Of such a turn rate at a reset, where its mean is 0, rad/s.
+
+    Raises:
+        ConfigurationError: Bodies and published points at once, or neither; a number or matrix out of its range.
+    """
+
+    bodies: str | None = None
+    published: str | None = None
+    acceleration_noise: Any = None
+    reversion_s: float | None = None
+    mean_velocity: Sequence[float] | None = None
+    start_position_std: Any = 0.1
+    start_velocity_std: Any = 0.5
+    turn_noise: float | None = None
+    start_turn_std: float = 0.5
+
+    def __post_init__(self) -> None:
+        if (self.bodies is None) == (self.published is None):
+            given = f"bodies={self.bodies!r}, published={self.published!r}"
+            raise ConfigurationError(
+                f"a track follows bodies by name or pattern, or published points; got {given}"
+            )
+        name = self.published if self.bodies is None else self.bodies
+        if not isinstance(name, str):
+            raise ConfigurationError(f"bodies and published are names, got {name!r}")
+        if self.acceleration_noise is None:
+            noise = "the intensity of its white acceleration noise in m^2/s^3"
+            raise ConfigurationError(f"acceleration_noise is missing: {noise} (0: velocity stays)")
+        check_fields(self, positive, ["reversion_s"], "s")
+        check_fields(self, non_negative, ["turn_noise"], "rad^2/s^3")
+        check_fields(self, non_negative, ["start_turn_std"], "rad/s")
+        for name in ("acceleration_noise", "mean_velocity", "start_position_std", "start_velocity_std"):
+            setattr(self, name, plain_numbers(getattr(self, name)))
+
+    def motion(self, coordinates: int) -> Motion:
+        """The motion model for d coordinates."""
+        mean = 0.0 if self.mean_velocity is None else self.mean_velocity
+        velocity = _each("mean_velocity", mean, coordinates, "m/s", signed=True)
+        reversion_s = np.inf if self.reversion_s is None else self.reversion_s
+        return Motion(
+            _intensity(self.acceleration_noise, coordinates), reversion_s, velocity, self.turn_noise
+        )
+
+    def start(self, coordinates: int, size: int) -> Array:
+        """Standard deviations of a state at a reset: position, velocity and, as a fifth, turn rate; shape (size,)."""
+        stds = np.zeros(size)
+        stds[:coordinates] = _each("start_position_std", self.start_position_std, coordinates, "m")
+        velocity = _each("start_velocity_std", self.start_velocity_std, coordinates, "m/s")
+        stds[coordinates : 2 * coordinates] = velocity
+        if self.turn_noise is not None:
+            stds[2 * coordinates :] = self.start_turn_std
+        return stds
+
+    def data(self) -> dict[str, Any]:
+        """Plain data, from which it can be made again."""
+        return asdict(self)
+
+
+def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = False) -> Array:
+    """One number per coordinate."""
+    try:
+        values = np.asarray(given, dtype=np.float64)
+        values = np.array(np.broadcast_to(values, coordinates))
+    except (TypeError, ValueError):
+        wanted = f"a number or {coordinates} numbers (one per coordinate) in {unit}"
+        raise ConfigurationError(f"{name} is {wanted}, got {given!r}") from None
+    if not np.isfinite(values).all():
+        raise ConfigurationError(f"{name} must be finite, in {unit}, got {given!r}")
+    for value in () if signed else values:
+        non_negative(name, value, unit)
+    return values
+
+
+def _intensity(given: Any, coordinates: int) -> Array:
+    if isinstance(given, list) and any(isinstance(row, list) for row in given):
+        return checked_covariance("acceleration_noise", given, coordinates)
+    return np.diag(_each("acceleration_noise", given, coordinates, "m^2/s^3"))
+
+
+def track_from(given: Any) -> Track:
+    """A track itself, or rebuilt from the dict of a recorded one."""
+    if isinstance(given, Track | dict):
+        return settings_from(Track, given, "a track")
+    example = f"sw.occlusion.Track({given!r}, acceleration_noise=0.1)"
+    raise ConfigurationError(f"expected a Track, such as {example} (m^2/s^3); got {given!r}")
+
+
+class Tracked(NamedTuple):
+    """One thing that is tracked."""
+
+    track: Track  # which it belongs to
+    name: str  # the body's, or the attribute's with an index
+    body: int  # in the model; -1 for a published point
+
+
+def tracked_things(
+    model: mujoco.MjModel, tracks: Sequence[Track], published: Callable[[Track], Sized]
+) -> list[Tracked]:
+    """All that the tracks follow, in their order."""
+    things: list[Tracked] = []
+    there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
+    for track in tracks:
+        if track.bodies is None:
+            things += [Tracked(track, f"{track.published}[{i}]", -1) for i in range(len(published(track)))]
+            continue
+        found = [Tracked(track, name, b) for name, b in there.items() if fnmatchcase(name, track.bodies)]
+        if not found:
+            known = ", ".join(there) or "none"
+            raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {known}")
+        things += found
+    names = [thing.name for thing in things]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
+    return things
