@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.filtering import cbf
+from safe_wrappers.control.numerics.projection import keeps_rows
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize
-from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant
 
 _ROUNDING = 1e-9  # round-off, as a share of h's size: of its value and its gradient together
@@ -108,7 +108,6 @@ class BoundBarrier(BoundConstraint):
         room, alpha = self._now - self.spec.margin, self.spec.alpha
         decay = alpha(room) if callable(alpha) else alpha * room
         bend = 0.5 * self.spec.curvature * self.plant.control_dt
-        # The condition of `cbf.cbf_rows`, for one barrier without its conversions.
         drift, effect = gradient @ self.plant.f, gradient @ self.plant.g
         return HalfSpaces(-effect[None, :], np.array([drift + (decay - bend)]))
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.numerics.conic_program import Program, by_clarabel, by_daqp
+from safe_wrappers.control.legged.whole_body_program import Program, by_clarabel, by_daqp
 
 FREE = np.full(3, np.inf)
 

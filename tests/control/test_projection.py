@@ -13,8 +13,8 @@ from scipy.optimize import lsq_linear, minimize, nnls
 from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
+from safe_wrappers.control.numerics.projection import Projection, Status, box_least_squares, project
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.projection import Status, box_least_squares, project
 
 ONES = np.ones(2)
 
@@ -454,7 +454,7 @@ def test_nonsense_is_refused(arguments, message):
 
 def test_public_name_and_status_are_strings():
     answer = sw.project([0.0], [[1.0]], [1.0], [-1.0], [1.0])
-    assert isinstance(answer, sw.filter.projection.Projection)
+    assert isinstance(answer, Projection)
     assert answer.status == "inactive" and isinstance(answer.status, Status)
 
 

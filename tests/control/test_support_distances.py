@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from oracles import support_margin
 
 from safe_wrappers.control.contact.friction_cone import tangents
-from safe_wrappers.control.legged.support_distances import support_distances
+from safe_wrappers.control.legged.support import support_distances
 from safe_wrappers.errors import ConfigurationError
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -15,10 +15,7 @@ from safe_wrappers.control.legged.support import common_plane
 from safe_wrappers.control.legged.whole_body import rigid_forces, solve_cone, solve_pyramid
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.queries.floating_base import (
-    contact_points,
-    equations_of_motion,
-)
+from safe_wrappers.plants.queries.floating_base import MomentumReader, contact_points, equations_of_motion
 
 ZOO = """
 <mujoco>
@@ -240,15 +237,17 @@ def momentum(model, data):
         mujoco.mj_jacBodyCom(model, data, linear[row], angular[row], body)
     axes = data.ximat[ids].reshape(-1, 3, 3)
     inertias = np.einsum("nij,nj,nkj->nik", axes, model.body_inertia[ids], axes)
-    return centroidal_momentum(
-        model.body_mass[ids], data.xipos[ids], linear @ data.qvel, inertias, angular @ data.qvel
-    )
+    spins = np.einsum("nij,nj->ni", inertias, angular @ data.qvel)
+    return centroidal_momentum(model.body_mass[ids], data.xipos[ids], linear @ data.qvel, spins)
 
 
 def test_momentum_is_mujocos_subtree_momentum(walker):
     for plant in walker(20):
         model, data = plant.model, plant.forward()
         found = momentum(model, data)
+        read = MomentumReader(model, np.ones(model.nbody, dtype=bool)).read(data)
+        for mine, other in zip(read, found, strict=True):
+            np.testing.assert_allclose(mine, other, rtol=1e-9, atol=1e-9)
         mujoco.mj_subtreeVel(model, data)
         assert found.com == pytest.approx(data.subtree_com[0])
         assert found.linear == pytest.approx(found.mass * data.subtree_linvel[0])

@@ -24,7 +24,7 @@ from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_fol
 from safe_wrappers.train.experiment import training_jobs
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.policies import load_policy
-from safe_wrappers.train.report.origin import about
+from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.folder import finished_facts
 from safe_wrappers.train.run.model import _constructor_arguments as constructor_arguments

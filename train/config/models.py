@@ -96,7 +96,7 @@ class LearnerConfig(Section):
 
     kind: Literal["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"] = "naive"
     """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ. `safe_set_map` is a
-    [SafeActionMap](wrappers/safe-action-map.md) around the filter, in training and evaluation."""
+    [SafeActionMap](wrappers/learner.md#safeactionmap) around the filter, in training and evaluation."""
     penalty: Annotated[Number, Field(ge=0)] = 0.0
     """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
@@ -113,8 +113,9 @@ class LearnerConfig(Section):
     """A margin that the arm's filter adds in training and that changes; see [its
     keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
     cost_limit: Annotated[Number, Field(ge=0)] | None = None
-    """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-price-on-cost) puts a price on cost, in
-    training; with PPO this is PPO-Lagrangian. For any algorithm and arm, also without a filter."""
+    """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-margin-that-changes-and-a-price-on-cost)
+    puts a price on cost, in training; with PPO this is PPO-Lagrangian. For any algorithm and arm, also without a
+    filter."""
     multiplier_rate: Annotated[Number, Field(gt=0)] = 1e-3
     """Of that multiplier: by how much it rises after an episode, for each unit of cost above the limit."""
 
@@ -185,9 +186,9 @@ class FilterConfig(Section):
     kwargs: Options = Field(default_factory=dict)
     """Further arguments of the factory."""
     lease: Annotated[Options | None, with_keys(arguments(LeaseExpiry, "plant", "measured"))] = None
-    """Arguments of a [LeaseExpiry](wrappers/lease-expiry.md) around the filter."""
+    """Arguments of a [LeaseExpiry](wrappers/late-commands.md#leaseexpiry) around the filter."""
     escape: Annotated[Options | None, with_keys(arguments(StuckEscape, "value"))] = None
-    """Arguments of a [StuckEscape](wrappers/stuck-escape.md) around the filter, but for `value`."""
+    """Arguments of a [StuckEscape](wrappers/learner.md#stuckescape) around the filter, but for `value`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -239,18 +240,19 @@ class EnvConfig(Section):
     kwargs: Options = Field(default_factory=dict)
     """Passed to `gymnasium.make`."""
     faults: Annotated[dict[str, Options], AfterValidator(_check_faults)] = Field(default_factory=dict)
-    """[Faults](wrappers/faults.md) between policy and robot, in training and evaluation: a wrapper's name and its
-    arguments, the innermost first."""
+    """[Faults](wrappers/recording.md#faults) between policy and robot, in training and evaluation: a wrapper's
+    name and its arguments, the innermost first."""
     occlusion: Annotated[Options | None, with_keys(arguments(OcclusionPenalty))] = None
     """Arguments of an [OcclusionPenalty](wrappers/occlusion-penalty.md) around the task, inside the filter."""
     cost: FunctionName | None = None
-    """`module:function` that judges a task without a cost of its own: [CostFunction](wrappers/cost-function.md), in
-    all arms, in training and evaluation."""
+    """`module:function` that judges a task without a cost of its own:
+    [CostFunction](wrappers/recording.md#costfunction), in all arms, in training and evaluation."""
     judge: Annotated[FilterConfig | None, BeforeValidator(_of_all_arms)] = None
     """`constraints`: the evaluation filter's own limits judge such a task, read from its true state, in all arms."""
     observation: Annotated[FilterConfig | None, BeforeValidator(_of_all_arms)] = None
     """`constraints`: policies observe what the filter decides by, in training and evaluation
-    ([FilterObservation](wrappers/filter-observation.md)); without a filter, what the evaluation's filter would."""
+    ([FilterObservation](wrappers/learner.md#filterobservation)); without a filter, what the evaluation's filter
+    would."""
     reset_options: Options = Field(default_factory=dict)
     """Options of every reset in training, such as `{layout: {hazards: []}}` of the goal tasks. Evaluation resets
     without them: every arm is judged on the task itself."""
@@ -297,7 +299,7 @@ class ArmConfig(Section):
     algorithm: Annotated[str, AfterValidator(_check_algorithm)]
     """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.6,<3'` also `TQC`, `CrossQ`,
     `TRPO`, `RecurrentPPO`, `QRDQN`, `MaskablePPO`. The last two and `DQN` are for discrete actions; filtered, those
-    have an [ActionShield](wrappers/action-shield.md), and `MaskablePPO` learns from its masks."""
+    have an [ActionShield](wrappers/filter.md#actionshield), and `MaskablePPO` learns from its masks."""
     total_steps: Count
     """Steps of all envs together, rounded up to whole rollouts: PPO with its default of `n_steps: 2048` and four
     envs trains 8,192 steps if 4,000 are asked for. Progress and report say how many were trained. May be [raised
@@ -318,7 +320,7 @@ class ArmConfig(Section):
     normalize: NormalizeConfig = NormalizeConfig()
     action_repeat: Count = 1
     """Control steps for which an action of the policy is held, in training and evaluation
-    ([ActionRepeat](wrappers/action-repeat.md)). The filter checks each, and `total_steps` counts the policy's
+    ([ActionRepeat](wrappers/learner.md#actionrepeat)). The filter checks each, and `total_steps` counts the policy's
     actions."""
     n_envs: Count = 1
     """Envs of a run."""
@@ -330,7 +332,7 @@ class ArmConfig(Section):
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Torch's. May be changed later."""
     trackers: list[Literal["wandb", "mlflow"]] = Field(default_factory=list)
-    """[Where curves and films go](cli.md#trackers) beside TensorBoard. May be changed later."""
+    """[Where curves and films go](cli.md#where-everything-lies) beside TensorBoard. May be changed later."""
 
     @property
     def replays_goals(self) -> bool:

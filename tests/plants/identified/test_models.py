@@ -8,8 +8,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.identified.ensemble import EnsembleModel
-from safe_wrappers.plants.identified.linear import LinearModel
+from safe_wrappers.plants.identified.models import EnsembleModel, LinearModel
 
 
 def steps_of(episodes):
@@ -46,7 +45,7 @@ def test_networks_know_a_pendulum_better_and_the_same_seed_gives_the_same():
 
 def test_seeds_decide(monkeypatch):
     pytest.importorskip("torch")
-    monkeypatch.setattr("safe_wrappers.plants.identified.ensemble._UPDATES", 20)
+    monkeypatch.setattr("safe_wrappers.plants.identified.models._UPDATES", 20)
     draw = np.random.default_rng(0)
     data = draw.normal(size=(50, 2)), draw.normal(size=(50, 1)), draw.normal(size=(50, 2))
     one, same, other = (EnsembleModel(*data, seed=seed) for seed in (1, 1, 2))
@@ -56,7 +55,7 @@ def test_seeds_decide(monkeypatch):
 
 def test_a_number_that_never_changes_does_no_harm(monkeypatch):
     pytest.importorskip("torch")
-    monkeypatch.setattr("safe_wrappers.plants.identified.ensemble._UPDATES", 20)
+    monkeypatch.setattr("safe_wrappers.plants.identified.models._UPDATES", 20)
     draw = np.random.default_rng(0)
     states = np.column_stack([draw.normal(size=50), np.full(50, 0.3)])
     changes = np.column_stack([draw.normal(size=50), np.zeros(50)])
