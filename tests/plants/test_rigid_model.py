@@ -4,10 +4,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from flexible_joint import resonances
 from oracles import damping_ratios
 from scenes import Scene
 
-from benchmarks.flexible_joint import resonances
 from safe_wrappers.plants import rigid_model_check
 
 ANGLES = (0.0, 0.7, 1.5, 2.4, np.pi)

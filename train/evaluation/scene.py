@@ -20,20 +20,25 @@ from .step_log import is_violation
 
 @dataclass(frozen=True)
 class Scene:
-    """One episode seen from above; lengths in metres."""
+    """One episode seen from above; lengths in metres.
+
+    Attributes:
+        agent: Where the robot was, shape (steps + 1, 2).
+        intervened: Where the filter changed the action, shape (steps,); step t starts at `agent[t]`.
+        violated: Where the task's own truth saw a violation, shape (steps,).
+        goals: Each place that the goal was at, shape (n, 2).
+        hazards: At the episode's start, shape (n, 2).
+        vases: Likewise.
+        hazard_radius: Of every hazard.
+        goal_radius: Of every goal.
+    """
 
     agent: Array
-    """(steps + 1, 2): where the robot was."""
     intervened: NDArray[np.bool_]
-    """(steps,): where the filter changed the action; step t starts at `agent[t]`."""
     violated: NDArray[np.bool_]
-    """(steps,): where the task's own truth saw a violation."""
     goals: Array
-    """(n, 2): each place that the goal was at."""
     hazards: Array
-    """(n, 2): at the episode's start, as the vases."""
     vases: Array
-    """(n, 2)."""
     hazard_radius: float
     goal_radius: float
 

@@ -10,25 +10,33 @@ from pathlib import Path
 from typing import Final
 
 import jinja2
-import numpy as np
 import yaml
 
 from safe_wrappers.errors import RunStateError
 
-from ..config import ArmConfig, ExperimentConfig
+from ..config import ExperimentConfig
 from ..evaluation.episode_selection import compared_pairs, shown_episode
 from ..evaluation.evaluate import evaluated_steps, evaluation_folder
 from ..evaluation.metrics import OF_THE_FILTER, REGISTRY
 from ..evaluation.scene import load_scene
 from ..evaluation.step_log import MOST_STEPS, StepLog, pool
-from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Curve, Summary, judged_by, learning_curve, over_seeds
+from ..evaluation.summary import (
+    SEEDS_FOR_AN_INTERVAL,
+    Curve,
+    Summary,
+    judged_by,
+    learning_curve,
+    number,
+    over_seeds,
+    spread,
+)
 from ..files import Row, read_json, write_rows, write_text
 from ..run.folder import START_FILE, finished_facts
-from ..videos.record import Video, load_video, video_path, video_problem
+from ..videos.record import Video, load_video, video_path
 from .drawing import Picture, color_of, data_uri
 from .figures import CONDITIONS, curve_picture, over_the_episode, plane_picture, refusals
 from .tables import RUN_COLUMNS, SHORT, every_metric, run_rows, short_rows
-from .verdict import cards, verdict
+from .verdict import compare, percent, verdict
 from .where import place_pictures, scene_picture
 
 _PACKAGES: Final = (
@@ -90,7 +98,10 @@ def write_report(
         about=about(experiment),
         first=first,
         rest=rest,
-        cards=cards(experiment, summary, _filter_us(experiment)),
+        found=compare(experiment, summary),
+        number=number,
+        percent=percent,
+        spread=spread,
         short=SHORT,
         rows=[(a, list(short_rows(summary, a))) for a in experiment.arms if any(summary.table[a.name].values())],
         over=over_seeds(*summary.seeds),
@@ -102,7 +113,6 @@ def write_report(
             for condition, words in CONDITIONS.items()
             if (video := load_video(video_path(experiment, arm, condition))) is not None
         ],
-        film_problem=video_problem(experiment),
         scenes=list(_scenes(experiment)),
         plane=plane_picture(summary, names) if summary.judged else None,
         acting=acting,
@@ -200,24 +210,16 @@ def _film(video: Video) -> str:
     return f"{said} Shown {video.speed:.1f} times as fast as real."
 
 
-def _filter_us(experiment: ExperimentConfig) -> float | None:
-    """The mean filter call of the filtered side, in training if it was there, else in evaluation."""
-    trained, evaluated = [], []
-    for _, arm in compared_pairs(experiment):
-        for seed in experiment.seeds:
-            folder = experiment.run_folder(arm, seed)
-            trained.append(finished_facts(folder).get("filter_time_us"))
-            log = evaluated_steps(folder, "filter_on")
-            evaluated.append(None if log is None or np.isnan(log.filter_time_us) else log.filter_time_us)
-    times = [time for time in trained if time is not None] or [time for time in evaluated if time is not None]
-    return float(np.mean(times)) if times else None
-
-
 def about(experiment: ExperimentConfig) -> str:
     """What was trained on what, for how long, and how it was judged."""
     kinds = ", ".join(dict.fromkeys(f"{arm.algorithm} on {arm.env.id}" for arm in experiment.arms))
-    steps = sorted({_trained(experiment, arm, seed) for arm in experiment.arms for seed in experiment.seeds})
-    how_long = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
+    steps = sorted(  # whole rollouts, which may be more than `total_steps`
+        int(finished_facts(experiment.run_folder(arm, seed)).get("timesteps", arm.total_steps))
+        * arm.action_repeat
+        for arm in experiment.arms
+        for seed in experiment.seeds
+    )
+    how_long = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
     seeds = len(experiment.seeds)
     begun = ""
     for arm in experiment.arms:
@@ -232,12 +234,6 @@ def about(experiment: ExperimentConfig) -> str:
         f"{kinds}, {how_long} steps, {seeds} seed{'s' * (seeds > 1)}; evaluation on"
         f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed.{begun}"
     )
-
-
-def _trained(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> int:
-    """Control steps of a run: whole rollouts, which may be more than `total_steps`."""
-    facts = finished_facts(experiment.run_folder(arm, seed))
-    return int(facts.get("timesteps", arm.total_steps)) * arm.action_repeat
 
 
 def _versions() -> Iterator[tuple[str, str]]:

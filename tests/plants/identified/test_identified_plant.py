@@ -8,9 +8,41 @@ import pytest
 from scipy.stats import binom
 
 import safe_wrappers as sw
+<<<<<<< HEAD
 from benchmarks.identified import CartInWind
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+=======
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+>>>>>>> main
 from safe_wrappers.plants import View
+
+
+class CartInWind(gym.Env):
+    """A cart of 1 kg on a rail, pushed by up to 4 N and by the drag of a wind that nobody measures.
+
+    The drag is 0.3 kg/m (v - w)|v - w|; w is an Ornstein-Uhlenbeck process with a time constant of 1 s and a standard
+    deviation of `wind` m/s.
+    """
+
+    def __init__(self, wind=1.0):
+        self.wind, self.dt = wind, 0.05
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._x, self._v = self.np_random.uniform(-1.0, 1.0), 0.0
+        self._w, self._steps = self.wind * self.np_random.standard_normal(), 0
+        return np.array([self._x, self._v]), {}
+
+    def step(self, action):
+        keep = math.exp(-self.dt)
+        self._w = keep * self._w + self.wind * math.sqrt(1.0 - keep**2) * self.np_random.standard_normal()
+        against = self._v - self._w
+        self._v += self.dt * (4.0 * float(action[0]) - 0.3 * against * abs(against))
+        self._x += self.dt * self._v
+        self._steps += 1
+        return np.array([self._x, self._v]), 0.0, False, self._steps >= 200, {}
 
 
 def wall(view):
