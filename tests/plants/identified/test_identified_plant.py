@@ -8,12 +8,7 @@ import pytest
 from scipy.stats import binom
 
 import safe_wrappers as sw
-<<<<<<< HEAD
-from benchmarks.identified import CartInWind
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-=======
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
->>>>>>> main
 from safe_wrappers.plants import View
 
 
