@@ -27,7 +27,7 @@ COMMANDS: Final = {
     "evaluate": "evaluate the trained policies on the same episodes, with the filter off and on",
     "compare": "train, evaluate, and print the comparison",
     "sweep": "search the settings under `sweep` in the config, for the most return at cost zero",
-    "report": "write the comparison as one HTML page, from what is already there; of several, also an overview",
+    "report": "write the comparison as one HTML page, from what is already there; of several, one each",
     "enjoy": "let a trained policy act, in a window or on film if asked",
     "push": "upload a run's policy to the Hugging Face hub",
     "diagnose": "run an env, and a policy: what is wrong, and which wrapper treats it",
@@ -49,7 +49,7 @@ def make_parser(command: str) -> argparse.ArgumentParser:
         # They may stand before the config and behind options: `main` tells them by their "=".
         parser.epilog = "key=value overrides a setting: total_steps=1000, arms.filtered.filter=protect"
         if command == "report":
-            what = "where to (default: report.html beside the runs; of several, overview.html)"
+            what = "where to (default: report.html beside the runs)"
             add("--output", type=Path, metavar="FILE", help=what)
         else:
             add("--on", metavar="ray[:ADDRESS]", help="run on a Ray cluster whose nodes share the folders")
@@ -147,8 +147,7 @@ def _experiment(command: str, options: argparse.Namespace, overrides: list[str],
         return
 
     from .experiment import evaluate_experiment, summarize_experiment, train_experiment
-    from .report import verdict, write_report
-    from .report.terminal_table import comparison_table
+    from .report import comparison_table, verdict, write_report
 
     experiment = parse_experiment(settings)
     if command in ("train", "compare"):
@@ -166,25 +165,18 @@ def _experiment(command: str, options: argparse.Namespace, overrides: list[str],
 
 
 def _report(_: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
-    """Of one config its page; of several a page each, and one that puts them side by side."""
+    """A page of each config."""
     from .config import parse_experiment, read_config
     from .experiment import summarize_experiment
-    from .report import write_overview, write_report
+    from .report import write_report
 
-    experiments = [parse_experiment(read_config(config, overrides)) for config in options.configs]
-    folders = [experiment.folder for experiment in experiments]
-    if len(set(folders)) < len(folders):
-        raise ConfigurationError("report: two configs name the same experiment.")
-    entries = [(experiment, summarize_experiment(experiment)) for experiment in experiments]
-    for config, (experiment, summary) in zip(options.configs, entries, strict=True):
-        alone = options.output if len(entries) == 1 else None
-        path = write_report(experiment, summary, _compare_command(config, overrides), alone)
+    if options.output and len(options.configs) > 1:
+        raise ConfigurationError("--output is for one config; of several each page lies beside its runs")
+    for config in options.configs:
+        experiment = parse_experiment(read_config(config, overrides))
+        command = _compare_command(config, overrides)
+        path = write_report(experiment, summarize_experiment(experiment), command, options.output)
         _say(console, f"Report: {path}")
-    if len(entries) > 1:
-        path = options.output or experiments[0].output / "overview.html"
-        again = ["safe-wrappers", "report", *map(str, options.configs), *overrides]
-        write_overview(entries, path, shlex.join(again))
-        _say(console, f"Overview: {path}")
 
 
 def _diagnose(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:

@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.filtering import cbf
+from safe_wrappers.control.numerics.projection import keeps_rows
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize
-from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant
 
 _ROUNDING = 1e-9  # round-off, as a share of h's size: of its value and its gradient together

@@ -88,15 +88,6 @@ def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
     assert limit.start() == Detour(0.0, 0)
 
 
-def test_no_detour_without_a_drive_or_without_a_disc_ahead():
-    env = filtered({"hazards": [[0.26, 0.0]]}, detour=True)
-    (limit,) = env.filter.bound
-    assert limit.candidates(np.array([0.0, 1.0])) == []
-    assert limit.candidates(np.array([-1.0, 0.0])) == []
-    env = filtered({"hazards": [[0.26, 0.0]]})
-    assert env.filter.bound[0].candidates(np.array([1.0, 0.0])) == []
-
-
 @pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
 @pytest.mark.parametrize("action", [(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.3, -1.0)])
 def test_a_robot_inside_a_hazard_is_brought_out_whatever_the_policy_wants(action):

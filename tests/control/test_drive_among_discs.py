@@ -11,8 +11,8 @@ import safe_wrappers as sw
 from benchmarks import drivers
 from safe_wrappers.constraints.backup.heading_drive_clearance import BoundHeadingDriveClearance
 from safe_wrappers.control.backup import drive_decision as among
+from safe_wrappers.control.numerics.projection import cast_inside
 from safe_wrappers.filter.engine import SafetyFilter
-from safe_wrappers.filter.projection import cast_inside
 
 RESERVE_M = 0.004
 KINDS = {

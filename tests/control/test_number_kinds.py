@@ -7,18 +7,16 @@ from safe_wrappers.control.contact import friction_cone, impact
 from safe_wrappers.control.estimation import covariance, kalman, observability
 from safe_wrappers.control.filtering import cbf, manipulability
 from safe_wrappers.control.handover import polynomials, smoothstep, splines
-from safe_wrappers.control.legged import predicted_positions, support
+from safe_wrappers.control.legged import whole_body_problem
+from safe_wrappers.control.numerics import projection
 from safe_wrappers.control.teleop import passivity
 from safe_wrappers.control.vehicle import slip
 from safe_wrappers.control.watchdog import leases, sampling
-from safe_wrappers.filter import projection
 
 EYE = [[1, 0], [0, 1]]
 EYE3 = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 CHAIN = [[0, 1], [0, 0]]
 UP = [0, 0, 1]
-SQUARE = [[0, 0], [2, 0], [2, 2], [0, 2]]
-CORNERS = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
 
 CALLS = {
     "numerical_gradient": (lambda x: cbf.numerical_gradient(lambda y: y @ y, x), [[3, 4]]),
@@ -55,7 +53,7 @@ CALLS = {
     "ChannelLedger": (lambda *a: filled(passivity.ChannelLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1, 2]),
     "differentiate": (splines.differentiate, [[1, 2, 3]]),
     "extrema": (polynomials.extrema, [[0, 3, -1], 2]),
-    "largest_acceleration": (predicted_positions.largest_acceleration, [2, 1, 1]),
+    "largest_acceleration": (whole_body_problem.largest_acceleration, [2, 1, 1]),
     "project, one row": (lambda *a: projection.project(*a)[0], [[1, 1], [[1, 1]], [1], -1, 1]),
     "project, rows": (lambda *a: projection.project(*a)[0], [[1, 1], [[2, 1], [1, 2]], [1, 1], -1, 1]),
     "hold_lag_s": (sampling.hold_lag_s, [2]),
@@ -64,11 +62,6 @@ CALLS = {
     "smoothstep": (smoothstep.smoothstep, [1]),
     "shortest_latched_blend": (smoothstep.shortest_latched_blend, [2, 3]),
     "hermite_series": (splines.hermite_series, [[0, 1, 3], [0, 2, 1], [1, 0, 1], 2]),
-    "support_polygon": (support.support_polygon, [SQUARE]),
-    "support_rows": (
-        lambda p, o, n, i: support.support_rows(p, support.plane(o, n), i),
-        [CORNERS, [0, 0, 0], UP, 0],
-    ),
 }
 
 

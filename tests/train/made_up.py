@@ -9,6 +9,9 @@ from safe_wrappers.train.evaluation.step_log import StepLog, save_steps
 from safe_wrappers.train.files import write_rows
 from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
 
+SILENT = dict.fromkeys(("cost", "cost_substep", "violations"), "")
+"""What a task reports that judges nothing."""
+
 
 def episode(**values):
     return dict.fromkeys(EPISODE_COLUMNS[2:], 0.0) | {"length": 100} | values

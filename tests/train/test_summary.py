@@ -4,12 +4,12 @@ import json
 import numpy as np
 import pytest
 
-from safe_wrappers.train.evaluation.curves import learning_curve
 from safe_wrappers.train.evaluation.evaluate import EVALUATION_COLUMNS
 from safe_wrappers.train.evaluation.summary import (
     Estimate,
     estimate,
     interquartile_mean,
+    learning_curve,
     number,
     summarize,
     write_summary,

@@ -9,7 +9,7 @@ from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig, parse_experiment
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
 from safe_wrappers.train.files import read_rows
-from safe_wrappers.train.report.origin import about
+from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack, make_vec_env

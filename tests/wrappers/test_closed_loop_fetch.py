@@ -8,8 +8,7 @@ import safe_wrappers as sw
 from safe_wrappers.errors import UnsafeStateWarning
 
 gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-from benchmarks.fetch_drivers import drivers, obstacles  # noqa: E402 (the benchmark needs gymnasium_robotics)
-from benchmarks.fetch_judge import FetchJudge  # noqa: E402
+from benchmarks.fetch import FetchJudge, drivers, obstacles  # noqa: E402 (the benchmark needs gymnasium_robotics)
 
 ENVS = ["FetchReach-v4", "FetchPush-v4", "FetchSlide-v4", "FetchPickAndPlace-v4"]
 every_env = pytest.mark.parametrize("env_id", ENVS)

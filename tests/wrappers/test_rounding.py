@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.filter.projection import cast_inside
+from safe_wrappers.control.numerics.projection import cast_inside
 
 unit = st.floats(-1.0, 1.0)
 

@@ -3,43 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from ..config import ArmConfig, ExperimentConfig
 from ..files import read_rows
 from .evaluate import evaluation_folder
 
 
-@dataclass(frozen=True)
-class Pair:
-    """A comparison: one arm and condition without the filter, one with it.
-
-    Attributes:
-        bare: Without the filter; the filtered arm itself where the experiment has no arm without one.
-        filtered: With the filter.
-    """
+class Pair(NamedTuple):
+    """A comparison: an arm without the filter (the filtered one itself where there is no other), and one with it."""
 
     bare: ArmConfig
     filtered: ArmConfig
 
-    @property
-    def same_policy(self) -> bool:
-        """The two differ only in the filter at evaluation."""
-        return self.bare == self.filtered
 
+class ShownEpisode(NamedTuple):
+    """The evaluation episode that is looked at in every arm and condition, and the worst one beside it on film.
 
-@dataclass(frozen=True)
-class ShownEpisode:
-    """The evaluation episode that is looked at in every arm and condition, and the worst one beside it on film."""
+    Attributes:
+        seed: The training seed of the policies.
+        episode_seed: Of the typical episode.
+        worst_seed: Of the one with the lowest return.
+        reason: How they were chosen, for the page.
+    """
 
     seed: int
-    """The training seed of the policies."""
     episode_seed: int
-    """Of the typical episode."""
     worst_seed: int
-    """Of the one with the lowest return."""
     reason: str
-    """How they were chosen, for the page."""
 
     @property
     def filmed(self) -> dict[str, int]:

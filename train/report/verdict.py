@@ -3,11 +3,103 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
-from ..config import ExperimentConfig
-from ..evaluation.has_cost import judged_by
-from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, number, spread
-from .comparison import Comparison, Outcome, Side, compare, side
+import numpy as np
+
+from ..config import ArmConfig, ExperimentConfig
+from ..evaluation.episode_selection import Pair, compared_pairs
+from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, judged_by, number
+
+
+class Side(NamedTuple):
+    """What some arms did under a condition, with or without their training; totals over all seeds."""
+
+    steps: int
+    violations: int | None  # None: not judged
+    infeasible: int
+    fallback: int
+    unsafe: int
+    collisions: int  # 0 where the task reports none, too
+    returns: list[Estimate]  # of evaluation, one per arm; empty if one is missing
+    changed: float | None  # share of evaluation steps that the filter changed
+
+    @property
+    def share(self) -> float:
+        """Of steps in violation."""
+        return (self.violations or 0) / self.steps if self.steps else 0.0
+
+
+class Comparison(NamedTuple):
+    """Without the filter and with it, and what they are of."""
+
+    pairs: list[Pair]
+    off: Side
+    on: Side
+    evaluated: Side  # of the side with the filter, evaluation alone
+    outcomes: dict[
+        tuple[str, str], Side
+    ]  # (arm, "filter_off" or "filter_on") of a single pair, as far as it is there
+
+    @property
+    def judged(self) -> bool:
+        """Violations were judged on both sides."""
+        return self.off.violations is not None and self.on.violations is not None
+
+    @property
+    def same_policies(self) -> bool:
+        """The two sides differ only in the filter at evaluation."""
+        return self.pairs[0].bare == self.pairs[0].filtered
+
+    def who(self, arm: str) -> str:
+        """An arm of a single pair, by how it was trained."""
+        if self.same_policies:
+            return "The policy"
+        through = arm == self.pairs[0].filtered.name
+        return "Trained through the filter" if through else "Trained without the filter"
+
+
+def _side(summary: Summary, arms: Sequence[ArmConfig], condition: str, training: bool = False) -> Side:
+    names = [arm.name for arm in arms]
+    wanted = (condition, "training") if training else (condition,)
+    rows = [row for row in summary.per_seed if row["arm"] in names and row["condition"] in wanted]
+    totals = {
+        key: int(sum(row.get(key, 0) for row in rows))
+        for key in ("steps", "infeasible", "fallback", "unsafe", "collisions")
+    }
+    judged = all("violations" in row for row in rows)
+    cells = [summary.table[name][condition] for name in names]
+    rates = [cell["intervention_rate"].iqm for cell in cells if "intervention_rate" in cell]
+    return Side(
+        **totals,
+        violations=int(sum(row["violations"] for row in rows)) if judged else None,
+        returns=[cell["return"] for cell in cells] if all("return" in cell for cell in cells) else [],
+        changed=float(np.mean(rates)) if rates else None,
+    )
+
+
+def compare(experiment: ExperimentConfig, summary: Summary) -> Comparison | None:
+    """The headline's comparison; None where the experiment has no filter, or nothing of a side is there.
+
+    An arm without a filter and one with it count with all their training and the evaluation that is theirs
+    (filter off, filter on). Where the policies are the same, only their evaluation is compared.
+    """
+    pairs = compared_pairs(experiment)
+    if not pairs:
+        return None
+    training = pairs[0].bare != pairs[0].filtered
+    filtered = [pair.filtered for pair in pairs]
+    off = _side(summary, [pair.bare for pair in pairs], "filter_off", training)
+    on = _side(summary, filtered, "filter_on", training)
+    if not off.steps or not on.steps:
+        return None
+    outcomes = {
+        (arm.name, condition): side
+        for arm in (pairs[0] if len(pairs) == 1 else ())  # of several tasks there is no common return
+        for condition in ("filter_off", "filter_on")
+        if (side := _side(summary, [arm], condition)).returns and side.steps
+    }
+    return Comparison(pairs, off, on, _side(summary, filtered, "filter_on"), outcomes)
 
 
 def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
@@ -17,16 +109,14 @@ def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
     without and with the filter.
     """
     found = compare(experiment, summary)
+    judge = judged_by(experiment, summary.judged)
     if found is None:
-        return _without_comparison(experiment, summary)
-    judge = judged_by(experiment, found.judged)
-    parts = (
-        *((_safety(found.off, found.on), judge) if found.judged else (judge, _own_measure(found.on))),
-        _collisions(found.off, found.on),
-        *_price(found),
-        _work(found.on, found.evaluated),
-    )
-    return [part for part in parts if part]
+        return [part for part in ("There is no filter to compare with yet.", judge) if part]
+    first = [_safety(found.off, found.on), judge] if found.judged else [judge, _own_measure(found.on)]
+    collisions = ""
+    if found.off.collisions or found.on.collisions:
+        collisions = f"Collisions begun: {found.on.collisions:,} with it, {found.off.collisions:,} without."
+    return [part for part in (*first, collisions, *_price(found), _work(found.on, found.evaluated)) if part]
 
 
 def percent(share: float) -> str:
@@ -43,18 +133,10 @@ def _safety(off: Side, on: Side) -> str:
         return f"With the filter none of {on.steps:,} steps was in violation; without it {without} were."
     if not on.violations:
         return "No violation with the filter, and none without it: the task did not put it to the test."
-    with_filter = f"{on.violations:,} of {on.steps:,} steps ({percent(on.share)})"
+    through = f"{on.violations:,} of {on.steps:,} steps ({percent(on.share)}) with it, {without} without."
     if on.share < off.share:
-        return (
-            f"The filter lowered violations without removing them: {with_filter} with it, {without} without."
-        )
-    return f"The filter did not lower violations: {with_filter} with it, {without} without."
-
-
-def _collisions(off: Side, on: Side) -> str:
-    if not off.collisions and not on.collisions:
-        return ""
-    return f"Collisions begun: {on.collisions:,} with it, {off.collisions:,} without."
+        return f"The filter lowered violations without removing them: {through}"
+    return f"The filter did not lower violations: {through}"
 
 
 def _own_measure(on: Side) -> str:
@@ -64,123 +146,70 @@ def _own_measure(on: Side) -> str:
 
 def _price(found: Comparison) -> list[str]:
     if len(found.pairs) > 1:
-        if not found.off.returns or not found.on.returns:
-            return []
-        # Returns of different tasks have no common mean.
-        went = (
+        went = [
             f"{pair.filtered.name} {number(off.iqm)} to {number(on.iqm)}"
-            for pair, off, on in zip(found.pairs, found.off.returns, found.on.returns, strict=True)
-        )
-        return [f"The return per episode went: {', '.join(went)}."]
+            for pair, off, on in zip(found.pairs, found.off.returns, found.on.returns, strict=False)
+        ]
+        return [f"The return per episode went: {', '.join(went)}."] if went else []
     if not found.outcomes:
         return []
-    told = [_policy(found, arm) for arm in dict.fromkeys(outcome.arm.name for outcome in found.outcomes)]
-    return [*told, " ".join(filter(None, (_choice(found), _brackets(found.outcomes), _training(found))))]
+    told = [_policy(found, arm) for arm in dict.fromkeys(arm for arm, _ in found.outcomes)]
+    return [*told, _choice(found)]
 
 
-def _policy(found: Comparison, name: str) -> str:
+def _policy(found: Comparison, arm: str) -> str:
     """What one arm's policies returned in evaluation, without and with the filter."""
-    if found.same_policies:
-        who, phrases = "The policy", ("without the filter", "with it")
-    elif name == found.pairs[0].filtered.name:
-        who, phrases = "Trained through the filter, the policy", ("with it taken off", "with it")
-    else:
-        who, phrases = "Trained without the filter, the policy", ("without it", "with it added afterwards")
-    parts = [
-        f"{_with_spread(outcome.returns)} {phrases[outcome.filter_on]}{_violations(outcome)}"
-        for outcome in found.outcomes
-        if outcome.arm.name == name
-    ]
+    parts = []
+    for condition, phrase in (("filter_off", "with the filter off"), ("filter_on", "with it on")):
+        side = found.outcomes.get((arm, condition))
+        if side is not None:
+            returns = side.returns[0]
+            told = number(returns.iqm) if returns.low is None else str(returns)
+            parts.append(f"{told} {phrase}{_in_brackets(side)}")
+    who = found.who(arm) + ("" if found.same_policies else ", the policy")
     return f"{who} returned per evaluation episode {' and '.join(parts)}."
 
 
-def _with_spread(returns: Estimate) -> str:
-    return number(returns.iqm) if returns.low is None else str(returns)
-
-
-def _violations(outcome: Outcome) -> str:
-    if outcome.violations is None:
+def _in_brackets(side: Side) -> str:
+    if side.violations is None:
         return ""
-    if not outcome.violations:
+    if not side.violations:
         return " (no step in violation)"
-    share = percent(outcome.violations / outcome.steps)
-    return f" ({outcome.violations:,} of {outcome.steps:,} steps in violation, {share})"
+    return f" ({side.violations:,} of {side.steps:,} steps in violation, {percent(side.share)})"
 
 
 def _choice(found: Comparison) -> str:
     """Whether it paid to train through the filter that is on afterwards; nothing where that was not tried."""
-    acting = [outcome for outcome in found.outcomes if outcome.filter_on]
+    acting = [side.returns[0] for (_, condition), side in found.outcomes.items() if condition == "filter_on"]
     if len(acting) < 2:
         return ""
-    added, through = (outcome.returns for outcome in acting)
+    added, through = acting
     if added.iqm == through.iqm:
         return "With the filter on, both returned the same."
     better = "trained without it" if added.iqm > through.iqm else "trained through it"
-    return f"With the filter on, the policy {better} returned more ({_how_surely(added, through)})."
-
-
-def _how_surely(one: Estimate, other: Estimate) -> str:
-    seeds = min(one.seeds, other.seeds)
-    if spread(seeds) != "95 % interval":
-        return "one seed says little" if seeds < 2 else f"{seeds} seeds say little"
-    assert one.low is not None and one.high is not None and other.low is not None and other.high is not None
-    apart = one.low > other.high or other.low > one.high
-    return f"the intervals over {seeds} seeds {'lie apart' if apart else 'overlap'}"
-
-
-def _brackets(outcomes: Sequence[Outcome]) -> str:
-    counts = [outcome.returns.seeds for outcome in outcomes]
-    if max(counts) < 2:
-        return "One seed: no interval."
-    if max(counts) < SEEDS_FOR_AN_INTERVAL:
-        return f"In brackets the range over {max(counts)} seeds, which is not an interval."
-    rest = "" if min(counts) >= SEEDS_FOR_AN_INTERVAL else ", of two seeds their range"
-    return f"In brackets bootstrap 95 % intervals over seeds{rest}."
-
-
-def _training(found: Comparison) -> str:
-    """For how long the compared policies were trained."""
-    arms = {arm.name: arm for pair in found.pairs for arm in (pair.bare, pair.filtered)}
-    lengths = [f"{arm.total_steps * arm.action_repeat:,}" for arm in arms.values()]
-    if len(set(lengths)) == 1:
-        return f"Trained for {lengths[0]} control steps{' each' if len(lengths) > 1 else ''}."
-    return f"Trained for {' and '.join(lengths)} control steps."
+    seeds = min(added.seeds, through.seeds)
+    surely = "one seed says little" if seeds < 2 else f"{seeds} seeds say little"
+    if seeds >= SEEDS_FOR_AN_INTERVAL:
+        apart = max(added.low or 0.0, through.low or 0.0) > min(added.high or 0.0, through.high or 0.0)
+        surely = f"the intervals over {seeds} seeds {'lie apart' if apart else 'overlap'}"
+    return f"With the filter on, the policy {better} returned more ({surely})."
 
 
 def _work(on: Side, evaluated: Side) -> str:
     """What the filter did in evaluation, and then, where it was on in training and failed there, how often."""
+    rest = "no step was infeasible and none ran the fallback"
     if evaluated.infeasible or evaluated.fallback:
         rest = _failed(evaluated.infeasible, evaluated.fallback)
-    else:
-        rest = "no step was infeasible and none ran the fallback"
-    if evaluated.changed is None:
-        in_evaluation = f"In evaluation {rest}."
-    else:
+    said = f"In evaluation {rest}."
+    if evaluated.changed is not None:
         changed = percent(evaluated.changed) if evaluated.changed else "none"
-        in_evaluation = f"The filter changed {changed} of the evaluation steps; {rest}."
+        said = f"The filter changed {changed} of the evaluation steps; {rest}."
     infeasible, fallback = on.infeasible - evaluated.infeasible, on.fallback - evaluated.fallback
-    if not infeasible and not fallback:
-        return in_evaluation
-    steps = on.steps - evaluated.steps
-    return f"{in_evaluation} In training {_failed(infeasible, fallback)}, of {steps:,}."
+    if infeasible or fallback:
+        said += f" In training {_failed(infeasible, fallback)}, of {on.steps - evaluated.steps:,}."
+    return said
 
 
 def _failed(infeasible: int, fallback: int) -> str:
     were = "step was" if infeasible == 1 else "steps were"
     return f"{infeasible:,} {were} infeasible and {fallback:,} ran the fallback"
-
-
-def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> list[str]:
-    parts = ["There is no filter to compare with yet."]
-    for arm in experiment.arms:
-        for condition, words in (("filter_off", "in evaluation"), ("training", "while training")):
-            alone = side(summary, [arm], condition, training=False)
-            if alone.steps and alone.returns:
-                judged = (
-                    ""
-                    if alone.violations is None
-                    else f", {alone.violations:,} of {alone.steps:,} steps in violation"
-                )
-                parts.append(f"{arm.name}: return {number(alone.returns[0].iqm)} {words}{judged}.")
-                break
-    return [part for part in (*parts, judged_by(experiment, summary.judged)) if part]

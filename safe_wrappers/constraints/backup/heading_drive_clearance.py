@@ -12,11 +12,10 @@ from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
-from safe_wrappers.control.numerics.nearest_discs import nearest_discs
+from safe_wrappers.control.numerics.planar import nearest_discs
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces
-from safe_wrappers.filter.constraint_batch import ConstraintBatch
+from safe_wrappers.filter.constraint import Constraint, ConstraintBatch, HalfSpaces
 from safe_wrappers.plants.mujoco.actuators import Actuators, acting_ranges
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant

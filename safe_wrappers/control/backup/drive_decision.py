@@ -190,7 +190,7 @@ def bounds_of(
 
 @compiled
 def _round_inside(out: Array, normals: Array, offsets: Array, low: Array, high: Array) -> None:
-    """`cast_inside` of `filter/projection.py` to single precision, in place."""
+    """`cast_inside` of `control/numerics/projection.py` to single precision, in place."""
     sent, worst, most = np.empty(2, dtype=np.float32), -1, 0.0
     for j in range(2):
         sent[j] = np.float32(min(max(out[j], low[j]), high[j]))

@@ -8,12 +8,12 @@ Source: appendix "Continuous covariance propagation and observability"; Van Loan
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import Array, finite_array
-from safe_wrappers.control.numerics.block_exponentials import Discrete, integral, van_loan
 from safe_wrappers.errors import ConfigurationError
 
 _SYMMETRY = 1e-9
@@ -26,6 +26,13 @@ _ORDER = 12
 """Terms of the Taylor series: at the longest window the remainder is 1e-5 of the rate's norm times the window."""
 _RESOLUTION = 1e-9
 """Relative to the time: the search ends where no longer window is free."""
+
+
+class Discrete(NamedTuple):
+    """x -> F x plus noise of covariance Q_d over one step of time: F = exp(A t) and Q_d, shape (..., n, n) each."""
+
+    transition: Array
+    noise: Array
 
 
 def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
@@ -63,7 +70,7 @@ def discretise(A: ArrayLike, Q: ArrayLike, time_s: ArrayLike) -> Discrete:
     """
     a, q = checked_system(A, Q)
     times = checked_times(time_s)
-    step = van_loan(a, q, times)
+    step = _van_loan(a, q, times)
     refuse_overflow(times, *step)
     return step
 
@@ -85,7 +92,7 @@ def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: ArrayLike) -> Array:
     if drift.ndim == 0 or drift.shape[-1] != len(a):
         raise ConfigurationError(f"b must have {len(a)} entries, one per state of A, got shape {drift.shape}")
     with np.errstate(over="ignore", invalid="ignore"):
-        carried = np.tensordot(integral(a, times), drift, axes=(-1, -1))
+        carried = np.tensordot(_integral(a, times), drift, axes=(-1, -1))
     carried = np.moveaxis(carried, times.ndim, -1)
     refuse_overflow(times, carried)
     return np.asarray(carried)
@@ -148,7 +155,7 @@ def _first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, hor
     speed, length = float(np.linalg.norm(a, 2)), float(np.linalg.norm(rows, 2))
     time = 0.0
     while True:
-        step = van_loan(a, q, np.asarray(time))
+        step = _van_loan(a, q, np.asarray(time))
         now = step.transition @ P0 @ step.transition.T + step.noise
         rate = derivative = _rate(now, a) + q
         curve = [0.0, 0.0]
@@ -202,7 +209,7 @@ def _free_by_rise(
     rising = (vectors * np.maximum(signs, 0.0)) @ vectors.T
     windows = np.minimum(shortest * 4.0 ** np.arange(1, 11), room)
     free = shortest
-    for window, rise in zip(windows, van_loan(a, rising, windows).noise, strict=True):
+    for window, rise in zip(windows, _van_loan(a, rising, windows).noise, strict=True):
         if not (np.isfinite(rise).all() and np.linalg.eigvalsh(value + rows @ rise @ rows.T)[-1] < goal):
             break
         free = float(window)
@@ -256,3 +263,54 @@ def refuse_overflow(times: Array, *results: Array) -> None:
     """Refuse results that are not finite."""
     if not all(np.isfinite(result).all() for result in results):
         raise ConfigurationError(f"within time_s = {np.max(times):.6g} s an unstable mode of A overflows")
+
+
+def _van_loan(a: Array, q: Array, times: Array) -> Discrete:
+    """`discretise` without its checks: over a time so short that it is well conditioned, then doubled."""
+    n, size = len(a), _norm_or_one(q)
+    doublings = _doublings(a, times)
+    base = (times / 2.0**doublings)[..., None, None]
+    block = np.zeros((*times.shape, 2 * n, 2 * n))
+    block[..., :n, :n], block[..., n:, n:] = -a * base, a.T * base
+    block[..., :n, n:] = q / size
+    exponential = _exponential(block)
+    transition = np.swapaxes(exponential[..., n:, n:], -1, -2)
+    noise = transition @ exponential[..., :n, n:] * (size * base)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for level in range(int(doublings.max(initial=0))):
+            on = (doublings > level)[..., None, None]
+            noise = np.where(on, transition @ noise @ np.swapaxes(transition, -1, -2) + noise, noise)
+            transition = np.where(on, transition @ transition, transition)
+    return Discrete(transition, 0.5 * (noise + np.swapaxes(noise, -1, -2)))
+
+
+def _integral(a: Array, times: Array) -> Array:
+    """The integral of `exp(A s)` from 0 to each time, shape (..., n, n)."""
+    n, doublings = len(a), _doublings(a, times)
+    base = (times / 2.0**doublings)[..., None, None]
+    block = np.zeros((*times.shape, 2 * n, 2 * n))
+    block[..., :n, :n], block[..., :n, n:] = a * base, np.eye(n)
+    exponential = _exponential(block)
+    transition, summed = exponential[..., :n, :n], exponential[..., :n, n:] * base
+    with np.errstate(over="ignore", invalid="ignore"):
+        for level in range(int(doublings.max(initial=0))):
+            on = (doublings > level)[..., None, None]
+            summed = np.where(on, transition @ summed + summed, summed)
+            transition = np.where(on, transition @ transition, transition)
+    return np.asarray(summed)
+
+
+def _exponential(matrix: Array) -> Array:
+    from scipy.linalg import expm  # here: SciPy takes a while to import
+
+    return np.asarray(expm(matrix))
+
+
+def _norm_or_one(matrix: Array) -> float:
+    return float(np.linalg.norm(matrix)) or 1.0
+
+
+def _doublings(a: Array, times: Array) -> NDArray[np.int64]:
+    """Number of halvings of each time until the exponential is well conditioned."""
+    rate = _norm_or_one(a)
+    return np.maximum(np.ceil(np.log2(np.maximum(rate * times, 1.0))), 0.0).astype(np.int64)
