@@ -278,7 +278,6 @@ def admit_each(
     motions: Array,
     discs: Array,
     first: NDArray[np.int64],
-    brake: bool,
     reserve: float,
     proposals: Array,
     values: Array,
@@ -291,14 +290,13 @@ def admit_each(
         motions: Likewise, shape (n, 6).
         discs: All robots' discs, one after the other, shape (d, 3).
         first: Where each robot's discs begin, and the end, shape (n + 1,).
-        brake: Whether the backup manoeuvre brakes along the heading.
         reserve: The margin, m.
         proposals: (drive, turn), shape (n, 2).
         values: Written: as of `least_clearance`, m, shape (n,).
         admitted: Written: whether its proposal is admitted, shape (n,).
     """
     for i in range(len(motions)):
-        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve))
+        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], reserve))
         values[i] = at.value
         admitted[i] = admits(at, proposals[i, 0], proposals[i, 1])
 
@@ -309,7 +307,6 @@ def decide_each(
     motions: Array,
     discs: Array,
     first: NDArray[np.int64],
-    brake: bool,
     reserve: float,
     proposals: Array,
     chosen: NDArray[np.int64],
@@ -328,7 +325,7 @@ def decide_each(
     """
     for r in range(len(chosen)):
         i = chosen[r]
-        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve))
+        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], reserve))
         stage, side, normals, offsets = _decide(at, proposals[i], sides[i], detour, bounds[r], out[i])
         sides[i] = side
         if single:
