@@ -18,7 +18,6 @@ from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import resume
 from safe_wrappers.train.run.data_pickles import read_pickle
 from safe_wrappers.train.run.stack import make_vec_env
-from safe_wrappers.train.run.start import policy_of_file
 from safe_wrappers.train.run.training import train_run
 
 
@@ -83,7 +82,6 @@ def test_a_policy_that_would_run_something_is_refused(run, fake_experiment, tmp_
     for use in (
         lambda: load_policy(folder),
         lambda: enjoy_command(str(folder), 1, "trained", False, None, Console(quiet=True)),
-        lambda: policy_of_file(checkpoint / "model.zip"),
         lambda: train_run(longer, 0, folder, Reports().progress),
     ):
         with pytest.raises(RunStateError, match=rf"{name}' is refused: its pickle names pathlib\.Path"):
