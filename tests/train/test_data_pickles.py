@@ -12,7 +12,6 @@ from test_run import Reports
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.diagnose import of_file
 from safe_wrappers.train.enjoy import enjoy_command
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import resume
@@ -63,15 +62,6 @@ def poison(checkpoint, name, payload):
                 archive.writestr(part, content)
     else:
         path.write_bytes(pickle.dumps(payload))
-
-
-def test_a_file_to_diagnose_that_would_run_something_is_refused(run, tmp_path):
-    _, _, checkpoint = run
-    assert of_file(checkpoint / "model.zip").num_timesteps == 32
-    poison(checkpoint, "model.zip", Touch(tmp_path / "made"))
-    with pytest.raises(RunStateError, match=r"model\.zip' is refused"):
-        of_file(checkpoint / "model.zip")
-    assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.parametrize("name", ["model.zip", "vecnormalize.pkl"])
