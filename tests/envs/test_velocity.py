@@ -15,8 +15,8 @@ from safe_wrappers.envs import VELOCITY_IDS
 from safe_wrappers.envs.velocity import make_velocity_env
 from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.plants.mujoco.contacts import evaluations
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
-from safe_wrappers.plants.mujoco.replay import evaluations
 
 PUBLISHED = {
     "HalfCheetah": 3.2096,
