@@ -25,13 +25,6 @@ def test_the_bound_is_the_smallest_score_that_enough_scores_do_not_exceed(rate, 
     assert allowed_misses(n, float(exact)) == math.floor((n + 1) * exact)
 
 
-def test_numbers_that_everybody_can_count():
-    assert scores_needed(0.1) == 9 and scores_needed(0.05) == 19 and scores_needed(0.5) == 1
-    assert upper_bound(np.arange(9.0), 0.1) == 8.0
-    assert upper_bound(np.arange(19.0), 0.1) == 17.0
-    assert upper_bound(np.arange(8.0), 0.1) == math.inf
-
-
 def test_what_is_no_number_counts_as_infinite():
     assert upper_bound(np.array([np.nan, 1.0, 2.0]), 0.5) == 2.0
     assert upper_bound(np.array([np.nan, np.nan, 2.0]), 0.5) == math.inf
