@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from substep_costs import check_costs
 
-from safe_wrappers.envs.goal.car import CAR
+from safe_wrappers.envs.goal_robots import CAR
 
 EMPTY = {"hazards": [], "vases": []}
 

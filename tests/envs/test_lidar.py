@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.envs.goal.lidar import LIDAR_BINS, LIDAR_RANGE, pseudo_lidar
+from safe_wrappers.envs.goal_robots import LIDAR_BINS, LIDAR_RANGE, pseudo_lidar
 
 coordinate = st.floats(-4, 4, allow_nan=False)
 objects = st.lists(st.tuples(coordinate, coordinate, st.integers(0, 2)), max_size=12)

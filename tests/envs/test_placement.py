@@ -3,9 +3,16 @@ import itertools
 import numpy as np
 import pytest
 
-from safe_wrappers.envs.goal.layout import PartialLayout
-from safe_wrappers.envs.goal.levels import AGENT_KEEPOUT, GOAL_KEEPOUT, HAZARD_KEEPOUT, LEVELS, VASE_KEEPOUT
-from safe_wrappers.envs.goal.placement import sample_goal, sample_layout
+from safe_wrappers.envs.goal_layout import (
+    AGENT_KEEPOUT,
+    GOAL_KEEPOUT,
+    HAZARD_KEEPOUT,
+    LEVELS,
+    VASE_KEEPOUT,
+    PartialLayout,
+    sample_goal,
+    sample_layout,
+)
 from safe_wrappers.errors import ConfigurationError
 
 KEEPOUTS = {"agent": AGENT_KEEPOUT, "goal": GOAL_KEEPOUT, "hazards": HAZARD_KEEPOUT, "vases": VASE_KEEPOUT}

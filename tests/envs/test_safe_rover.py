@@ -13,9 +13,8 @@ from scipy.integrate import solve_ivp
 
 from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.envs import EPISODE_STEPS, SAFE_ROVER_ID
-from safe_wrappers.envs.ground import GROUNDS, MAGIC_FORMULA, Ground, Patch
+from safe_wrappers.envs.ground import GROUNDS, MAGIC_FORMULA, SLOWEST, Ground, Patch, tyre_force
 from safe_wrappers.envs.safe_rover import WHEELS
-from safe_wrappers.envs.tyre import SLOWEST, tyre_force
 from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
 
 G = 9.81

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 
-from safe_wrappers.envs import VELOCITY_IDS
+from safe_wrappers.envs import SPEED_LIMITS, VELOCITY_IDS
 from safe_wrappers.envs.velocity import make_velocity_env
-from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.mujoco.replay import evaluations
