@@ -84,24 +84,19 @@ class Ground:
 
     def __init__(self, base: str, patches: Sequence[Patch]) -> None:
         self.base, self.patches = base, tuple(patches)
-        self._base = MAGIC_FORMULA[base]
-        self._discs = [(*p.center, p.radius**2, p) for p in reversed(self.patches)]
+        self._discs = [(*p.center, p.radius**2, p.ground) for p in reversed(self.patches)]
 
     def at(self, x: float, y: float) -> str:
         """Name of the ground at a point, m."""
-        for cx, cy, square, patch in self._discs:
+        for cx, cy, square, ground in self._discs:
             dx, dy = x - cx, y - cy
             if dx * dx + dy * dy <= square:
-                return patch.ground
+                return ground
         return self.base
 
     def curve_at(self, x: float, y: float) -> MagicFormula:
         """Traction curve at a point, m."""
-        for cx, cy, square, patch in self._discs:
-            dx, dy = x - cx, y - cy
-            if dx * dx + dy * dy <= square:
-                return MAGIC_FORMULA[patch.ground]
-        return self._base
+        return MAGIC_FORMULA[self.at(x, y)]
 
 
 SLOWEST: Final = 0.5
