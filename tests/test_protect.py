@@ -148,7 +148,7 @@ def test_a_car_keeps_clear_of_vases_with_its_outline_where_they_cost():
 
 
 def test_the_cars_outline_encloses_every_geom():
-    from safe_wrappers.control.numerics.planar import distance_to_outline
+    from safe_wrappers.control.numerics.shapes import distance_to_outline
 
     env = gym.make("SafeCarGoal1-v0").unwrapped
     env.reset(

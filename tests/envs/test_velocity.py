@@ -13,7 +13,7 @@ from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from safe_wrappers.envs import SPEED_LIMITS, VELOCITY_IDS
 from safe_wrappers.envs.velocity import make_velocity_env
 from safe_wrappers.errors import UnknownNameError
-from safe_wrappers.plants.mujoco.replay import evaluations
+from safe_wrappers.plants.mujoco.contacts import evaluations
 
 PUBLISHED = {
     "HalfCheetah": 3.2096,

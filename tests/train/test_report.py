@@ -194,7 +194,7 @@ def test_infeasible_steps_constraints_and_what_was_left_out(fake_experiment):
         "of 400 steps 100 were infeasible and 0 ran the fallback",
         "Where violations were: unfiltered, filter off",
         "Where the filter stepped in: filtered",
-        "From the first 10,000 steps of each run; 28 more were evaluated but not kept.",
+        "From the first 20,000 steps of each run; 28 more were evaluated but not kept.",
         "In training 20 steps were infeasible and 20 ran the fallback, of 2,000.",
         "filtered trained through the filter, learner adaption_penalty",
         "TMLR 2023: filtered adaption_penalty",

@@ -9,8 +9,7 @@ from rich.console import Console
 
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train.evaluation.episode_selection import shown_episode
-from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
-from safe_wrappers.train.evaluation.scene import load_scene
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.run import Progress, train_run
@@ -84,7 +83,7 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             video = load_video(video_path(experiment, arm, condition))
             rows = read_rows(evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.csv")
             frames = Image.open(io.BytesIO(video.animation))
-            scenes = evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.npz"
+            log = evaluated_steps(experiment.run_folder(arm, 0), condition)
             seeds = (shown.episode_seed, shown.worst_seed)
             for side, ((said_title, length, count), seed) in enumerate(
                 zip(video.episodes, seeds, strict=True)
@@ -102,7 +101,10 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
                 dot = np.argwhere(red - green > 100).mean(axis=0)[::-1]
                 # Where this episode starts, to half a pixel of the task's.
                 start = (
-                    ((load_scene(scenes, seed).agent[0] * (20, 15) + (40, 30)).astype(int) + 0.5)
+                    (
+                        (log.coordinates[log.episode_seed == seed][0, :2] * (20, 15) + (40, 30)).astype(int)
+                        + 0.5
+                    )
                     * HEIGHT
                     / 60
                 )

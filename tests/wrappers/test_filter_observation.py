@@ -9,7 +9,7 @@ from worlds import Cart, SpeedRow, cart_plant
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.control.numerics.planar import nearest_discs, squashed
+from safe_wrappers.control.numerics.shapes import nearest_discs, squashed
 
 LOOKED_AT = ("SafePointGoal1-v0", "SafeCarGoal2-v0", "InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5")
 

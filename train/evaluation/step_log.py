@@ -19,8 +19,8 @@ from safe_wrappers.checks import Array
 
 from ..files import write_bytes
 
-MOST_STEPS: Final = 10_000
-"""Steps kept of one run under one condition: the first ones. Ten episodes of 1000 steps; 0.1 to 4 MB."""
+MOST_STEPS: Final = 20_000
+"""Steps kept of one run under one condition: the first ones. Twenty episodes of 1000 steps; 0.2 to 8 MB."""
 
 
 @dataclass(frozen=True)
@@ -143,27 +143,45 @@ def _joint_names(model: Any) -> list[str]:
     return names
 
 
+def _published(env: gym.Env[Any, Any], name: str) -> Any:
+    """A number, a place or places of a task, as plain data; an empty list where it publishes none."""
+    return np.asarray(getattr(env.unwrapped, name, []), dtype=float).tolist()
+
+
 class StepRecorder:
     """Collects an evaluation's steps; keys that no filter wrote count as "did nothing".
 
     Args:
         env: The whole stack.
+
+    Attributes:
+        places: Of each episode, by its seed, what a task seen from above publishes: where hazards and vases were at
+            its start, each place that the goal was at, and their radii; lists of [x, y], m.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env = env
         self._rows: dict[str, list[Any]] = {name: [] for name in _PER_STEP}
         self._left_out = 0
+        self.places: dict[int, dict[str, Any]] = {}
 
     def begin(self, episode_seed: int) -> None:
         """An episode has been reset."""
         # Only now: some tasks do not know where they are before their first reset.
         self._names, self._read = coordinates_of(self._env)
         self._episode_seed, self._step = episode_seed, 0
+        if np.size(_published(self._env, "agent_position")):
+            found = {what: _published(self._env, f"{what}_positions") for what in ("hazard", "vase")}
+            radii = {f"{what}_radius": _published(self._env, f"{what}_radius") for what in ("hazard", "goal")}
+            self.places[episode_seed] = found | radii | {"goal": []}
 
     def before(self, observation: Any) -> None:
         """Takes down the state in which the next step begins."""
         self._coordinates = self._read(observation)
+        if self._episode_seed in self.places:
+            goal, goals = _published(self._env, "goal_position"), self.places[self._episode_seed]["goal"]
+            if goal and goals[-1:] != [goal]:
+                goals.append(goal)
 
     def after(self, action: Any, info: dict[str, Any]) -> None:
         """Takes down what the step did.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +18,6 @@ from ..config import ExperimentConfig
 from ..evaluation.episode_selection import compared_pairs, shown_episode
 from ..evaluation.evaluate import evaluated_steps, evaluation_folder
 from ..evaluation.metrics import OF_THE_FILTER, REGISTRY
-from ..evaluation.scene import load_scene
 from ..evaluation.step_log import MOST_STEPS, StepLog, pool
 from ..evaluation.summary import (
     SEEDS_FOR_AN_INTERVAL,
@@ -37,18 +36,9 @@ from .drawing import Picture, color_of, data_uri
 from .figures import CONDITIONS, curve_picture, over_the_episode, plane_picture, refusals
 from .tables import RUN_COLUMNS, SHORT, every_metric, run_rows, short_rows
 from .verdict import compare, percent, verdict
-from .where import place_pictures, scene_picture
+from .where import Scene, place_pictures, scene_pictures
 
-_PACKAGES: Final = (
-    "safe-wrappers",
-    "gymnasium",
-    "mujoco",
-    "stable-baselines3",
-    "torch",
-    "numpy",
-    "qpsolvers",
-    "daqp",
-)
+_PACKAGES: Final = ("safe-wrappers", "gymnasium", "mujoco", "stable-baselines3", "torch", "numpy", "daqp")
 _CURVES: Final = {
     "return": ("Return", "return per episode"),
     "cost": ("Cost", "cost per episode"),
@@ -113,7 +103,7 @@ def write_report(
             for condition, words in CONDITIONS.items()
             if (video := load_video(video_path(experiment, arm, condition))) is not None
         ],
-        scenes=list(_scenes(experiment)),
+        scenes=_scenes(experiment),
         plane=plane_picture(summary, names) if summary.judged else None,
         acting=acting,
         interventions=[] if not acting else [
@@ -132,7 +122,7 @@ def write_report(
         learners={arm.name: arm.learner.kind for arm in experiment.arms if arm.filter.kind != "none"},
         registry=REGISTRY,
         command=command,
-        versions=list(_versions()),
+        versions=[("python", platform.python_version()), *((each, version(each)) for each in _PACKAGES)],
         settings=yaml.safe_dump(values | {"arms": list(values["arms"])}, sort_keys=False),
         every=list(every_metric(experiment, summary)),
     )  # fmt: skip
@@ -184,22 +174,26 @@ def _places(experiment: ExperimentConfig, acting: dict[str, StepLog]) -> Iterato
             yield from place_pictures(filtered.name, acting[filtered.name], bare.name, off.get(bare.name))
 
 
-def _scenes(experiment: ExperimentConfig) -> Iterator[Picture]:
+def _scenes(experiment: ExperimentConfig) -> list[Picture]:
     """The shown episode seen from above, for tasks that publish where things are."""
     shown = shown_episode(experiment)
     pair = next(iter(compared_pairs(experiment)), None)
-    wanted, found = [(experiment.arms[0], "filter_off")], []
+    wanted = [(experiment.arms[0], "filter_off")]
     if pair is not None:
         wanted = [(pair.bare, "filter_off"), (pair.filtered, "filter_on")]
+    scenes = []
     for arm, condition in wanted if shown is not None else ():
         assert shown is not None
-        path = evaluation_folder(experiment.run_folder(arm, shown.seed)) / f"{condition}.npz"
-        scene = load_scene(path, shown.episode_seed)
-        if scene is not None:
-            names = [each.name for each in experiment.arms]
+        folder = experiment.run_folder(arm, shown.seed)
+        places = read_json(evaluation_folder(folder) / f"{condition}_places.json").get(
+            str(shown.episode_seed)
+        )
+        log = evaluated_steps(folder, condition)
+        if places and log is not None and (log.episode_seed == shown.episode_seed).any():
+            color = color_of(arm.name, [each.name for each in experiment.arms])
             title = f"{arm.name}, filter {CONDITIONS[condition]}, from above"
-            found.append((title, scene, color_of(arm.name, names)))
-    yield from (scene_picture(*each, [scene for _, scene, _ in found]) for each in found)
+            scenes.append(Scene(title, color, log, log.episode_seed == shown.episode_seed, places))
+    return scene_pictures(scenes)
 
 
 def _film(video: Video) -> str:
@@ -234,12 +228,3 @@ def about(experiment: ExperimentConfig) -> str:
         f"{kinds}, {how_long} steps, {seeds} seed{'s' * (seeds > 1)}; evaluation on"
         f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed.{begun}"
     )
-
-
-def _versions() -> Iterator[tuple[str, str]]:
-    yield "python", platform.python_version()
-    for package in _PACKAGES:
-        try:
-            yield package, version(package)
-        except PackageNotFoundError:
-            continue
