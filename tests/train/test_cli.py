@@ -236,7 +236,7 @@ def test_errors_are_lines_and_not_tracebacks(tmp_path, capsys):
         (["env=Reachr-v5"], "Reachr-v5"),
         (["arms.filtered.filter={factory: 'nowhere:shield'}"], "cannot import 'nowhere'"),
         (["total_steps=-1"], "total_steps"),
-        (["arms.filtered.start_from=nowhere.zip"], "'nowhere.zip' is no model"),
+        (["arms.filtered.start_from=nowhere.zip"], "no file 'nowhere.zip'"),
     ],
 )
 def test_arms_that_cannot_be_made_are_refused_before_anything_starts(tmp_path, capsys, overrides, message):
