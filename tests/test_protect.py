@@ -17,7 +17,7 @@ from scipy.linalg import solve_discrete_are
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
+from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsafeStateWarning, UnsupportedEnvError
 
 RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]

@@ -90,7 +90,7 @@ def test_a_node_is_lost_and_its_run_goes_on_from_its_checkpoint_elsewhere(cluste
     told = console()
     train_experiment(experiment, told, "ray")
     loses.join()
-    assert "was lost on" in told.file.getvalue()
+    assert "was lost; begun again" in told.file.getvalue()
     for folder in folders:
         assert json.loads((folder / "finished.json").read_text())["timesteps"] == 8192
         rows = read_rows(folder / "episodes.csv")
