@@ -133,10 +133,10 @@ class _Problem(NamedTuple):
     @staticmethod
     def of(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> "_Problem":
         """Copied where compiled code would have to be compiled anew: strides, read-only memory."""
-        given = [part if part.flags.carray else part.copy() for part in (u, a, b, lo, hi)]
+        u, a, b, lo, hi = (part if part.flags.carray else part.copy() for part in (u, a, b, lo, hi))
         m, k = u.size, b.size
-        sizes = np.empty(m), np.empty((3, k)), np.empty(m), np.empty((k, m)), np.empty(m + k), np.empty(m + k)
-        return _Problem(*given, *sizes)
+        program = np.empty(m), np.empty((k, m)), np.empty(m + k), np.empty(m + k)
+        return _Problem(u, a, b, lo, hi, np.empty(m), np.empty((3, k)), *program)
 
 
 @compiled
