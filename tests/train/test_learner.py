@@ -241,6 +241,7 @@ def test_another_learner_is_another_run(fake_experiment):
         ("{kind: both, penalty: -1}", [], "learner.penalty: .* greater than or equal to 0, got -1"),
         ("{penalty: 1}", [], "naive takes no penalty"),
         ("{kind: safe_action, penalty: 1}", [], "safe_action takes no penalty; adaption_penalty and both do"),
+        ("safe_action", ["algorithm=DQN", "hyperparameters={}"], "is for continuous actions, and DQN has"),
         ("{kind: both, penalty: 1, anchor: closest}", [], "both takes no anchor; safe_set_map does"),
         ("{kind: safe_set_map, anchor: brake}", [], "unknown name 'brake'"),
         ("safe_actions", [], "Did you mean 'safe_action'"),
