@@ -50,7 +50,7 @@ def in_process(monkeypatch):
 
 def rows(folder):
     with (folder / "fake" / "sweep" / "sweep.csv").open() as file:
-        return list(csv.DictReader(file))
+        return sorted(csv.DictReader(file), key=lambda row: int(row["trial"]))
 
 
 def test_the_command_searches_and_its_trials_are_ordinary_experiments(tmp_path, capsys):
