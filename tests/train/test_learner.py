@@ -77,7 +77,7 @@ KINDS = {
     "naive": "naive",
     "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}}}",
     "safe_action": "safe_action",
-    "both": f"{{kind: both, penalty: {PENALTY}, per_correction: 1.0, per_squared: 2.0, bounded: 3.0, scale: 0.5}}",
+    "both": f"{{kind: both, penalty: {PENALTY}, per_correction: 1.0}}",
 }
 TAKEN = [("SAC", kind) for kind in KINDS] + [("PPO", "naive"), ("PPO", "adaption_penalty")]
 
@@ -114,8 +114,7 @@ def test_training_has_what_the_kind_says_and_the_rows_have_the_tasks_return(
     if arm.learner.penalised:
         paid, own = np.array(watch.paid), [[i[keys.ADAPTION_TASK_REWARD] for i in row] for row in infos]
         corrections = np.array([[info[keys.CBF_CORRECTION] for info in row] for row in infos])
-        by_size = corrections + 2.0 * corrections**2 + 3.0 * (1.0 - np.exp(-((corrections / 0.5) ** 2)))
-        charged = changed * (PENALTY + by_size * (kind == "both"))
+        charged = changed * (PENALTY + corrections * (kind == "both"))
         np.testing.assert_allclose(paid, np.array(own) - charged, rtol=1e-5)
     else:
         assert keys.ADAPTION_PENALTY not in infos[0, 0]
@@ -242,12 +241,11 @@ def test_another_learner_is_another_run(fake_experiment):
         ("{kind: both, penalty: -1}", [], "learner.penalty: .* greater than or equal to 0, got -1"),
         ("{penalty: 1}", [], "naive takes no penalty"),
         ("{kind: safe_action, penalty: 1}", [], "safe_action takes no penalty; adaption_penalty and both do"),
-        ("{kind: both, penalty: 1, scale: 2}", [], "scale belongs to bounded"),
+        ("safe_action", ["algorithm=DQN", "hyperparameters={}"], "is for continuous actions, and DQN has"),
         ("{kind: both, penalty: 1, anchor: closest}", [], "both takes no anchor; safe_set_map does"),
         ("{kind: safe_set_map, anchor: brake}", [], "unknown name 'brake'"),
         ("safe_actions", [], "Did you mean 'safe_action'"),
         ("safe_set_map", ["arms.a.filter=none"], "without a filter no action is ever changed"),
-        ("{kind: both, bounded: 1, scale: 0}", [], "learner.scale: .* greater than 0, got 0"),
         ("safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("safe_action", ["hyperparameters.n_steps=3"], "have one-step returns"),
         (
@@ -273,9 +271,6 @@ def test_the_stack_puts_the_penalty_outside_recorder_and_monitor(fake_experiment
     env = make_stack(arm.env, arm.filter, arm.learner)
     assert isinstance(env, sw.AdaptionPenalty)
     assert {name: getattr(env, name) for name in arm.learner.penalties} == arm.learner.penalties
-    assert arm.learner.penalties == {
-        "penalty": PENALTY, "per_correction": 1.0, "per_squared": 2.0, "bounded": 3.0, "scale": 0.5
-    }  # fmt: skip
     assert isinstance(env.env, Monitor) and isinstance(env.env.env, sw.RecordInterventions)
     assert isinstance(make_stack(arm.env, arm.filter), Monitor)
     with pytest.raises(ConfigurationError, match="AdaptionPenalty needs a CBFActionFilter inside"):

@@ -43,14 +43,6 @@ def test_every_kind_is_listed_and_each_by_itself(tmp_path, monkeypatch, capsys):
     assert listed(capsys, "wrappers") == {"wrappers": found["wrappers"]}
 
 
-def test_wrappers_are_those_that_are_exported_with_what_they_do(capsys):
-    (found,) = listed(capsys, "wrappers").values()
-    assert {"CBFActionFilter", "VectorCBFActionFilter", "StuckEscape", "faults.Outages"} <= set(found)
-    for name, words in found.items():
-        assert words.endswith(".") or len(words) > 20, name
-        assert name.startswith("faults.") or name in sw.__all__
-
-
 def test_envs_can_be_made_and_those_with_a_recipe_protected(capsys):
     (found,) = listed(capsys, "envs").values()
     own = [name for name, words in found.items() if words == "of this library"]

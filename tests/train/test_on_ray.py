@@ -111,19 +111,6 @@ def test_failures_and_messages_come_back(cluster):
     assert "good: done" in told.file.getvalue()
 
 
-def test_a_run_that_nobody_wants_saves_and_ends(cluster, fake_experiment):
-    from safe_wrappers.train.experiment import training_jobs
-
-    experiment = fake_experiment("total_steps=2000000", "checkpoint_every=1000000", "seeds=[0]")
-    arm = experiment.arms[1]
-    folder = experiment.run_folder(arm, 0)
-    jobs = training_jobs(experiment, [arm])
-    run_jobs(
-        jobs, 1, console(), "T", unwanted=lambda _: len(read_rows(folder / "episodes.csv")) > 20, on="ray"
-    )
-    assert list(folder.glob("checkpoints/step_*"))
-
-
 @pytest.mark.slow
 def test_a_sweep_tries_on_a_cluster_what_it_tries_here(cluster, tmp_path):
     pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")

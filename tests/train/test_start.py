@@ -80,16 +80,11 @@ def test_an_off_policy_policy_goes_on_too(fake_experiment):
     assert all(torch.allclose(ours[k], v, atol=1e-6) for k, v in theirs.items() if "target" not in k)
 
 
-def test_the_arm_is_trained_first_that_another_begins_with(fake_experiment):
-    experiment = fake_experiment("arms.unfiltered.start_from=filtered", "seeds=[0]")
-    assert [arm.name for arms in generations(experiment) for arm in arms] == ["filtered", "unfiltered"]
-
-
 @pytest.mark.parametrize(
     ("overrides", "error", "words"),
     [
         (["arms.filtered.start_from=unfilterd"], UnknownNameError, "Did you mean 'unfiltered'"),
-        ([TUNED, "arms.unfiltered.start_from=filtered"], ConfigurationError, "no arm can be trained first"),
+        (["arms.unfiltered.start_from=filtered"], UnknownNameError, "an arm before this one"),
         ([TUNED, "arms.unfiltered.algorithm=A2C"], ConfigurationError, "trained with A2C, this arm with PPO"),
         (["start_from=unfiltered"], UnknownNameError, "start_from"),
     ],

@@ -92,7 +92,7 @@ class LearnerConfig(Section):
 
     text_is: ClassVar[str] = "kind"
     _PENALISED: ClassVar = ("adaption_penalty", "both")
-    _PENALTIES: ClassVar = ("penalty", "per_correction", "per_squared", "bounded", "scale")
+    _PENALTIES: ClassVar = ("penalty", "per_correction")
 
     kind: Literal["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"] = "naive"
     """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ. `safe_set_map` is a
@@ -101,12 +101,6 @@ class LearnerConfig(Section):
     """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
     """For the same: taken off per unit of correction."""
-    per_squared: Annotated[Number, Field(ge=0)] = 0.0
-    """For the same: taken off per squared unit of correction."""
-    bounded: Annotated[Number, Field(ge=0)] = 0.0
-    """For the same: taken off times `1 - exp(-(correction / scale)^2)`, so that no correction costs more."""
-    scale: Annotated[Number, Field(gt=0)] = 1.0
-    """Of `bounded`, in action units."""
     anchor: Literal["centre", "backup", "closest"] = "centre"
     """For `safe_set_map`."""
     margin_curriculum: MarginCurriculumConfig | None = None
@@ -121,18 +115,14 @@ class LearnerConfig(Section):
 
     @model_validator(mode="after")
     def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
-        given = bool(self.penalty or self.per_correction or self.per_squared or self.bounded)
+        given = bool(self.penalty or self.per_correction)
         if self.penalised and not given:
             raise ConfigurationError(
                 f"{self.kind} needs a penalty in units of the task's reward, per changed step or by the size of the"
-                f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction, per_squared or bounded."
+                f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction."
             )
         if given and not self.penalised:
             raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
-        if self.scale != 1.0 and not self.bounded:
-            raise ConfigurationError(
-                f"scale belongs to bounded: {{kind: {self.kind}, bounded: 0.1, scale: 0.5}}."
-            )
         if self.multiplier_rate != LearnerConfig.multiplier_rate and self.cost_limit is None:
             raise ConfigurationError(
                 "multiplier_rate belongs to cost_limit: {cost_limit: 25, multiplier_rate: 0.001}."

@@ -64,8 +64,9 @@ def begin_with(model: BaseAlgorithm, where: str, name: str, path: Path) -> dict[
             f"{refusal} has learned from observations of another scaling (normalize.observation; of a file in"
             f" {NORMALIZE} beside it)"
         )
+    weights: Any = parameters["policy"]
     try:
-        model.policy.load_state_dict(parameters["policy"])
+        model.policy.load_state_dict(weights)
     except RuntimeError as error:  # torch names the weights that differ
         raise ConfigurationError(f"{refusal} has other weights (policy, policy_kwargs): {error}") from None
     if scaling is not None:

@@ -439,6 +439,8 @@ def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upp
 def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
     """The x in the box that minimises `|a x - b|^2`, shape (n,); `a` has full column rank."""
     hessian, linear, n = a.T @ a, -(a.T @ b), len(lower)
+    if not n:
+        return np.zeros(0)
     clipped = np.clip(np.linalg.solve(hessian, -linear), lower, upper)
     unit = float(np.abs(clipped).max()) or 1.0
     bounds = np.minimum(upper / unit, _UNBOUNDED), np.maximum(lower / unit, -_UNBOUNDED)
