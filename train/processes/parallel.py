@@ -144,8 +144,10 @@ class _Shown:
 
     def update(self, name: str, kind: str, told: Any) -> None:
         """A job's `steps` or `figures`."""
-        figures = {} if kind == "steps" else {"figures": ", ".join(f"{key} {told[key]}" for key in told)}
-        self.bars.update(self._tasks[name], completed=told if kind == "steps" else None, **figures)
+        if kind == "steps":
+            self.bars.update(self._tasks[name], completed=told)
+        else:
+            self.bars.update(self._tasks[name], figures=", ".join(f"{key} {told[key]}" for key in told))
 
     def end(self, name: str, how: str) -> None:
         self.bars.remove_task(self._tasks.pop(name))
