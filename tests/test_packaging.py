@@ -121,7 +121,6 @@ def test_metadata(wheel):
         "mujoco",
         "numba",
         "pillow",
-        "qpsolvers",
         "daqp",
         "clarabel",
         "ruckig",
