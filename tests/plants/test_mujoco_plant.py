@@ -233,15 +233,6 @@ def test_clamped_sums_of_forces_are_refused():
         bound(Scene(nameless))
 
 
-@pytest.mark.parametrize("option", ['actuatorgroupdisable="2"', '><flag actuation="disable"/></option'])
-def test_a_disabled_actuator_is_refused(option):
-    xml = scene('<actuator><motor name="off" joint="hinge" group="2"/></actuator>').xml
-    closed = "" if "flag" in option else "/"
-    disabled = xml.replace('gravity="0 0 0"/>', f'gravity="0 0 0" {option}{closed}>')
-    with pytest.raises(UnsupportedEnvError, match="'off' is disabled"):
-        bound(Scene(disabled))
-
-
 def test_an_integrator_that_mixes_forces_and_steps_is_refused():
     env = gym.make("Reacher-v5")
     for integrator in range(4):
