@@ -96,7 +96,7 @@ def test_the_wheel_has_every_module_and_asset_of_the_repository(wheel):
         ("train", "safe_wrappers/train"),
     ):
         for path in (ROOT / folder).rglob("*"):
-            if path.suffix in (".py", ".xml") or path.name == "py.typed":
+            if path.suffix in (".py", ".xml", ".html") or path.name == "py.typed":
                 assert f"{inside}/{path.relative_to(ROOT / folder).as_posix()}" in names, path
     assert sum(n.startswith("safe_wrappers/envs/assets/") and n.endswith(".xml") for n in names) >= 5
 
@@ -121,7 +121,6 @@ def test_metadata(wheel):
         "mujoco",
         "numba",
         "pillow",
-        "qpsolvers",
         "daqp",
         "clarabel",
         "ruckig",

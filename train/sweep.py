@@ -121,7 +121,7 @@ class Space:
         self.distributions = {key: self._checked(key, given) for key, given in self.config.parameters.items()}
 
     def trial(self, name: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], ExperimentConfig]:
-        """The experiment of a trial, as settings and checked: the ranked arm, and those that it begins with.
+        """The experiment of a trial, as settings and checked: the ranked arm, after those that it begins with.
 
         Raises:
             ConfigurationError: The values do not go together.
@@ -140,9 +140,10 @@ class Space:
             arms[arm.name] = settings["arms"][arm.name]
             arm = self.experiment.begins_with(arm)
         output = self.experiment.folder / FOLDER
+        arms = dict(reversed(arms.items()))  # those first that others begin with
         settings |= {"arms": arms, "evaluation": evaluation, "name": name, "output": str(output)}
         experiment = parse_experiment(settings)
-        if _FILTERED not in conditions(experiment.arms[0], experiment.evaluation_filter):
+        if _FILTERED not in conditions(experiment.arms[-1], experiment.evaluation_filter):
             raise ConfigurationError(
                 "trials are ranked by their return with the filter on, and there is no filter; give an arm or the"
                 " evaluation one (evaluation: {filter: protect})."
@@ -281,7 +282,7 @@ def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: st
     run(evaluation_jobs, {name: found.arms for name, (_, found) in attempts.items()}, "Evaluation of trials")
     for name, (trial, experiment) in attempts.items():
         write_cards(experiment)
-        arm = experiment.arms[0].name
+        arm = experiment.arms[-1].name
         rows = [
             row
             for row in summarize_experiment(experiment).per_seed

@@ -16,7 +16,6 @@ from safe_wrappers.control.estimation.dead_reckoning import (
     rigid_transform,
     to_sensor,
 )
-from safe_wrappers.errors import ConfigurationError
 
 SPINNING = """
 <mujoco>
@@ -133,22 +132,3 @@ def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
     np.testing.assert_allclose(seen, pose.inv().apply(points), atol=1e-12)
     np.testing.assert_allclose(from_sensor(seen, rotation, origin), points, atol=1e-12)
     np.testing.assert_allclose(to_sensor(points[2], rotation, origin), seen[2], atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("rotation", "position", "words"),
-    [
-        (np.diag([1.0, 1.0, -1.0]), np.zeros(3), r"determinant \+1 \(here -1"),
-        (2.0 * np.eye(3), np.zeros(3), "off by up to 3"),
-        (np.eye(3) + 1e-4, np.zeros(3), "expected a rotation"),
-        (np.zeros((3, 3)), np.zeros(3), "expected a rotation"),
-        (np.eye(2), np.zeros(3), r"got \(2, 2\) and \(3,\)"),
-        (np.eye(3), np.zeros(2), r"got \(3, 3\) and \(2,\)"),
-        (np.eye(3), np.zeros((2, 3)), "or n of each"),
-        (np.full((3, 3), np.nan), np.zeros(3), "rotation must be finite"),
-        (np.eye(3), [0.0, np.inf, 0.0], "position must be finite"),
-    ],
-)
-def test_what_is_no_pose_is_refused(rotation, position, words):
-    with pytest.raises(ConfigurationError, match=words):
-        rigid_transform(rotation, position)
