@@ -47,16 +47,6 @@ PATROLS_AT_ONCE: dict[str, Any] = PATROLLED | {
 }
 """Of PatrolledPointMaze, told that a patrol turns about within a quarter of a second."""
 
-PATROLS_TURNING: dict[str, Any] = PATROLLED | {
-    "tracks": [PATROLLED["tracks"][0] | {"turn_noise": 1.0, "start_turn_std": 0.5}]
-}
-"""Of PatrolledPointMaze, told that a patrol turns as a car does. No turn rate leads it back on its own line."""
-
-PATROLS_TURNING_AT_ONCE: dict[str, Any] = PATROLLED | {
-    "tracks": [PATROLS_AT_ONCE["tracks"][0] | {"turn_noise": 1.0, "start_turn_std": 0.5}]
-}
-"""Both."""
-
 
 def crossing(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
     """OccludedCrossing with its cars tracked."""

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, panels
 from safe_wrappers.checks import Array
-from safe_wrappers.control.estimation.covariance import blind_time, discretise
+from safe_wrappers.control.estimation.covariance import discretise
 
 P0 = np.diag([0.05**2, 0.15**2])
 INTENSITY = 0.0225
@@ -24,7 +24,7 @@ def draw() -> Figure:
     for k in (3, 2, 1):
         left.fill_between(times, -k * sigma, k * sigma, color=ON, alpha=0.16, lw=0)
         left.text(times[-1] + 0.06, k * sigma[-1], rf"{k} $\sigma$", color=ON, va="center")
-    expiry = blind_time(P0, A, Q, [1.0, 0.0], TOLERANCE, 3.0, 60.0)
+    expiry = np.interp(TOLERANCE / 3.0, sigma, times)
     for side in (-1.0, 1.0):
         left.axhline(side * TOLERANCE, color=FORBIDDEN, lw=1.2)
     left.text(0.05, TOLERANCE + 0.08, "tolerance", color=FORBIDDEN)
@@ -50,6 +50,5 @@ def draw() -> Figure:
 
 def _sigma(system: Array, times: Array) -> Array:
     """Of the position, from P0 on."""
-    step = discretise(system, Q, times)
-    grown = step.transition @ P0 @ step.transition.swapaxes(-1, -2) + step.noise
-    return np.asarray(np.sqrt(grown[:, 0, 0]))
+    steps = [discretise(system, Q, time) for time in times]
+    return np.sqrt([(step.transition @ P0 @ step.transition.T + step.noise)[0, 0] for step in steps])

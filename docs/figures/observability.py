@@ -29,9 +29,9 @@ def draw() -> Figure:
     )
     for label, a, q, color in systems:
         start = 0.05**2 * np.eye(len(a))
-        step = discretise(a, np.diag(q), times)
-        grown = step.transition @ start @ step.transition.swapaxes(-1, -2) + step.noise
-        left.plot(times, np.sqrt(grown[:, 0, 0]), color=color, label=label)
+        steps = [discretise(a, np.diag(q), time) for time in times]
+        grown = [(step.transition @ start @ step.transition.T + step.noise)[0, 0] for step in steps]
+        left.plot(times, np.sqrt(grown), color=color, label=label)
     left.set(ylim=(0.0, 2.6), xlabel="time unseen (s)", ylabel=r"$\sigma$")
     left.legend(loc="upper left")
     start = np.array([2.0, 1.5])

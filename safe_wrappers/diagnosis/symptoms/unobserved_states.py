@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits.joints import driven_joints
-from safe_wrappers.control.estimation.observability import Scaled, unobservable_subspace
+from safe_wrappers.control.estimation.observability import unobservable_subspace
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.linear_model import Linearised
 from safe_wrappers.diagnosis.recording import Env, Recording
@@ -65,8 +65,7 @@ def _tracked(env: Env, recording: Recording, step: int, data: mujoco.MjData) -> 
 
 def unseen(a: Array, c: Array) -> Array:
     """Orthonormal basis of what outputs C x of x+ = A x never show, shape (n, k); states in comparable units."""
-    n = len(a)
-    return unobservable_subspace(Scaled(a - np.eye(n), c, np.ones(n)), TOLERANCE)
+    return unobservable_subspace(a - np.eye(len(a)), c, TOLERANCE)
 
 
 def _relative(c: Array) -> Array:
