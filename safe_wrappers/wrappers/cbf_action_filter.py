@@ -52,7 +52,7 @@ class CBFActionFilter(LayerWrapper):
         margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
 
     Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
-    ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe``, ``cbf/mismatch`` (bool); ``cbf/correction``, ``cbf/clipped``,
+    ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe``, ``cbf/mismatch`` (bool); ``cbf/correction``,
     ``cbf/margin`` (float); ``cbf/stage`` (int); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
 
     Attributes:
@@ -211,7 +211,6 @@ class CBFActionFilter(LayerWrapper):
         # False for NaN too, so that one comparison clears the common case.
         inside = bool(((proposed >= self._low) & (proposed <= self._high)).all())
         finite = inside or bool(np.isfinite(proposed).all())
-        clipped = 0.0
         usable: Array | None = proposed
         if not (readable and finite):
             if readable:
@@ -222,7 +221,7 @@ class CBFActionFilter(LayerWrapper):
         elif not inside:
             usable = np.clip(proposed, self._low, self._high)
             clipped = float(np.linalg.norm(usable - proposed))
-            message = f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)"
+            message = f"the policy's action left the action space by {clipped:.3g}; it is boxed"
             self._warn_once("clipped", message)
         decision = self.filter.filter(usable)
         intervened = decision.changed
@@ -247,7 +246,6 @@ class CBFActionFilter(LayerWrapper):
             keys.CBF_MISMATCH: False,
             keys.CBF_REFUSED: none if decision.refused is None else decision.refused,
             keys.CBF_CORRECTION: correction,
-            keys.CBF_CLIPPED: clipped,
             keys.CBF_MARGIN: margin,
             keys.PROPOSED_ACTION: proposed,
             keys.EXECUTED_ACTION: executed.copy(),

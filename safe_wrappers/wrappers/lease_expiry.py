@@ -60,7 +60,7 @@ class LeaseExpiry(CommandGate):
         control_dt: Control interval, s; None reads the env's `dt`.
 
     Info, at every step: ``lease/remaining_s`` (float), ``lease/expired``, ``lease/refused``, ``lease/braking``
-    (bool); without a filter inside ``lease/clipped`` (float) and ``executed_action``.
+    (bool), and ``executed_action``.
 
     Raises:
         ConfigurationError: A missing or negative bound or time, a clearance that is neither, or a wrong order.
@@ -78,7 +78,6 @@ class LeaseExpiry(CommandGate):
     """
 
     layer: ClassVar = Layer.LEASE
-    clipped_key: ClassVar = keys.LEASE_CLIPPED
 
     _fallback: FallbackController
     _executed: Array | None
@@ -163,7 +162,7 @@ class LeaseExpiry(CommandGate):
     def step(self, action: Any) -> Step:
         """Execute the action under its lease, the command in force under its own, or the fallback."""
         given = action_array(action, self._shape)
-        self._measure(given, "policy's")
+        self._warn_outside(given, "policy's")
         now = self.now_s
         arrived, fresh, refused = self._accept(given, now)
         if fresh:

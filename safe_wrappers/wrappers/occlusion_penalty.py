@@ -53,7 +53,7 @@ class OcclusionPenalty(LayerWrapper):
             position from the sensor's body (m, world axes), velocity (m/s) and deviation along each axis (m).
 
     Info, at every step and at reset: ``occlusion/visible``, ``occlusion/expired`` (bool arrays, one per track),
-    ``occlusion/sigma`` (m, array), ``occlusion/penalty``, ``occlusion/task_reward`` (float).
+    ``occlusion/sigma`` (m, array), ``occlusion/penalty`` (float).
 
     Attributes:
         tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead.
@@ -188,7 +188,7 @@ class OcclusionPenalty(LayerWrapper):
             self.ego_motion.fix()
         self._start()
         info.update(self._look())
-        info[keys.OCCLUSION_PENALTY] = info[keys.OCCLUSION_TASK_REWARD] = 0.0
+        info[keys.OCCLUSION_PENALTY] = 0.0
         return self._observed(observation), info
 
     def step(self, action: Any) -> Step:
@@ -201,10 +201,9 @@ class OcclusionPenalty(LayerWrapper):
             self.ego_motion.advance(elapsed, self._random.draw.standard_normal(9))
         info.update(self._look())
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
-        info[keys.OCCLUSION_TASK_REWARD] = one_reward(reward, "OcclusionPenalty")
         info[keys.OCCLUSION_PENALTY] = penalty
         if penalty:
-            reward = float(reward) - penalty
+            reward = one_reward(reward, "OcclusionPenalty") - penalty
         return self._observed(observation), reward, terminated, truncated, info
 
     @property

@@ -251,7 +251,6 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         }
         if written.any():
             found[keys.CBF_CORRECTION] = np.linalg.norm(executed - proposed, axis=1)
-            found[keys.CBF_CLIPPED] = np.linalg.norm(boxed - proposed, axis=1)
         for key, values in found.items():
             reports[key][usual] = values[usual]
         return usual

@@ -44,7 +44,6 @@ def test_the_ceiling_is_the_appendixs_formula_less_one_step(env, speed, y):
     clearance = ROOM - y
     by_hand = (clearance - 0.002 - 0.003 - speed**2 / 48.0) / speed - (0.1 + 0.2 + 0.01) - HOLD
     assert looking.ceiling_s == pytest.approx(by_hand, abs=1e-9)
-    assert looking.clearance_m == pytest.approx(clearance)
 
 
 def test_what_recedes_or_stands_has_the_highest_ceiling_there_is(env):
@@ -97,7 +96,6 @@ def test_a_function_of_the_env_measures_as_well(env):
     for looking in (by_function, by_constraint):
         looking.look()
     assert by_function.ceiling_s == pytest.approx(by_constraint.ceiling_s)
-    assert by_function.clearance_m == pytest.approx(by_constraint.clearance_m)
     assert by_function.budget.can_stop_after(np.array([0.0, 1.0]), HOLD)
     place(env, (0.0, ROOM - 0.00102))
     by_function.look()  # it knows no command from another: none is admitted
@@ -111,7 +109,7 @@ def test_what_cannot_be_read_has_no_ceiling(env, answer):
     )
     env.reset(seed=0)
     looking.look()
-    assert not looking.readable and looking.ceiling_s == -1.0 and looking.clearance_m == 0.0
+    assert not looking.readable and looking.ceiling_s == -1.0
     assert not looking.budget.can_stop_after(np.zeros(2), HOLD)
 
 

@@ -39,7 +39,7 @@ def test_an_ideal_channel_is_no_channel(env_id):
     assert np.array_equal(seen, expected) and rewards == expected_rewards
     info = env.step(actions[0])[4]
     assert info["teleop/round_trip_s"] == 0.0 and info["teleop/ceiling_s"] == np.inf
-    assert not info["teleop/revoked"] and info["teleop/lost"] == info["teleop/late"] == 0
+    assert not info["teleop/revoked"] and info["teleop/lost"] == 0
 
 
 @pytest.mark.parametrize(("up", "down"), [(3, 0), (0, 5), (4, 2)])
@@ -97,57 +97,29 @@ def test_faults_and_recording_belong_outside():
     assert max(env.step(np.zeros(2))[4]["teleop/round_trip_s"] for _ in range(200)) > 0.003
 
 
-@pytest.mark.parametrize(("missing", "expected"), [("hold", 0.5), ("zero", 0.0), ("fallback", None)])
-def test_what_acts_while_nothing_arrives_is_declared(missing, expected):
-    env = channel(missing=missing)
-    place(env)
-    env.set_observation_time(None)
-    first = env.step(np.full(2, 0.5))[4]["executed_action"]
-    if missing != "fallback":
-        assert (first == 0.0).all()  # before the first command
-    for _ in range(30):
-        info = env.step(np.array([0.0, 0.5]))[4]
-    assert info["executed_action"][1] == 0.5
-    env.set_observation_time(None)
-    executed = env.step(np.full(2, 0.9))[4]["executed_action"]
-    if expected is None:
-        assert executed[1] < 0.0  # it brakes
-    else:
-        assert executed[1] == expected
-
-
 def test_overtaken_and_lost_packets_are_counted_and_the_newest_acts():
     env = channel(sw.teleop.Link(0.002, 0.01, 0.2, in_order=False), sw.teleop.Link(loss=0.1))
     place(env)
-    raw, lost, late, stamps = env.unwrapped, 0, 0, []
+    raw, lost, stamps = env.unwrapped, 0, []
     for k in range(1000):
         info = env.step(np.array([k * 1e-4, 0.0]))[4]
         stamps.append(info["executed_action"][0])
         lost += info["teleop/lost"]
-        late += info["teleop/late"]
     assert raw.data.time == pytest.approx(1.0)
     assert (np.diff(stamps) >= 0.0).all()  # never back to an older one
-    assert 240 < lost < 360 and late > 300
-    executed = len(set(stamps))
-    assert executed + late <= 1000 - 0.15 * 1000 + 5
+    assert 240 < lost < 360 and len(set(stamps)) < 550  # many are overtaken
 
 
 def test_links_and_operators_are_seeded_bit_for_bit():
     runs = []
     for seed in (0, 0, 1):
-        env = channel(sw.teleop.Link(0.01, 0.02, 0.1, False), sw.teleop.Link(0.01, 0.02, 0.1, False), seed=7)
+        env = channel(sw.teleop.Link(0.01, 0.02, 0.1, False), sw.teleop.Link(0.01, 0.02, 0.1, False))
         observation, _ = env.reset(seed=3)
         operator = TeleopOperator(seed)
         for _ in range(400):
             observation = env.step(operator.act(observation))[0]
         runs.append(observation)
     assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
-    late = [channel(sw.teleop.Link(0.0, 0.05), seed=seed) for seed in (0, 1)]
-    ages = []
-    for env in late:
-        env.reset(seed=0)
-        ages.append([env.step(np.zeros(2))[4]["teleop/round_trip_s"] for _ in range(100)])
-    assert ages[0] != ages[1]
 
 
 def test_the_observation_is_the_operators_own():
@@ -214,15 +186,6 @@ def refused(error=ConfigurationError, inside=None, env_id="TeleopContact-v0", ma
         ({"coding": "wave", "impedance": 0.0}, "impedance"),
         ({"coding": "wave", "impedance": -1.0}, "impedance"),
         ({"impedance": 40.0}, "plain coding"),
-        ({"coding": "wave", "impedance": 40.0, "passivity": "controller"}, "pay for"),
-        ({"passivity": "observer"}, "passivity is one of"),
-        ({"damping_limit": 5.0}, "controller"),
-        ({"storage_j": 0.1}, "controller"),
-        ({"passivity": "controller", "storage_j": -0.1}, "storage_j"),
-        ({"passivity": "controller", "damping_limit": 0.0}, "damping_limit"),
-        ({"missing": "wait"}, "missing is one of"),
-        ({"wave_rule": "wait"}, "wave_rule is one of"),
-        ({"seed": 0.5}, "seed"),
         ({"port": {"flow": [0]}}, "needs effort"),
         ({"port": {"flow": [0, 1], "effort": [4]}}, "as many"),
         ({"port": {"flow": [0, 0], "effort": [4, 5]}}, "once"),
@@ -254,7 +217,7 @@ def test_unknown_names_are_refused_with_those_there_are():
     refused(UnknownNameError, uplink={"delay": 0.1}, match="delay_s")
     refused(UnknownNameError, port={"flows": [0], "effort": [1]}, match="feedthrough")
     refused(UnknownNameError, ceiling={"budget": {"clearence": None}}, match="clearance")
-    refused(UnknownNameError, missing="fallback", fallback="stop", match="brake")
+    refused(UnknownNameError, ceiling=ceiling(), fallback="stop", match="brake")
 
 
 @pytest.mark.parametrize(
@@ -266,14 +229,13 @@ def test_ceilings_that_cannot_be_are_refused(changes):
         ceiling(**changes)
 
 
-def test_waves_and_controllers_need_a_port():
-    for options in ({"coding": "wave", "impedance": 10.0}, {"passivity": "controller"}):
-        refused(env_id="Reacher-v5", match="needs a port", **options)
+def test_waves_need_a_port():
+    refused(env_id="Reacher-v5", match="needs a port", coding="wave", impedance=10.0)
 
 
 def test_envs_that_do_not_fit_are_refused():
     refused(env_id="CartPole-v1", match="Box action space")
-    refused(UnsupportedEnvError, env_id="Pendulum-v1", missing="fallback", control_dt=0.05, match="MuJoCo")
+    refused(UnsupportedEnvError, env_id="Pendulum-v1", ceiling=ceiling(), control_dt=0.05, match="MuJoCo")
 
 
 def test_wrong_orders_are_refused():
@@ -301,4 +263,4 @@ def test_chunks_may_come_through_a_channel():
     for _ in range(20):
         info = env.step(np.full((8, 2), 0.1))[4]
     assert info["teleop/round_trip_s"] >= 0.004 and not info["teleop/revoked"]
-    assert isinstance(info["teleop/late"], int)
+    assert isinstance(info["teleop/lost"], int)
