@@ -1,6 +1,7 @@
-"""Golden traces: what every protected env did, step by step, before a change, compared bit for bit with today.
+"""Golden traces: what every protected env did, step by step, before a change, compared with today.
 
-    python -m benchmarks.golden_traces                    # compares all runs with tests/data/golden_traces.json
+    python -m benchmarks.golden_traces                    # bit for bit: all runs of tests/data/golden_traces.json
+    python -m benchmarks.golden_traces --behaviour        # what the filter did in each run, within a tolerance
     python -m benchmarks.golden_traces --envs Reacher     # of the envs whose name has one of these words
     python -m benchmarks.golden_traces --short            # the three envs of the default tests
     python -m benchmarks.golden_traces --write            # records what is compared from now on
@@ -12,6 +13,11 @@ each, so that a difference is found by field and by place and the file stays sma
 Bits depend on the processor's vector instructions and on the versions of the libraries. The command therefore runs
 with those instructions that every x86-64 processor of the last ten years has, and records versions and a probe of
 the arithmetic; where they are others than recorded, nothing is compared, and it says so (exit status 3).
+
+Behaviour is for changes of numerics, after which no bit stays: of each run the shares of changed, infeasible,
+fallback and unsafe steps, the violations by the env's judge, the mean correction and the return. A run behaves as
+before where each of them is within `TOLERANCES` (relative, absolute) plus the difference between the recorded runs
+of the same driver with other seeds, which is what chance alone changes. What is beyond is listed, with the totals.
 """
 
 import argparse
@@ -33,7 +39,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import mujoco_drivers as drivers
-from benchmarks.cases import CASES, PROTECTED
+from benchmarks.cases import CASES, PROTECTED, Case
 from benchmarks.mujoco_drivers import Maker
 from safe_wrappers.envs.teleop_contact import (
     CLAMP_Y,
@@ -55,6 +61,16 @@ SAME_BITS = {
 }
 """The environment in which the command runs itself."""
 NOT_COMPARABLE = 3
+TOLERANCES = {
+    "changed": (0.05, 0.01),
+    "infeasible": (0.1, 0.004),
+    "fallback": (0.1, 0.004),
+    "unsafe": (0.1, 0.004),
+    "violations": (0.0, 0.0),
+    "correction": (0.05, 0.005),
+    "return": (0.1, 0.5),
+}
+"""By figure: relative and absolute. Figures are per step, the correction (action units) is over all steps."""
 
 _ATTACKING = {
     "SafeCarGoal1-v0": "full throttle",
@@ -131,25 +147,29 @@ _STACKS: dict[str, Make] = {
 }
 
 
-def runs() -> dict[str, tuple[Make, dict[str, Maker]]]:
-    """By name: how to make the env, and its two drivers."""
-    found: dict[str, tuple[Make, dict[str, Maker]]] = {}
+def runs() -> dict[str, tuple[Make, dict[str, Maker], Case | None]]:
+    """By name: how to make the env, its two drivers, and the case whose judge it has."""
+    found: dict[str, tuple[Make, dict[str, Maker], Case | None]] = {}
     for name, case in PROTECTED.items():
         attacking = _ATTACKING.get(name, list(case.drivers)[-1])
         pair = {"random": case.drivers["random"], attacking: case.drivers[attacking]}
-        found[name] = (lambda case=case: case.protect(case.make()), pair)  # type: ignore[misc]
+        found[name] = (lambda case=case: case.protect(case.make()), pair, case)  # type: ignore[misc]
     disc = CASES["Reacher-v5, with a disc"]
     attack = {d: disc.drivers[d] for d in ("random", "disc-seeking")}
-    found[disc.name] = (lambda: disc.protect(disc.make()), attack)
+    found[disc.name] = (lambda: disc.protect(disc.make()), attack, disc)
     for name, make in _STACKS.items():
         pulse = CASES["SafePointGoal1-v0"].drivers["bang-bang"] if "PointGoal" in name else drivers.pulse
-        found[name] = (make, {"random": drivers.random, "pulse": pulse})
+        found[name] = (make, {"random": drivers.random, "pulse": pulse}, None)
     return found
 
 
-def trace(make: Make, driver: Maker, seed: int) -> dict[str, Any]:
-    """One run: what the filter did, counted, and the digests by field."""
+def trace(make: Make, driver: Maker, seed: int, case: Case | None = None) -> dict[str, Any]:
+    """One run: what the filter did, as `behaviour`, and the digests by field.
+
+    Violations are None where nobody judges: in stacks that execute several control steps at once.
+    """
     env = make()
+    judge = case.judge(env.unwrapped) if case is not None else None
     rng = np.random.default_rng(seed)
     # A chunk is asked of the driver command by command.
     commands = int(math.prod(env.action_space.shape or ())) // int(
@@ -158,19 +178,28 @@ def trace(make: Make, driver: Maker, seed: int) -> dict[str, Any]:
     act = driver(env.unwrapped, rng)
     digests: dict[str, Any] = {}
     lines: dict[str, list[str]] = {}
-    counts = dict.fromkeys(("intervened", "fallback", "infeasible"), 0)
+    sums = dict.fromkeys(TOLERANCES, 0.0)
     observation, info = env.reset(seed=seed)
+    if judge is not None:
+        judge.start()
     episode = seed * 1_000
     for step in range(STEPS):
         row = np.concatenate([np.asarray(act()) for _ in range(commands)])
         action = row.astype(env.action_space.dtype).reshape(env.action_space.shape)
+        if judge is not None:
+            judge.before()
         observation, reward, terminated, truncated, info = env.step(action)
+        if judge is not None:
+            sums["violations"] += not judge.after(info["executed_action"], info) <= 0.0
+        sums["changed"] += int(np.any(info.get("cbf/intervened", False)))
+        for name in ("infeasible", "fallback", "unsafe"):
+            sums[name] += int(np.any(info.get(f"cbf/{name}", False)))
+        sums["correction"] += float(np.max(info.get("cbf/correction", 0.0)))
+        sums["return"] += float(reward)
         now = {"observation": observation, "reward": reward, "over": [terminated, truncated], "info": info}
         for field, value in _numbers("", now):
             digest = digests.setdefault(field, hashlib.blake2b(digest_size=4))
             digest.update(f"{step} {value.dtype} {value.shape}".encode() + value.tobytes())
-        for name in counts:
-            counts[name] += int(np.any(info.get(f"cbf/{name}", False)))
         if (step + 1) % PER_DIGEST == 0:
             for field, digest in digests.items():
                 lines.setdefault(field, []).append(digest.hexdigest())
@@ -178,7 +207,11 @@ def trace(make: Make, driver: Maker, seed: int) -> dict[str, Any]:
             episode += 1
             env.reset(seed=episode)
     env.close()
-    return counts | {"digests": {field: " ".join(found) for field, found in sorted(lines.items())}}
+    behaviour: dict[str, float | None] = {name: round(total / STEPS, 6) for name, total in sums.items()}
+    if judge is None:
+        behaviour["violations"] = None
+    digests_by_field = {field: " ".join(found) for field, found in sorted(lines.items())}
+    return {"behaviour": behaviour, "digests": digests_by_field}
 
 
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
@@ -195,8 +228,8 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
 def _job(job: tuple[str, str, int]) -> tuple[str, dict[str, Any]]:
     warnings.simplefilter("ignore")
     name, driver, seed = job
-    make, by_name = runs()[name]
-    return f"{name}; {driver}; seed {seed}", trace(make, by_name[driver], seed)
+    make, by_name, case = runs()[name]
+    return f"{name}; {driver}; seed {seed}", trace(make, by_name[driver], seed, case)
 
 
 def arithmetic() -> dict[str, str]:
@@ -243,9 +276,48 @@ def differences(recorded: Mapping[str, Any], today: Mapping[str, Any]) -> list[s
     return found
 
 
+def misbehaviour(recorded: Mapping[str, Any], today: Mapping[str, Any]) -> list[str]:
+    """Where a run of today is beyond the tolerance of what was recorded, in words."""
+    found = []
+    for run, now in today.items():
+        if run not in recorded:
+            found.append(f"{run}: was not recorded")
+            continue
+        before = recorded[run]["behaviour"]
+        driver = run.rsplit("; ", 1)[0]
+        seeds = [other["behaviour"] for name, other in recorded.items() if name.startswith(f"{driver}; ")]
+        for figure, (relative, absolute) in TOLERANCES.items():
+            old, new = before[figure], now["behaviour"][figure]
+            if old is None or new is None:
+                if old != new:
+                    found.append(f"{run}: {figure} was {old}, is {new}")
+                continue
+            spread = max(abs(other[figure] - old) for other in seeds)
+            if abs(new - old) > relative * abs(old) + absolute + spread:
+                found.append(f"{run}: {figure} was {old:.4g}, is {new:.4g}")
+    return found
+
+
+def totals(recorded: Mapping[str, Any], today: Mapping[str, Any]) -> str:
+    """The means over all runs that both have, before and now."""
+    words = []
+    for figure in TOLERANCES:
+        both = [
+            (recorded[run]["behaviour"][figure], now["behaviour"][figure])
+            for run, now in today.items()
+            if run in recorded
+        ]
+        old, new = (
+            np.array([pair for pair in both if None not in pair], dtype=float).reshape(-1, 2).mean(axis=0)
+        )
+        words.append(f"{figure} {old:.5g} -> {new:.5g}")
+    return "means per step: " + ", ".join(words)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="golden_traces", description=__doc__.splitlines()[0])
     parser.add_argument("--write", action="store_true", help="record instead of comparing")
+    parser.add_argument("--behaviour", action="store_true", help="compare what the filter did, not bits")
     parser.add_argument("--short", action="store_true", help=f"only {', '.join(SHORT)}")
     parser.add_argument(
         "--envs", nargs="+", metavar="WORD", help="only envs whose name has one of these words"
@@ -266,7 +338,7 @@ def main() -> None:
         parser.error(f"no env has one of these words; there are: {'; '.join(runs())}")
     kept = json.loads(arguments.recorded.read_text()) if arguments.recorded.exists() else {}
     here = arithmetic()
-    if not arguments.write and kept.get("arithmetic") != here:
+    if not (arguments.write or arguments.behaviour) and kept.get("arithmetic") != here:
         print(f"not comparable: recorded with {kept.get('arithmetic')}, this is {here}")
         sys.exit(NOT_COMPARABLE)
     jobs = [(name, driver, seed) for name in chosen for driver in runs()[name][1] for seed in SEEDS]
@@ -284,8 +356,12 @@ def main() -> None:
         arguments.recorded.write_text(text + "\n")
         print(f"{len(today)} runs of {STEPS} steps recorded in {arguments.recorded}")
         return
-    found = differences(kept["runs"], today)
-    print("\n".join(found) if found else f"{len(today)} runs of {STEPS} steps are equal bit for bit")
+    if arguments.behaviour:
+        print(totals(kept["runs"], today))
+        found, equal = misbehaviour(kept["runs"], today), "behave as recorded, within the tolerance"
+    else:
+        found, equal = differences(kept["runs"], today), "are equal bit for bit"
+    print("\n".join(found) if found else f"{len(today)} runs of {STEPS} steps {equal}")
     sys.exit(1 if found else 0)
 
 

@@ -21,10 +21,6 @@ class ActionError(SafeWrappersError, ValueError):
     """An action has the wrong shape or type; the env was not stepped."""
 
 
-class CallError(ConfigurationError, TypeError):
-    """A constructor was called without an argument that it needs, or with one that it does not take."""
-
-
 class RunStateError(SafeWrappersError):
     """A training run's folder cannot be used: it belongs to another config, or its checkpoint is damaged."""
 

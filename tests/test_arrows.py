@@ -25,7 +25,7 @@ LAYERS = {
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
-COMMON = {"arguments", "checks", "errors", "info"}
+COMMON = {"checks", "errors", "info"}
 """Single modules at the top that every layer may use; `protect` and the package itself are the top."""
 BELOW_WRAPPERS = {"control", "plants", "drawing", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
@@ -139,7 +139,6 @@ def test_the_parser_sees_what_it_should(tmp_path):
     assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
     assert layers_used("control", LAYERS["control"] / "watchdog" / "leases.py") == {"checks", "errors"}
     assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {
-        "arguments",
         "checks",
         "errors",
         "plants",

@@ -2,7 +2,10 @@
 
 import contextlib
 import copy
+import textwrap
+import threading
 import warnings
+from unittest import mock
 
 import gymnasium as gym
 import mujoco
@@ -237,6 +240,63 @@ def refusal(env):
     with pytest.raises(ConfigurationError) as caught:
         sw.protect(env)
     return str(caught.value)
+
+
+class Slider(gym.Env):
+    """A point on a line. Observed: position and speed."""
+
+    observation_space = gym.spaces.Box(-100.0, 100.0, (2,), np.float64)
+
+    def __init__(self, discrete=False, lock=None):
+        self.action_space = gym.spaces.Discrete(3, start=-1) if discrete else gym.spaces.Box(-1.0, 1.0, (1,))
+        self.lock = lock
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.zeros(2)
+        return self.state, {}
+
+    def step(self, action):
+        self.state = self.state + 0.1 * np.array([self.state[1], float(np.atleast_1d(action)[0])])
+        return self.state, 0.0, False, False, {}
+
+
+UNKNOWN = {
+    "JointSpeedLimit(limit=4.0)": lambda: gym.make("lab/Arm-v0"),
+    "PredictiveShield(h, horizon, backup)": lambda: Slider(),
+    "sw.ActionShield(": lambda: Slider(discrete=True),
+    'plant=sw.SimulatorPlant("fork")': lambda: Slider(lock=threading.Lock()),  # cannot be copied
+}
+
+
+@pytest.mark.parametrize("says", UNKNOWN)
+def test_an_env_without_a_recipe_gets_lines_that_filter_it(says):
+    with mock.patch.dict(gym.registry):
+        gym.register("lab/Arm-v0", entry_point="gymnasium.envs.mujoco.reacher_v5:ReacherEnv")
+        env = UNKNOWN[says]()
+        message = refusal(env)
+    assert says in message
+    lines = textwrap.dedent("\n".join(line for line in message.splitlines() if line.startswith("    ")))
+    discrete = isinstance(env.action_space, gym.spaces.Discrete)
+    scope = {"env": env, "horizon": 2, "h": lambda seen: 0.25 - abs(seen[1])}
+    scope["backup"] = lambda seen: -int(np.sign(seen[1])) if discrete else [-np.sign(seen[1])]
+    exec(lines, scope)
+    filtered = scope["env"]
+    filtered.reset(seed=0)
+    infos = [
+        filtered.step(1 if discrete else np.ones(env.action_space.shape, np.float32))[4] for _ in range(8)
+    ]
+    assert any(info["cbf/intervened"] for info in infos) and not any(info["cbf/infeasible"] for info in infos)
+
+
+def test_recipes_of_similar_names_are_told_and_why_no_filter_fits():
+    with mock.patch.dict(gym.registry):
+        gym.register("lab/Swimer-v3", entry_point="gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv")
+        message = refusal(gym.make("lab/Swimer-v3"))
+    assert message.partition("Recipes of similar names: ")[2].split(", ")[0] == "Swimmer"
+    picture = Slider()
+    picture.action_space = gym.spaces.Box(-1.0, 1.0, (2, 2))
+    assert "A filter by hand is refused, too: " in refusal(picture)
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0", "CartPole-v1"])

@@ -95,14 +95,11 @@ def _run(options: argparse.Namespace, console: Console) -> None:
 
 
 def _diagnose(options: argparse.Namespace, console: Console) -> None:
-    from .diagnosis import diagnose_command
+    from .diagnose import diagnose_command
 
-    output = options.output or Path("diagnosis.html")
+    output = options.output or Path("diagnosis.json")
     steps = DIAGNOSED_STEPS if options.steps is None else options.steps
-    words = ["safe-wrappers", *(sys.argv[1:] if options.given is None else options.given)]
-    diagnose_command(
-        options.words[0], options.policy, steps, output, shlex.join(words), console, options.imports or ()
-    )
+    diagnose_command(options.words[0], options.policy, steps, output, console, options.imports or ())
 
 
 def _enjoy(options: argparse.Namespace, console: Console) -> None:

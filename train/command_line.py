@@ -111,7 +111,7 @@ def make_parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE",
         help="of report: where to (default: report.html beside the runs; of several, overview.html); of diagnose "
-        "(default: diagnosis.html; the same as JSON beside it); of enjoy: a film of a typical episode "
+        "(default: diagnosis.json); of enjoy: a film of a typical episode "
         "and the worst one, FILM.webp",
     )
     parser.add_argument(

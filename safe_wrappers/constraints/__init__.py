@@ -1,6 +1,5 @@
 """Safety requirements: each turns a plant into half-spaces on the control."""
 
-from safe_wrappers.arguments import tells_arguments
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.constraints.backup.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.backup.escape_clearance import EscapeClearance
@@ -50,7 +49,3 @@ __all__ = [
     "WallClearance",
     "Workspace",
 ]
-
-for _kind in (globals()[name] for name in __all__):
-    if _kind.__init__ is not object.__init__:
-        tells_arguments(_kind)

@@ -7,8 +7,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
-from safe_wrappers.constraints.obstacle_marks import obstacle_marks
-from safe_wrappers.constraints.obstacles import Nearest, Plain, obstacles_from, refuse_more_dimensions
+from safe_wrappers.constraints.obstacles import (
+    Nearest,
+    Plain,
+    obstacle_marks,
+    obstacles_from,
+    refuse_more_dimensions,
+)
 from safe_wrappers.control.backup.approach_rows import (
     Machine,
     approach_rows,

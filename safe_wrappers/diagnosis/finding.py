@@ -3,10 +3,9 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
-from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnknownNameError
 
 
@@ -18,15 +17,6 @@ class Evidence(NamedTuple):
     unit: str
 
 
-class Series(NamedTuple):
-    """What a plot shows: a number of every control step of one driver."""
-
-    name: str
-    unit: str
-    driver: str
-    values: Array
-
-
 @dataclass(frozen=True)
 class Finding:
     """One symptom in one env.
@@ -34,23 +24,20 @@ class Finding:
     Attributes:
         symptom: Its name, a key of `SYMPTOMS`.
         title: In words.
-        section: Of the appendix.
-        figure: What was measured, in `unit`: with the policy, or without one the worse of the other drivers (the
-            milder for `Symptom.least`); NaN where it could not be measured.
+        figure: What was measured, in `unit`: with the policy, or without one for the worse of the other drivers; NaN
+            where it could not be measured.
         threshold: From which on it is a symptom.
         unit: Of both.
         by_driver: The figure of each driver.
         evidence: Further numbers.
-        code: Lines that put a wrapper around `env`, tried in a second run; "" where there are none.
-        advice: What to do besides, or why there are no lines.
-        after: The figure in the second run, of the same drivers; NaN where there was none.
+        code: Lines that put the wrapper that was tried around `env`; "" where none was.
+        advice: What to do besides, or why no wrapper was tried.
+        after: The figure in a second run with that wrapper, of the same driver; NaN where there was none.
         missing: Why it could not be measured; "" where it was.
-        series: For a plot.
     """
 
     symptom: str
     title: str
-    section: str
     figure: float = math.nan
     threshold: float = math.nan
     unit: str = ""
@@ -60,7 +47,6 @@ class Finding:
     advice: str = ""
     after: float = math.nan
     missing: str = ""
-    series: Series | None = None
 
     @property
     def severity(self) -> float:
@@ -74,24 +60,18 @@ class Finding:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers and words; None for what was not measured."""
-        numbers = {
-            name: _number(getattr(self, name)) for name in ("figure", "threshold", "severity", "after")
-        }
-        words = {
-            name: getattr(self, name) for name in ("symptom", "title", "section", "unit", "code", "advice")
-        }
-        return {
-            **words,
-            **numbers,
-            "present": self.present,
-            "missing": self.missing,
-            "by_driver": {driver: _number(value) for driver, value in self.by_driver.items()},
-            "evidence": [{**one._asdict(), "value": _number(one.value)} for one in self.evidence],
-        }
+        evidence = [each._asdict() for each in self.evidence]
+        found: dict[str, Any] = _finite(asdict(self) | {"evidence": evidence, "severity": self.severity})
+        return found | {"present": self.present}
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+def _finite(value: Any) -> Any:
+    """The same with None for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @dataclass(frozen=True)
@@ -130,53 +110,44 @@ class Diagnosis:
             raise UnknownNameError(f"no symptom {symptom!r} was looked for; there are {', '.join(found)}")
         return found[symptom]
 
-    def as_dict(self) -> dict[str, Any]:
-        """All of it, for JSON."""
-        return {
+    def as_json(self) -> str:
+        """All of it."""
+        whole = {
             "env": self.env,
             "steps": self.steps,
             "drivers": list(self.drivers),
             "idle_constraints": list(self.idle_constraints),
             "findings": [finding.as_dict() for finding in self.findings],
         }
-
-    def as_json(self) -> str:
-        """All of it."""
-        return json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
-
-    @property
-    def idle_words(self) -> str:
-        """What to think of constraints that have refused nothing; "" where each has."""
-        if not self.idle_constraints:
-            return ""
-        names = ", ".join(self.idle_constraints)
-        may_be = "A limit may be out of reach, or in another unit; angles are in rad."
-        return f"Never acted, with any driver: {names}. {may_be}"
+        return json.dumps(whole, indent=1, allow_nan=False) + "\n"
 
     def __str__(self) -> str:
         """A table for a terminal, and the lines to paste."""
         lines = [f"{self.env}: {self.steps:,} steps each of {', '.join(self.drivers)}"]
         if self.idle_constraints:
-            lines.append(f"  {self.idle_words}")
+            lines.append(
+                f"  Never acted, with any driver: {', '.join(self.idle_constraints)}. A limit may be out of reach, or"
+                " in another unit; angles are in rad."
+            )
         for finding in self.findings:
-            lines.append(f"  {_verdict(finding):9} {finding.symptom:16} {_words(finding)}")
-            if finding.present and finding.code:
+            verdict = "unknown" if finding.missing else "FOUND" if finding.present else "not found"
+            lines.append(f"  {verdict:9} {finding.symptom:17} {_words(finding)}")
+            if not finding.present:
+                continue
+            lines += [f"      - {each.name}: {amount(each.value, each.unit)}" for each in finding.evidence]
+            if finding.code:
                 lines += [f"      {line}" for line in finding.code.splitlines()]
                 lines.append(f"      with these lines: {amount(finding.after, finding.unit)}")
-            if finding.present and finding.advice:
+            if finding.advice:
                 lines.append(f"      {finding.advice}")
         return "\n".join(lines)
-
-
-def _verdict(finding: Finding) -> str:
-    return "unknown" if finding.missing else "FOUND" if finding.present else "not found"
 
 
 def _words(finding: Finding) -> str:
     if finding.missing:
         return finding.missing
     limit = amount(finding.threshold, finding.unit)
-    return f"{finding.title}: {amount(finding.figure, finding.unit)} (from {limit} on; {finding.section})"
+    return f"{finding.title}: {amount(finding.figure, finding.unit)} (a symptom from {limit} on)"
 
 
 def amount(value: float, unit: str) -> str:

@@ -9,48 +9,29 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import whole_number
-from safe_wrappers.diagnosis.finding import Diagnosis, Finding, Series
+from safe_wrappers.diagnosis import commands, contacts, limits, wheel_slip
+from safe_wrappers.diagnosis.finding import Diagnosis, Finding
 from safe_wrappers.diagnosis.recording import (
     Driver,
     Env,
-    Predicts,
+    Recording,
     attacking_driver,
     policy_driver,
     random_driver,
     record,
 )
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Recordings, Symptom
-from safe_wrappers.diagnosis.symptoms import (
-    balance,
-    command_steps,
-    contact_forces,
-    late_commands,
-    lever_arms,
-    limits,
-    loop_margin,
-    port_energy,
-    singular_poses,
-    soft_joints,
-    unobserved_states,
-    wheel_slip,
-)
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
 SYMPTOMS: Final[dict[str, Symptom]] = {
     "limits": limits.SYMPTOM,
-    "command_steps": command_steps.SYMPTOM,
-    "late_commands": late_commands.SYMPTOM,
-    "singular_poses": singular_poses.SYMPTOM,
-    "lever_arms": lever_arms.SYMPTOM,
-    "loop_margin": loop_margin.SYMPTOM,
-    "contact_forces": contact_forces.SYMPTOM,
+    "command_steps": commands.STEPS,
+    "contact_forces": contacts.FORCES,
     "wheel_slip": wheel_slip.SYMPTOM,
-    "balance": balance.SYMPTOM,
-    "port_energy": port_energy.SYMPTOM,
-    "soft_joints": soft_joints.SYMPTOM,
-    "unobserved_states": unobserved_states.SYMPTOM,
+    "balance": contacts.BALANCE,
+    "port_energy": commands.ENERGY,
 }
 """By name."""
 POLICY: Final = "policy"
@@ -58,17 +39,17 @@ POLICY: Final = "policy"
 
 def diagnose(
     env: Env,
-    policy: Predicts | Driver | None = None,
+    policy: Any = None,
     steps: int = 2000,
     seed: int = 0,
     symptoms: Sequence[str] | None = None,
 ) -> Diagnosis:
-    """Look for the symptoms of the appendix's first table, and try the wrapper that each calls for.
+    """Look for symptoms in an env and a policy, and try the wrapper that each calls for.
 
     The env is driven at random, by an attacker (random corners of the action space, each held for 15 steps) and by
     the policy. A symptom is ranked by its figure over its threshold: with the policy, or without one for the worse of
-    the other two. Where lines of code treat it, they are run around the env, and the figure is measured again by the
-    same drivers.
+    the other two. Where a wrapper treats it, that is put around the env, and the figure is measured again by the same
+    driver.
 
     Args:
         env: With a one-dimensional Box action space. It is stepped and reset, and otherwise left as it is.
@@ -101,12 +82,7 @@ def diagnose(
         drivers[POLICY] = policy_driver(policy)
         _try(env, drivers[POLICY])
     recordings = {name: record(env, driver, steps, seed) for name, driver in drivers.items()}
-    findings = []
-    for name in chosen:
-        finding = _found(env, name, recordings)
-        if finding.present and finding.code:
-            finding = _treated(env, finding, drivers, steps, seed)
-        findings.append(finding)
+    findings = [_found(env, name, recordings, drivers, seed) for name in chosen]
     return Diagnosis(name_of(env), steps, list(drivers), findings, _idle_constraints(env, recordings))
 
 
@@ -127,7 +103,7 @@ def _try(env: Env, driver: Driver) -> None:
         )
 
 
-def _idle_constraints(env: Env, recordings: Recordings) -> list[str]:
+def _idle_constraints(env: Env, recordings: dict[str, Recording]) -> list[str]:
     """The constraints of the env's filter, if it has one, that have refused nothing."""
     inside = filter_inside(env)
     if inside is None:
@@ -137,9 +113,15 @@ def _idle_constraints(env: Env, recordings: Recordings) -> list[str]:
     return [name for name, has in zip(inside.constraint_names, acted, strict=True) if not has]
 
 
-def _measured(env: Env, symptom: Symptom, recordings: Recordings) -> tuple[dict[str, Measured], str]:
-    """Of each driver that says something, and why the others do not."""
-    found, missing = {}, ""
+def _found(
+    env: Env, name: str, recordings: dict[str, Recording], drivers: dict[str, Driver], seed: int
+) -> Finding:
+    """One symptom, with the figure of each driver that says something, and what its wrapper leaves."""
+    symptom = SYMPTOMS[name]
+    found: dict[str, Measured] = {}
+    missing = ""
+    if symptom.policies_only and POLICY not in recordings:
+        missing = "other drivers say nothing of it: give a policy"
     for driver, recording in recordings.items():
         if symptom.policies_only and driver != POLICY:
             continue
@@ -147,57 +129,32 @@ def _measured(env: Env, symptom: Symptom, recordings: Recordings) -> tuple[dict[
             found[driver] = symptom.measure(env, recording)
         except NotMeasuredError as error:
             missing = missing or str(error)
-    if symptom.policies_only and POLICY not in recordings:
-        missing = "other drivers say nothing of it: give a policy"
-    return found, missing
-
-
-def _judged(found: dict[str, Measured], least: bool) -> str:
-    """The driver whose figure counts: the policy, or else the worse of the others, or the milder."""
-    choose = min if least else max
-    return POLICY if POLICY in found else choose(found, key=lambda driver: found[driver].figure)
-
-
-def _found(env: Env, name: str, recordings: Recordings) -> Finding:
-    symptom = SYMPTOMS[name]
-    found, missing = _measured(env, symptom, recordings)
     if not found:
-        return Finding(name, symptom.title, symptom.section, missing=missing)
-    driver = _judged(found, symptom.least)
-    measured = found[driver]
-    code = advice = ""
-    if measured.figure >= symptom.threshold:
-        code, advice = symptom.lines(env, recordings[driver])
-    return Finding(
-        name, symptom.title, symptom.section, measured.figure, symptom.threshold, symptom.unit,
-        {each: one.figure for each, one in found.items()}, measured.evidence, code, advice,
-        series=Series(*symptom.plotted, driver, measured.steps),
-    )  # fmt: skip
-
-
-def _as_before(tried: Env, env: Env) -> Env:
-    """What a policy of the env alone can be asked in: a flat observation that has grown loses what is new."""
-    new, old = tried.observation_space, env.observation_space
-    if not isinstance(new, gym.spaces.Box) or not isinstance(old, gym.spaces.Box) or len(new.shape) != 1:
-        return tried
-    if new.shape[0] <= old.shape[0]:
-        return tried
-    return gym.wrappers.TransformObservation(tried, lambda seen: seen[: old.shape[0]], old)
-
-
-def _treated(env: Env, finding: Finding, drivers: dict[str, Driver], steps: int, seed: int) -> Finding:
-    """The finding with the figure that its lines leave; lines that are refused are taken out, and it is told why."""
-    import safe_wrappers
-
-    scope: dict[str, Any] = {"env": env, "sw": safe_wrappers}
-    assert finding.series is not None
-    driver = finding.series.driver
+        return Finding(name, symptom.title, missing=missing)
+    judged = POLICY if POLICY in found else max(found, key=lambda driver: found[driver].figure)
+    figures = {driver: one.figure for driver, one in found.items()}
+    finding = Finding(
+        name, symptom.title, figures[judged], symptom.threshold, symptom.unit, figures, found[judged].evidence
+    )
+    if not finding.present:
+        return finding
     makers = {"random": random_driver, "attacking": attacking_driver}
+    driver_again = makers[judged](env, seed) if judged in makers else drivers[judged]
+    return _treated(env, finding, symptom, recordings[judged], driver_again, seed)
+
+
+def _treated(
+    env: Env, finding: Finding, symptom: Symptom, recording: Recording, driver: Driver, seed: int
+) -> Finding:
+    """The finding with the figure that its wrapper leaves; one that is refused is told, and why."""
+    treatment = symptom.treatment(env, recording)
+    told = replace(finding, advice=treatment.advice)
+    if treatment.wrap is None:
+        return told
     try:
-        exec(finding.code, scope)  # the very lines that the user is told
-        fresh = makers[driver](env, seed) if driver in makers else drivers[driver]
-        recording = record(_as_before(scope["env"], env), fresh, steps, seed)
-        return replace(finding, after=SYMPTOMS[finding.symptom].measure(scope["env"], recording).figure)
+        tried = treatment.wrap(env)
+        after = symptom.measure(tried, record(tried, driver, len(recording.infos), seed)).figure
+        return replace(told, code=treatment.code, after=after)
     except (SafeWrappersError, NotMeasuredError) as error:
-        tool = f"{finding.advice} {finding.code.partition('(')[0].rpartition('sw.')[2]} was refused: {error}"
-        return replace(finding, code="", advice=tool.strip())
+        tool = treatment.code.partition("(")[0].rpartition(".")[2]
+        return replace(told, advice=f"{treatment.advice} {tool} was refused: {error}".strip())

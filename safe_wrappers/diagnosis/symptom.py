@@ -1,28 +1,26 @@
-"""A symptom: how it is measured, and which lines treat it."""
+"""A symptom: how it is measured, and which wrapper treats it."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import mujoco
 
-from safe_wrappers.checks import Array
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording, physics
-
-Recordings = Mapping[str, Recording]
-"""By the driver's name."""
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.teleop import Link
 
 
 class NotMeasuredError(Exception):
     """Why a symptom cannot be measured in an env; never leaves this package."""
 
 
-def require_physics(env: Env, that: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """MuJoCo's model and data of an env; `NotMeasuredError` where it has no model `that` could be used."""
+def require_physics(env: Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """MuJoCo's model and data of an env; `NotMeasuredError` where it has none."""
     found = physics(env)
     if found is None:
-        raise NotMeasuredError(f"the env has no MuJoCo model {that}")
+        raise NotMeasuredError("the env has no MuJoCo model")
     return found
 
 
@@ -37,19 +35,44 @@ def replayed(model: mujoco.MjModel, recording: Recording) -> Iterator[tuple[int,
         yield k, data
 
 
-@dataclass
-class Measured:
-    """A symptom's figure for one driver.
-
-    Attributes:
-        figure: In the symptom's unit.
-        steps: The same of every control step, for a plot, shape (k,).
-        evidence: Further numbers.
-    """
+class Measured(NamedTuple):
+    """A symptom's figure for one driver, in the symptom's unit, and further numbers."""
 
     figure: float
-    steps: Array
-    evidence: Sequence[Evidence] = field(default_factory=tuple)
+    evidence: Sequence[Evidence] = ()
+
+
+@dataclass(frozen=True)
+class Treatment:
+    """What helps.
+
+    Attributes:
+        code: How the wrapper is typed; "" where none can be tried.
+        wrap: Does the same to an env.
+        advice: What to do besides, or why no wrapper can be tried.
+    """
+
+    code: str = ""
+    wrap: Callable[[Env], Env] | None = None
+    advice: str = ""
+
+
+def wrapped(wrapper: Callable[..., Env], advice: str = "", **arguments: Any) -> Treatment:
+    """A wrapper of the package, or `protect`, with arguments whose `repr` is how they are typed."""
+    words = "".join(f", {name}={_typed(value)}" for name, value in arguments.items())
+    code = f"env = sw.{wrapper.__name__}(env{words})"
+    return Treatment(code, lambda env: wrapper(env, **arguments), advice)
+
+
+def _typed(value: Any) -> str:
+    return f"sw.teleop.{value!r}" if isinstance(value, Link) else repr(value)
+
+
+def filtered(constraint: Callable[..., Any], **arguments: Any) -> Treatment:
+    """A filter with one constraint of `safe_wrappers.constraints`; arguments as of `wrapped`."""
+    words = ", ".join(f"{name}={value!r}" for name, value in arguments.items())
+    code = f"limit = sw.constraints.{constraint.__name__}({words})\nenv = sw.CBFActionFilter(env, [limit])"
+    return Treatment(code, lambda env: CBFActionFilter(env, [constraint(**arguments)]))
 
 
 class Symptom(NamedTuple):
@@ -57,23 +80,16 @@ class Symptom(NamedTuple):
 
     Attributes:
         title: In words.
-        section: Of the appendix.
         threshold: From which on it is a symptom, in `unit`.
         unit: Of the figure; "share" is one of control steps.
-        plotted: What a plot shows, and its unit.
         measure: Of an env and what one driver did in it; raises `NotMeasuredError`.
-        lines: For an env and the driver's recording: lines that put a wrapper around `env`, and advice.
+        treatment: For an env and the driver's recording.
         policies_only: Random and attacking drivers have this symptom of themselves.
-        least: Without a policy the milder of the other drivers counts: what only one of them meets says nothing of
-            the env.
     """
 
     title: str
-    section: str
     threshold: float
     unit: str
-    plotted: tuple[str, str]
     measure: Callable[[Env, Recording], Measured]
-    lines: Callable[[Env, Recording], tuple[str, str]]
+    treatment: Callable[[Env, Recording], Treatment]
     policies_only: bool = False
-    least: bool = False

@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.arguments import tells_arguments
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.control_loop import ControlLoop, checked_loop
@@ -16,7 +15,6 @@ from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse
 from safe_wrappers.plants.plant import Plant
 
 
-@tells_arguments
 class AnalyticPlant(Plant):
     """`x' = f(x) + g(x) u` from plain functions.
 

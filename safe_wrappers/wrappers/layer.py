@@ -5,13 +5,12 @@ import math
 import warnings
 import zlib
 from collections.abc import Mapping
-from typing import Any, ClassVar, Final, Self, SupportsFloat
+from typing import Any, ClassVar, Final, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.arguments import refuse_call
 from safe_wrappers.checks import OF_NUMBERS, numbers_of, shown
 from safe_wrappers.errors import ActionError, UnsupportedEnvError
 from safe_wrappers.plants.default import PlantTemplate
@@ -34,12 +33,6 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
     """A wrapper with a place in the stack, whose arguments are recorded in the env's spec."""
 
     layer: ClassVar[Layer]
-
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Refuse a call that does not fit, before `__init__`; a copy is made without arguments."""
-        if args or kwargs:
-            refuse_call(cls, args, kwargs)
-        return super().__new__(cls)
 
     def __init__(self, env: Env) -> None:
         refuse_vector_env(env, type(self).__name__)

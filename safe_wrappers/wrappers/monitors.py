@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
-from safe_wrappers.control.contact.contact import complementarity_residuals
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
+from safe_wrappers.control.contact.impact import complementarity_residuals
 from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.contacts import (

@@ -6,9 +6,8 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.arrows import arrows
 from safe_wrappers.drawing.marks import Mark
-from safe_wrappers.drawing.scene import find_renderer, put
+from safe_wrappers.drawing.scene import arrows, find_renderer, put
 from safe_wrappers.drawing.strip import Strip
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import name_of, wrappers_of

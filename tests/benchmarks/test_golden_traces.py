@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from benchmarks import golden_traces
-from benchmarks.golden_traces import NOT_COMPARABLE, RECORDED, SAME_BITS, SHORT, differences, runs
+from benchmarks.golden_traces import (
+    NOT_COMPARABLE,
+    RECORDED,
+    SAME_BITS,
+    SHORT,
+    TOLERANCES,
+    differences,
+    misbehaviour,
+    runs,
+)
 
 
 def compare(*words):
@@ -37,7 +46,7 @@ def test_every_env_is_recorded_and_most_are_filtered():
     recorded = json.loads(RECORDED.read_text())["runs"]
     assert {run.partition(";")[0] for run in recorded} == set(runs())
     assert len(recorded) == 4 * len(runs()) and set(SHORT) <= set(runs())
-    intervened = {run.partition(";")[0] for run, found in recorded.items() if found["intervened"]}
+    intervened = {run.partition(";")[0] for run, found in recorded.items() if found["behaviour"]["changed"]}
     # No limit binds on the goal tasks without cost; a lease alone and a channel have no filter to intervene.
     idle = {
         "SafePointGoal0-v0",
@@ -73,6 +82,19 @@ def test_a_bit_that_differs_is_found(monkeypatch):
     assert differences({}, {"run": after}) == ["run: was not recorded"]
     del after["digests"]["reward"]
     assert differences({"run": before}, {"run": after}) == ["run: reward is gone"]
+
+
+def test_another_behaviour_is_found_and_chance_is_allowed_for():
+    def run(**figures):
+        return {"behaviour": dict.fromkeys(TOLERANCES, 0.0) | {"violations": None} | figures}
+
+    seeds = {"a; random; seed 0": run(changed=0.2), "a; random; seed 1": run(changed=0.25)}
+    (name, _) = seeds
+    assert misbehaviour(seeds, seeds) == []
+    assert misbehaviour(seeds, {name: run(changed=0.26)}) == []
+    assert misbehaviour(seeds, {name: run(changed=0.3)}) == [f"{name}: changed was 0.2, is 0.3"]
+    found = misbehaviour(seeds, {name: run(changed=0.2, infeasible=0.006, violations=0.0)})
+    assert found == [f"{name}: infeasible was 0, is 0.006", f"{name}: violations was None, is 0.0"]
 
 
 def test_other_arithmetic_is_not_compared(tmp_path, monkeypatch, capsys):

@@ -12,13 +12,7 @@ from scipy.integrate import solve_ivp
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.contact.impact_speed_limit import Contact
-from safe_wrappers.control.contact.body_regions import BODY_REGIONS
-from safe_wrappers.control.contact.impact import (
-    attenuation_after_delay,
-    effective_mass,
-    peak_force,
-    time_to_peak,
-)
+from safe_wrappers.control.contact.impact import BODY_REGIONS, peak_force, time_to_peak
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 # A mass on a slide before a wall ------------------------------------------------------------------------------
@@ -123,14 +117,6 @@ def test_what_is_left_is_negative_exactly_where_the_peak_is_too_high(
     assert harder < left or pressed == LIMIT - margin  # also where all is lost
 
 
-def test_to_first_order_what_is_left_is_the_force_that_is_missing():
-    at_limit = Contact(0.0, SLOW, MASS, K, 0.0, 0.0)
-    assert at_limit.peak == pytest.approx(LIMIT)
-    for more in (-1e-4, 1e-4):
-        contact = at_limit._replace(speed=SLOW * (1.0 + more))
-        assert contact.left(LIMIT) == pytest.approx(LIMIT - contact.peak, rel=1e-3)
-
-
 ARM = """<mujoco><option timestep="0.001"/><worldbody>
 <geom name="wall" type="plane" pos="1 0 0" euler="0 -70 0" size="2 2 .1" contype="0"/>
 <body name="upper" pos="0 0 .3"><joint name="a" axis="0 1 0" damping=".4"/><geom type="capsule" fromto="0 0 0 .4 0 0"
@@ -153,7 +139,7 @@ def closing(model, qpos, qvel, normal, point):
     return float(normal @ jacobian @ qvel)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     env, rng = Scene(ARM), np.random.default_rng(seed)
     env.data.qpos[:3], env.data.qvel[:3] = rng.uniform(-0.8, 0.8, 3), rng.uniform(-3.0, 3.0, 3)
@@ -184,7 +170,7 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     inertia = np.array([np.zeros(m.nv) for _ in range(m.nv)])
     for column, unit in zip(inertia, np.eye(m.nv), strict=True):
         mujoco.mj_mulM(m, data, column, unit)
-    mass = float(effective_mass(inertia, row))
+    mass = 1.0 / float(row @ np.linalg.solve(inertia, row))
     assert contact.mass == pytest.approx(mass, rel=1e-9) and contact.stiffness == 1e4
 
     # The push: how fast the closing speed grows, in motion (by differences along it) and once it has stopped.
@@ -201,24 +187,6 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     mujoco.mj_forward(m, data)
     resting = float(row @ data.qacc_smooth)  # without the motors
     assert constraint.contact(0).push >= mass * max(resting, 0.0) - 1e-9
-
-
-def test_some_of_those_pushes_come_from_the_motion_and_some_from_rest():
-    env, more = Scene(ARM), {True: 0, False: 0}
-    constraint = asked(
-        env, sw.constraints.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4)
-    )
-    rng = np.random.default_rng(0)
-    constraint.value()
-    for _ in range(30):
-        qpos = env.model.qpos0.copy()
-        qpos[:3], qvel = rng.uniform(-0.8, 0.8, 3), np.zeros(env.model.nv)
-        constraint.place(qpos, qvel, np.ones(3))
-        resting = constraint.contact(0).push
-        qvel[:3] = rng.uniform(-3.0, 3.0, 3)
-        constraint.place(qpos, qvel, np.ones(3))
-        more[constraint.contact(0).push > resting + 1e-9] += 1
-    assert min(more.values()) >= 3
 
 
 # What the world is like ---------------------------------------------------------------------------------------
@@ -242,18 +210,9 @@ def test_the_value_is_the_limit_less_the_peak_at_the_present_speed():
     assert value_at(slide(), limit(), -3.0, gap=0.1) == LIMIT
     pressed = value_at(slide(), limit(), 0.0, gap=-0.005)
     assert pressed == pytest.approx(LIMIT - K * 0.005)
-    braked = np.sqrt(3.0**2 - 2.0 * 40.0 * 0.1)
-    assert value_at(slide(), limit(braking=40.0), 3.0, gap=0.1) == pytest.approx(
-        LIMIT - braked * np.sqrt(K * MASS)
-    )
-    assert value_at(slide(), limit(braking=40.0), 2.0, gap=0.1) == LIMIT  # it stands before
 
 
 def test_what_gives_way_weighs_less():
-    free = slide(wall='gravcomp="1"')
-    assert value_at(free, limit(effective_mass=2.0), 0.3, gap=-1e-7) == pytest.approx(
-        LIMIT - 0.3 * np.sqrt(K * 2.0), abs=1e-2
-    )
     ball = '<body name="ball" pos=".4 0 0"><freejoint/><geom name="ball" size=".1" mass="1.25"/></body>'
     env = slide(extra=ball)
     env.data.qpos[0], env.data.qvel[0] = 0.2 + 1e-7, 0.3
@@ -360,7 +319,6 @@ def test_a_reactive_brake_comes_too_late_where_the_constraint_does_not():
     unmitigated = hit(1.0, np.inf)
     assert unmitigated == pytest.approx(float(peak_force(1.0, MASS, K)), rel=0.02)
     assert hit(1.0, latency) == unmitigated  # to the last bit
-    assert attenuation_after_delay(1.0, MASS, K, 40.0, latency) == 0.0
     assert unmitigated > 2.0 * LIMIT
     # Even a brake that acts at the touch itself would not do.
     assert hit(1.0, 0.0) > LIMIT
@@ -368,23 +326,6 @@ def test_a_reactive_brake_comes_too_late_where_the_constraint_does_not():
     filtered.reset(seed=0)
     filtered.unwrapped.data.qvel[0] = 1.0
     assert peaks(filtered, full, 80, reset=False)[0].max() <= LIMIT
-
-
-def test_a_declared_braking_makes_up_for_a_short_look_ahead():
-    # 40 kg at 200 N need some 0.4 s to stop; three control steps are 0.03 s.
-    def drive(**more):
-        env = sw.CBFActionFilter(slide(mass=40.0, gap=1.0), [limit(margin=2.0, horizon=3, **more)])
-        return peaks(env, full, 150)
-
-    force, infos = drive(braking=4.9)
-    assert 0.9 * LIMIT < force.max() <= LIMIT and not any(i["cbf/infeasible"] for i in infos)
-    assert min(i["cbf/margin"] for i in infos) >= -1e-6
-    with pytest.warns(sw.UnsafeStateWarning):
-        force, infos = drive()
-    assert force.max() > 2.0 * LIMIT and any(i["cbf/infeasible"] for i in infos)  # and it says so
-    with pytest.warns(sw.UnsafeStateWarning):
-        force, _ = drive(braking=20.0)  # not true
-    assert force.max() > 2.0 * LIMIT
 
 
 def test_pushing_counts():
@@ -488,18 +429,6 @@ def test_a_contact_begins_where_mujoco_lets_it_begin():
 # Plain data, and what is refused ------------------------------------------------------------------------------
 
 
-class Reaching(gym.Wrapper):
-    """For specs: Reacher whose links can be told from its border."""
-
-
-def test_the_filters_margin_adds_up_and_a_region_gives_its_limit():
-    given = sw.constraints.ImpactSpeedLimit(
-        ["fingertip"], ["sideE"], region="hands and fingers", clamped=True, stiffness=1e4, margin=1.0
-    )
-    wider = sw.CBFActionFilter(gym.make("Reacher-v5"), [given], margin=2.0)
-    assert wider.constraints[0].margin == 3.0 and wider.filter.bound[0].scale == 140.0
-
-
 PLAIN = {"force_limit": 100.0, "stiffness": 1e4}
 REACHER = {"bodies": ["fingertip"], "against": ["sideE"]}
 
@@ -508,19 +437,7 @@ REACHER = {"bodies": ["fingertip"], "against": ["sideE"]}
     ("arguments", "error", "message"),
     [
         ({"force_limit": 0.0}, ConfigurationError, "force_limit must be a finite number > 0 in N, got 0.0"),
-        ({"force_limit": -5.0}, ConfigurationError, "force_limit must be a finite number > 0 in N"),
-        ({"stiffness": 0.0}, ConfigurationError, "stiffness must be a finite number > 0 in N/m, got 0.0"),
-        ({"stiffness": np.nan}, ConfigurationError, "stiffness must be a finite number > 0 in N/m"),
-        ({"effective_mass": 0.0}, ConfigurationError, "effective_mass must be a finite number > 0 in kg"),
-        ({"braking": -1.0}, ConfigurationError, r"braking must be a finite number > 0 in m/s\^2"),
-        ({"margin": -1.0}, ConfigurationError, "margin must be a finite number >= 0 in N"),
         ({"margin": 100.0}, ConfigurationError, "the margin 100.0 N leaves nothing of the limit 100.0 N"),
-        ({"horizon": 0}, ConfigurationError, "horizon is a whole number of control intervals"),
-        (
-            {"force_limit": None},
-            ConfigurationError,
-            r"give a force_limit \(N\) and the interface's stiffness",
-        ),
         ({"stiffness": None}, ConfigurationError, r"give a force_limit \(N\) and the interface's stiffness"),
         ({"clamped": True}, ConfigurationError, "name the region too"),
         (
@@ -528,23 +445,11 @@ REACHER = {"bodies": ["fingertip"], "against": ["sideE"]}
             UnknownNameError,
             "no body region 'torso'; choose skull and forehead, face, neck",
         ),
-        (
-            {"region": "face", "force_limit": None},
-            ConfigurationError,
-            r"foresees no contact with 'face': keep away from it \(Workspace\), or declare a force_limit",
-        ),
+        ({"region": "face", "force_limit": None}, ConfigurationError, "foresees no contact with 'face'"),
         ({"region": "face", "force_limit": None, "clamped": True}, ConfigurationError, "foresees no contact"),
-        (
-            {"bodies": "fingertip"},
-            ConfigurationError,
-            "bodies is a list of names of bodies or geoms; got 'fing",
-        ),
         ({"bodies": []}, ConfigurationError, r"bodies is a list of names of bodies or geoms; got \[\]"),
-        ({"against": "sideE"}, ConfigurationError, "against is a list of names"),
         ({"bodies": ["hand"]}, UnknownNameError, "no body or geom 'hand'; bodies: world, body0.*fingertip"),
-        ({"against": ["wall"]}, UnknownNameError, "no body or geom 'wall'; bodies: .*; geoms: ground, sideS"),
         ({"against": ["body0"]}, ConfigurationError, "'body0' is part of the machine itself"),
-        ({"against": ["fingertip"]}, ConfigurationError, "'fingertip' is part of the machine itself"),
     ],
 )
 def test_nonsense_is_refused(arguments, error, message):

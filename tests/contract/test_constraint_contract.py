@@ -31,7 +31,7 @@ CONSTRAINTS = [
     of.ContactFeasibility(0.6, 0.02, ["torso"], 0.01),
     of.EscapeClearance("robot", [OBSTACLES[5], DISCS, OBSTACLES[3]], 0.2, 0.1, 2.0),
     of.HeadingDriveClearance([of.Discs("hazards", 0.2)], "robot", 0.004, 0.01, 0.1, False, True),
-    of.ImpactSpeedLimit(["body1"], ["sideE"], None, "hands and fingers", True, 1e4, 20.0, 3.0, 1.0, 4),
+    of.ImpactSpeedLimit(["body1"], ["sideE"], None, "hands and fingers", True, 1e4, 1.0, 4),
     of.ImpactSpeedLimit(["fingertip"], ["sideE"], force_limit=100.0, stiffness=1e4),
     of.JointPositionLimit([-1.0, -math.inf], 2.0, ["joint1", "joint0"], 0.1, 7, 0.5),
     of.JointSpeedLimit([4.0, 3.0], ["joint1", "joint0"], 0.1, 2, 0.5),

@@ -187,7 +187,7 @@ def test_commands_on_their_way_are_actions():
             [sw.constraints.Plane([1.2, 0.0], [-1.0, 0.0])], 3.0, bodies=["box"], margin=0.01
         ),
         sw.constraints.ImpactSpeedLimit(
-            bodies=["box"], against=["wall"], force_limit=60.0, stiffness=20_000.0, braking=3.0, margin=1.0
+            bodies=["box"], against=["wall"], force_limit=60.0, stiffness=20_000.0, margin=1.0
         ),
     ],
     ids=lambda one: type(one).__name__,

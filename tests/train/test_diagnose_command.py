@@ -1,9 +1,6 @@
 """safe-wrappers diagnose: what it writes, whose policies it takes, and what it refuses."""
 
 import json
-import re
-import shutil
-import subprocess
 
 import gymnasium as gym
 import numpy as np
@@ -12,8 +9,7 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.diagnosis.trained import of_file, of_run
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.diagnose import of_file, of_run
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 TINY = """
@@ -40,35 +36,13 @@ def run(tmp_path_factory):
     return folder / "tiny" / "plain" / "seed_0"
 
 
-def test_the_command_prints_and_writes_page_and_json(tmp_path, capsys):
-    page = tmp_path / "deep" / "rover.html"
-    assert main(["diagnose", "SafeRover-v0", "--steps", "60", "--output", str(page)]) == 0
+def test_the_command_prints_and_writes_json(tmp_path, capsys):
+    path = tmp_path / "deep" / "rover.json"
+    assert main(["diagnose", "SafeRover-v0", "--steps", "60", "--output", str(path)]) == 0
     out = capsys.readouterr().out
-    assert "FOUND     wheel_slip" in out and "sw.SlipLimiter(env" in out and f"Page: {page}" in out
-    there = json.loads(page.with_suffix(".json").read_text())
+    assert "FOUND     wheel_slip" in out and "sw.SlipLimiter(env" in out and f"JSON: {path}" in out
+    there = json.loads(path.read_text())
     assert there["findings"][0]["symptom"] == "wheel_slip" and there["steps"] == 60
-    html = page.read_text()
-    assert "sw.SlipLimiter(env" in html and "<svg" in html and "safe-wrappers diagnose SafeRover-v0" in html
-    assert "Not found, or not measured" in html and "http" not in html
-    (table,) = (page.parent / "rover_data").iterdir()  # a plot per symptom that was found
-    assert f'href="rover_data/{table.name}"' in html and table.name == "symptom-wheel_slip.csv"
-    rows = read_rows(table)
-    assert [row["step"] for row in rows] == list(range(60))
-    slipping = np.mean([row["value"] > 0.2 for row in rows])
-    assert slipping == pytest.approx(there["findings"][0]["figure"]) and slipping > 0.0
-
-
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="no browser")
-@pytest.mark.parametrize("width", [1200, 600])
-def test_nothing_of_the_page_is_beyond_the_window(tmp_path, width):
-    page = tmp_path / "rover.html"
-    assert main(["diagnose", "SafeRover-v0", "--steps", "40", "--output", str(page)]) == 0
-    page.write_text(
-        page.read_text() + "<script>document.title = document.documentElement.scrollWidth</script>"
-    )
-    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900"]
-    shown = subprocess.run([*command, "--dump-dom", str(page)], capture_output=True, text=True, timeout=60)
-    assert int(re.search(r"<title>(\d+)</title>", shown.stdout)[1]) <= width
 
 
 def test_the_policy_of_a_run_acts_as_it_was_trained(run, tmp_path):
@@ -76,13 +50,13 @@ def test_the_policy_of_a_run_acts_as_it_was_trained(run, tmp_path):
     observation, _ = env.reset(seed=0)
     first = policy(observation)
     assert np.array_equal(policy(observation + 1.0), first)  # repeated: it was trained with action_repeat 2
-    page = tmp_path / "goal.html"
-    words = ["diagnose", "SafePointGoal1-v0", "--policy", str(run), "--steps", "40", "--output", str(page)]
+    path = tmp_path / "goal.json"
+    words = ["diagnose", "SafePointGoal1-v0", "--policy", str(run), "--steps", "40", "--output", str(path)]
     assert main(words) == 0
-    assert json.loads(page.with_suffix(".json").read_text())["drivers"] == ["random", "attacking", "policy"]
+    assert json.loads(path.read_text())["drivers"] == ["random", "attacking", "policy"]
 
 
-@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3, DDPG])
+@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, DDPG])
 def test_a_model_file_is_loaded_as_what_it_is(algorithm, tmp_path):
     made = algorithm("MlpPolicy", gym.make("Swimmer-v5"), device="cpu", seed=0)
     made.save(tmp_path / "model.zip")

@@ -8,12 +8,8 @@ import pytest
 from made_up import fill, steps
 from test_report import Page
 
-from safe_wrappers.diagnosis import Diagnosis, Finding
-from safe_wrappers.diagnosis.finding import Series
 from safe_wrappers.train.config import FilterConfig
-from safe_wrappers.train.diagnosis.page import diagnosis_page
 from safe_wrappers.train.evaluation.summary import summarize
-from safe_wrappers.train.figures.plot_files import PlotFiles
 from safe_wrappers.train.policies.card import write_card
 from safe_wrappers.train.report import write_overview, write_report
 
@@ -60,17 +56,7 @@ def overview(fake_experiment, word, folder):
     return write_overview([(experiment, summarize(experiment))] * 2, folder / "all.html", word).read_text()
 
 
-def diagnosis(fake_experiment, word, folder):
-    series = Series(word, word, word, np.ones(3))
-    texts = {"section": word, "unit": word, "code": word, "advice": word, "by_driver": {word: 2.0}}
-    found = Finding(
-        word, word, figure=2.0, threshold=1.0, evidence=[(word, 1.0, word)], series=series, **texts
-    )
-    absent = Finding(word, word, word, missing=word)
-    return diagnosis_page(Diagnosis(word, 10, [word], [found, absent]), word, PlotFiles(folder / "page.html"))
-
-
-@pytest.mark.parametrize("page", [report, overview, diagnosis])
+@pytest.mark.parametrize("page", [report, overview])
 def test_no_word_becomes_markup(page, fake_experiment, tmp_path):
     hostile, plain = (page(fake_experiment, word, tmp_path) for word in (HOSTILE, PLAIN))
     assert "script&gt;alert(1)" in hostile

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.control.contact.contact import complementarity_residuals
+from safe_wrappers.control.contact.impact import complementarity_residuals
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 FLOATS = (

@@ -13,8 +13,7 @@ from gymnasium.spaces import Box
 import safe_wrappers as sw
 from benchmarks import car_drivers
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.arrows import arrows
-from safe_wrappers.drawing.scene import MOST_MARKS, find_renderer, put, set_size
+from safe_wrappers.drawing.scene import MOST_MARKS, arrows, find_renderer, put, set_size
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
 

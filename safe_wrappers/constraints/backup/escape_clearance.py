@@ -9,8 +9,15 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
-from safe_wrappers.constraints.obstacle_marks import obstacle_marks
-from safe_wrappers.constraints.obstacles import Disc, Discs, Plane, TrackedDiscs, distances, obstacles_from
+from safe_wrappers.constraints.obstacles import (
+    Disc,
+    Discs,
+    Plane,
+    TrackedDiscs,
+    distances,
+    obstacle_marks,
+    obstacles_from,
+)
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.control.backup.way_clearances import Around, least_left, way_clearances
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line

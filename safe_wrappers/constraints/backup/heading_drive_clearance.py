@@ -9,8 +9,7 @@ import numpy as np
 from safe_wrappers.checks import Array, check_fields, non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
 from safe_wrappers.constraints.backup.heading_drive_batch import HeadingDriveBatch
-from safe_wrappers.constraints.obstacle_marks import obstacle_marks
-from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
+from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
 from safe_wrappers.control.numerics.nearest_discs import nearest_discs

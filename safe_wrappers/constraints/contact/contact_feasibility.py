@@ -12,16 +12,12 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.numerics.compiled import compiled
-from safe_wrappers.drawing.marks import Mark, arrow, line, segment
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader, can_touch_the_world
+from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-
-_DRAWN = 0.08  # height of a drawn cone, as a share of the model's extent
-_EDGES = 8  # of a drawn cone
 
 
 @dataclass
@@ -100,22 +96,6 @@ class BoundContactFeasibility(BoundSlacks):
         # Capped at the margin: differences between a touch and none would say nothing of the touch.
         return np.minimum(self.insides(control), self.spec.margin) + self.spec.tolerance - self.spec.margin
 
-    def draw(self) -> list[Mark]:
-        """At every contact as MuJoCo has it now the narrowed cone, and in it the force; the weight is as long."""
-        now, found = contacts_now(self.plant), []
-        tall = _DRAWN * float(self.plant.model.stat.extent)
-        for i in np.flatnonzero(self._index[now.body] >= 0):
-            point, normal = now.point[i], now.normal[i]
-            wide = self.spec.friction_share * now.friction[i]
-            across = np.linalg.svd(normal[None])[2][1:]
-            angles = np.linspace(0.0, 2.0 * np.pi, _EDGES, endpoint=False)
-            around = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ across
-            rim = point + tall * (normal + wide * around)
-            found += [segment("limit", point, corner, 0.01 * tall) for corner in rim]
-            found += line("limit", rim, 0.01 * tall, closed=True)
-            found.append(arrow("way", point, tall * now.force[i] / self._weight_n, 0.06 * tall))
-        return found
-
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/cone_margin` and `whole_body/contacts`: forecast for the executed control."""
         contacts, margin = 0, 0.0
@@ -124,14 +104,6 @@ class BoundContactFeasibility(BoundSlacks):
             margin = float(self.insides(executed).min())
         margin = margin if np.isfinite(margin) else 0.0
         return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}
-
-
-def contacts_now(plant: MujocoPlant) -> ContactForecast:
-    """The contacts of the robot with the fixed world as MuJoCo has computed them last; none under a delay."""
-    reader, data = ContactReader(plant.model), plant.published()
-    if data is not None:
-        reader.read(data)
-    return reader.forecast(True)
 
 
 def require_contacts(plant: Plant, asker: str) -> MujocoPlant:

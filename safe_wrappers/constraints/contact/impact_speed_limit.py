@@ -6,15 +6,12 @@ from typing import ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, check_fields, name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
-from safe_wrappers.control.contact.body_regions import body_region
-from safe_wrappers.control.contact.contact import series_stiffness
-from safe_wrappers.control.contact.impact import braked_peak_force, reduced_mass, speed_limit
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.control.contact.impact import BODY_REGIONS, in_series, pushed_peak_force, speed_limit
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
@@ -37,11 +34,10 @@ class ImpactSpeedLimit(RolloutConstraint):
         bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.
         against: Names of bodies or geoms of the world; the speed of free ones counts.
         force_limit: Largest peak force, N, of each pair of geoms. None takes the region's.
-        region: Of a human body (`control.contact.body_regions`, ISO/TS 15066:2016, to be checked against its text).
+        region: Of a human body (`control.contact.impact.BODY_REGIONS`, ISO/TS 15066:2016, to be checked against its
+            text).
         clamped: The region cannot recoil: its quasi-static limit, and no effective mass of its own.
         stiffness: Of the interface, N/m; with a region that of the robot's side alone, where None is a rigid robot.
-        effective_mass: Of the machine, kg; None has it computed at every contact.
-        braking: Deceleration, m/s^2, that every point can always be given towards every obstacle. None: unknown.
         margin: Kept free below the limit, N.
         horizon: Control steps to forecast; cover the time of braking and of a contact.
     """
@@ -52,8 +48,6 @@ class ImpactSpeedLimit(RolloutConstraint):
     region: str | None = None
     clamped: bool = False
     stiffness: float | None = None
-    effective_mass: float | None = None
-    braking: float | None = None
     margin: float = 0.0
     horizon: int = 5
 
@@ -64,9 +58,8 @@ class ImpactSpeedLimit(RolloutConstraint):
         self._check_shared()
         for name in ("bodies", "against"):
             setattr(self, name, name_list(name, getattr(self, name), "names of bodies or geoms"))
-        units = {"force_limit": "N", "stiffness": "N/m", "effective_mass": "kg", "braking": "m/s^2"}
-        for name, unit in units.items():
-            check_fields(self, positive, (name,), unit)
+        check_fields(self, positive, ("force_limit",), "N")
+        check_fields(self, positive, ("stiffness",), "N/m")
         self._force, self._stiffness, self._other_mass = self._interface()
         if self.margin >= self._force:
             nothing = f"the margin {self.margin} N leaves nothing"
@@ -81,7 +74,9 @@ class ImpactSpeedLimit(RolloutConstraint):
                 wanted = "a force_limit (N) and the interface's stiffness (N/m)"
                 raise ConfigurationError(f"give {wanted}, or a region of the human body")
             return self.force_limit, self.stiffness, np.inf
-        region = body_region(self.region)
+        if self.region not in BODY_REGIONS:
+            raise UnknownNameError(f"no body region {self.region!r}; choose {', '.join(BODY_REGIONS)}")
+        region = BODY_REGIONS[self.region]
         limit = region.quasi_static_force if self.clamped else region.transient_force
         force = self.force_limit if self.force_limit is not None else limit
         if force is None or (region.transient_force is None and self.force_limit is None):
@@ -90,7 +85,7 @@ class ImpactSpeedLimit(RolloutConstraint):
                 "force_limit (N) of your own"
             )
         pad = np.inf if self.stiffness is None else self.stiffness
-        return force, float(series_stiffness(pad, region.stiffness)), np.inf if self.clamped else region.mass
+        return force, float(in_series(pad, region.stiffness)), np.inf if self.clamped else region.mass
 
     def bind(self, plant: Plant) -> "BoundImpactSpeedLimit":
         return BoundImpactSpeedLimit(self, plant)
@@ -109,8 +104,7 @@ class Contact(NamedTuple):
     @property
     def peak(self) -> Array:
         """Force by the deepest deflection, under a push that goes on, N."""
-        pushed = -self.push / self.mass
-        return braked_peak_force(self.speed, self.mass, self.stiffness, pushed, deflection=self.deflection)
+        return pushed_peak_force(*self[1:])
 
     def left(self, limit: float) -> Array:
         """What is left of a limit, N, to first order; in squares, nearly linear in the control."""
@@ -145,20 +139,21 @@ class BoundImpactSpeedLimit(BoundRollout):
     def place(self, qpos: Array, qvel: Array, control: Array | None) -> None:
         """Everything about a state but its constraint forces; without a control the actuators do not push."""
         m, d = self.plant.model, self._probe
-        d.qpos[:], d.qvel[:] = qpos, qvel
+        d.qpos[:] = qpos
         self._pushing = control is not None
         if control is not None:
             d.ctrl[:] = self.plant.controls(control)
         mujoco.mj_fwdPosition(m, d)
-        mujoco.mj_fwdVelocity(m, d)
+        # Once the motion has stopped, damping no longer holds back.
+        d.qvel[:] = 0.0
+        self._resting = self._forces()
+        self._speeds = d.qvel[:] = qvel
         self._moving = self._forces()
-        self._speeds = qvel
-        self._curving = bool(qvel.any())
-        self._resting: Array | None = None
 
     def _forces(self) -> Array:
         """Generalised forces without those of constraints, shape (nv,)."""
         m, d = self.plant.model, self._probe
+        mujoco.mj_fwdVelocity(m, d)
         mujoco.mj_fwdActuation(m, d)
         mujoco.mj_fwdAcceleration(m, d)
         return np.asarray(d.qfrc_smooth - (0.0 if self._pushing else d.qfrc_actuator))
@@ -180,30 +175,15 @@ class BoundImpactSpeedLimit(BoundRollout):
         stiffness = self.spec._stiffness
         if mobility < _FIXED:
             return Contact(gap, 0.0, 1.0 / _FIXED, stiffness, 0.0, 0.0)
-        mass = 1.0 / mobility if self.spec.effective_mass is None else self.spec.effective_mass
+        mass = 1.0 / mobility
         moving = float(given @ self._moving)
-        if self._curving:
-            mujoco.mj_jacDot(m, d, first_dot, None, points[:3], m.geom_bodyid[robot])
-            mujoco.mj_jacDot(m, d, second_dot, None, points[3:], m.geom_bodyid[other])
-            moving += float(normal @ (first_dot - second_dot) @ self._speeds)
+        mujoco.mj_jacDot(m, d, first_dot, None, points[:3], m.geom_bodyid[robot])
+        mujoco.mj_jacDot(m, d, second_dot, None, points[3:], m.geom_bodyid[other])
+        moving += float(normal @ (first_dot - second_dot) @ self._speeds)
         if not self._gaps.moves[pair]:
-            mass = float(reduced_mass(mass, self.spec._other_mass))
-        push = mass * max(moving, self._at_rest(given), 0.0)
+            mass = float(in_series(mass, self.spec._other_mass))
+        push = mass * max(moving, float(given @ self._resting), 0.0)
         return Contact(gap, max(speed, 0.0), mass, stiffness, push, max(-gap, 0.0))
-
-    def _at_rest(self, given: Array) -> float:
-        """Acceleration along the normal once the motion has stopped, when damping no longer holds it back, m/s^2."""
-        if self._resting is None:
-            self._resting = self._moving
-            if self._curving:
-                d = self._probe
-                velocity = d.qvel.copy()
-                d.qvel[:] = 0.0
-                mujoco.mj_fwdVelocity(self.plant.model, d)
-                self._resting = self._forces()
-                d.qvel[:] = velocity
-                mujoco.mj_fwdVelocity(self.plant.model, d)
-        return float(given @ self._resting)
 
     def backup(self) -> Array:
         """The braking with which every forecast goes on: what was admitted for its sake stays admissible."""
@@ -218,16 +198,9 @@ class BoundImpactSpeedLimit(BoundRollout):
         contacts = _together([self.contact(pair) for pair in range(len(self._gaps.pairs))])
         there = contacts.gap <= self._gaps.touch
         # Only a contact that is there counts; before it, how it will be is the forecast's to say.
-        left = self.spec._force - self._braked(contacts, there).peak
+        left = self.spec._force - contacts.peak
         self._lost = np.where(there, np.minimum(contacts.left(self._limit), 0.0), 0.0)
-        return left if self.spec.braking is not None else np.where(there, left, np.maximum(left, 0.0))
-
-    def _braked(self, contacts: Contact, there: NDArray[np.bool_]) -> Contact:
-        """Contacts to come at the speed that the declared braking leaves of them."""
-        if self.spec.braking is None:
-            return contacts
-        square = np.maximum(contacts.speed**2 - 2.0 * self.spec.braking * contacts.gap, 0.0)
-        return contacts._replace(speed=np.where(there, contacts.speed, np.sqrt(square)))
+        return np.where(there, left, np.maximum(left, 0.0))
 
     def _violation(self, value: Array) -> Array:
         return self._lost
@@ -241,8 +214,6 @@ class BoundImpactSpeedLimit(BoundRollout):
             for instant in self._gaps.touched(self.plant, forecast, self._probe, pair):
                 touched.setdefault(instant, []).append(pair)
         soon = self.plant.substeps - 1
-        if self.spec.braking is not None:
-            touched[soon] = list(range(pairs))
         # Without contact as much is left as in the gentlest one.
         room = np.full((k, pairs), 0.5 * self._limit)
         judged: list[tuple[int, int]] = []
@@ -255,9 +226,8 @@ class BoundImpactSpeedLimit(BoundRollout):
                 judged.append((instant, pair))
                 contacts.append(self.contact(pair))
         if judged:
-            together, (instants, those) = _together(contacts), np.transpose(judged)
-            there = together.gap <= self._gaps.touch[those]
-            room[instants, those] = self._braked(together, there).left(self._limit)
+            instants, those = np.transpose(judged)
+            room[instants, those] = _together(contacts).left(self._limit)
         return room + self.spec.margin
 
 

@@ -7,16 +7,12 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
-from safe_wrappers.constraints.contact.contact_feasibility import contacts_now, require_contacts
+from safe_wrappers.constraints.contact.contact_feasibility import require_contacts
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.legged.support_distances import support_distances
-from safe_wrappers.control.numerics.outlines import convex_outline
-from safe_wrappers.drawing.marks import Mark, ball, line
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.contacts import ContactForecast
 from safe_wrappers.plants.plant import Plant
-
-_DRAWN = 0.015  # m: radius of drawn lines
 
 
 @dataclass
@@ -75,21 +71,6 @@ class BoundSupportMargin(BoundSlacks):
             return np.array([np.nan])
         left = (d - self.spec.inset - self.spec.margin for d in self._distances(found))
         return np.array([min(left, default=0.0)])
-
-    def draw(self) -> list[Mark]:
-        """The support polygon on the ground, and the centre of the pressure, which on level ground is the point."""
-        now = contacts_now(self.plant)
-        pressed = np.maximum((now.force * now.normal).sum(axis=1), 0.0)
-        if not pressed.sum() > 0.0:
-            return []
-        center = pressed @ now.point / pressed.sum()
-        found = [ball("way", center, 1.5 * _DRAWN)]
-        try:
-            corners = convex_outline(now.point[:, :2])
-        except ValueError:  # on one line, or fewer than three
-            return found
-        level = np.column_stack([corners, np.full(len(corners), now.point[:, 2].mean())])
-        return [*found, *line("limit", level, _DRAWN, closed=True)]
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/zmp_margin` and `whole_body/supported`: forecast for the executed control."""

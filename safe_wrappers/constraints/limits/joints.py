@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, name_list, positive
-from safe_wrappers.constraints.limits.joint_marks import range_marks, speed_marks
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.numerics.compiled import compiled
-from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -231,9 +229,6 @@ class BoundJointPositionLimit(BoundRollout):
     def room(self, forecast: Forecast) -> Array:
         return self._left(forecast.qpos)
 
-    def draw(self) -> list[Mark]:
-        return range_marks(self.plant, self._ids, self._low + self.spec.margin, self._high - self.spec.margin)
-
 
 def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
     if given is None:
@@ -311,9 +306,6 @@ class BoundJointSpeedLimit(BoundRollout):
 
     def room(self, forecast: Forecast) -> Array:
         return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
-
-    def draw(self) -> list[Mark]:
-        return speed_marks(self.plant, self._ids, self._limits)
 
     def rows(self) -> HalfSpaces:
         """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""

@@ -7,16 +7,11 @@ import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, positive
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
-from safe_wrappers.drawing.marks import Mark, arrow, ball
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
-_DRAWN, _LIFTED = (
-    0.2,
-    0.05,
-)  # shares of the model's extent: how long the limit is drawn, and how high over the body
 DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 
 
@@ -134,24 +129,6 @@ class BoundSpeedLimit(BoundRollout):
         if self._sign is not None:
             return self.spec.limit - self._sign * velocity[..., 0]
         return np.asarray(self.spec.limit - np.sqrt((velocity * velocity).sum(axis=-1)))
-
-    def draw(self) -> list[Mark]:
-        """The velocity as an arrow over the machine, and on its way a ball, which the tip reaches at the limit."""
-        if self._before is None:
-            return []
-        moved = np.zeros(3)
-        moved[self._axes] = self._here - self._before
-        length = float(np.linalg.norm(moved))
-        if length < 1e-9:
-            return []
-        pose = self.plant.pose()
-        at = self._shares @ pose.xipos if self._body is None else pose.xpos[self._body]
-        extent = float(self.plant.model.stat.extent)
-        at = at + np.array([0.0, 0.0, _LIFTED * extent])
-        reach = _DRAWN * extent * moved / length
-        share = length / (self.plant.control_dt * self.spec.limit)
-        radius = 0.02 * float(np.linalg.norm(reach))
-        return [arrow("way", at, share * reach, 2.0 * radius), ball("limit", at + reach, 3.0 * radius)]
 
     def _violation(self, value: Array) -> Array:
         return np.zeros(1)  # the next step's displacement starts afresh: there is no way back to allow for

@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers.checks import Array, name_list, non_negative
-from safe_wrappers.constraints.obstacle_marks import obstacle_marks
-from safe_wrappers.constraints.obstacles import distances, obstacles_from
+from safe_wrappers.constraints.obstacles import distances, obstacle_marks, obstacles_from
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.drawing.marks import Mark, ball, edges, pad
 from safe_wrappers.errors import ConfigurationError

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.arguments import tells_arguments
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import (
@@ -31,7 +30,6 @@ _SCALE_WINDOWS = 8  # per fitted episode
 _LEAST_SCALE = 1e-3  # of the largest one
 
 
-@tells_arguments
 class IdentifiedPlant(RolloutPlant):
     """Rolls out a model `x+ = F(x, u)` that was fitted to logged episodes; x is the observation.
 

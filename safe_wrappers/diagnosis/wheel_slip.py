@@ -8,8 +8,17 @@ from safe_wrappers.constraints.limits.joints import driven_joints
 from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording
-from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, replayed, require_physics
+from safe_wrappers.diagnosis.symptom import (
+    Measured,
+    NotMeasuredError,
+    Symptom,
+    Treatment,
+    replayed,
+    require_physics,
+    wrapped,
+)
 from safe_wrappers.plants.mujoco.model import HINGE
+from safe_wrappers.wrappers.presets import SlipLimiter
 
 SLIPS = 0.2
 """Slip ratio from which on a wheel is beyond the peak of its traction on all usual grounds."""
@@ -42,7 +51,7 @@ def wheels(model: mujoco.MjModel) -> dict[int, float]:
 
 def slips(env: Env, recording: Recording) -> Array:
     """The slip ratio of each wheel after each step, shape (k, wheels)."""
-    model, _ = require_physics(env, "whose wheels could be read")
+    model, _ = require_physics(env)
     rolling = wheels(model)
     if not rolling:
         raise NotMeasuredError("no driven joint turns a wheel")
@@ -65,22 +74,13 @@ def measure(env: Env, recording: Recording) -> Measured:
         Evidence("95th percentile of the largest slip", float(np.percentile(worst, 95.0)), ""),
         Evidence("largest slip", float(worst.max()), ""),
     ]
-    return Measured(float((worst > SLIPS).mean()), worst, evidence)
+    return Measured(float((worst > SLIPS).mean()), evidence)
 
 
-def lines(env: Env, recording: Recording) -> tuple[str, str]:
+def treatment(env: Env, recording: Recording) -> Treatment:
     """A slip limiter of these wheels."""
-    model, _ = require_physics(env, "whose wheels could be read")
-    names = [model.joint(j).name for j in wheels(model)]
-    return f"env = sw.SlipLimiter(env, wheels={names})", ""
+    model, _ = require_physics(env)
+    return wrapped(SlipLimiter, wheels=[model.joint(j).name for j in wheels(model)])
 
 
-SYMPTOM = Symptom(
-    "wheels that spin or lock",
-    "section 1.5.2, wheel slip",
-    0.05,
-    "share",
-    ("largest slip", ""),
-    measure,
-    lines,
-)
+SYMPTOM = Symptom("wheels that spin or lock", 0.05, "share", measure, treatment)

@@ -1,4 +1,4 @@
-"""A policy to diagnose: a finished run's, or a model file of Stable-Baselines3."""
+"""`safe-wrappers diagnose`: symptoms of an env and of a trained policy, printed, and as JSON."""
 
 from __future__ import annotations
 
@@ -8,18 +8,54 @@ from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
+from rich.console import Console
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from safe_wrappers.diagnosis import Diagnosis, diagnose
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
-from ..config.algorithms import ALGORITHMS
-from ..policies import load_policy
-from ..run.data_pickles import pickles_of_model
+from .atomic import write_text
+from .config.algorithms import ALGORITHMS
+from .config.env_ids import make_env
+from .policies import load_policy
+from .run.data_pickles import pickles_of_model
 
 Policy = Callable[[Any], Any]
 _OF_PACKAGE: Final = {"recurrent": "RecurrentPPO", "maskable": "MaskablePPO"}
+
+
+def diagnose_command(
+    env_id: str,
+    policy: Path | None,
+    steps: int,
+    output: Path,
+    console: Console,
+    imports: Collection[str] = (),
+) -> Diagnosis:
+    """Diagnose an env by its id, print what was found, and write the same as JSON.
+
+    Args:
+        env_id: As `gym.make` takes it.
+        policy: A run's folder, or a model.zip; None: random and attacking drivers alone.
+        steps: Control steps of each driver.
+        output: Where the JSON goes.
+        console: Where the table goes.
+        imports: As `load_policy` takes it.
+    """
+    acts: Any = None
+    if policy is not None and policy.suffix != ".zip":
+        env, acts = of_run(policy, env_id, imports)
+    else:
+        env = make_env(env_id, {})
+        acts = acts if policy is None else of_file(policy)
+    found = diagnose(env, acts, steps)
+    env.close()
+    write_text(output, found.as_json())
+    console.print(str(found), highlight=False, markup=False, soft_wrap=True)
+    console.print(f"JSON: {output}", highlight=False, markup=False, soft_wrap=True)
+    return found
 
 
 def of_run(folder: Path, env_id: str, imports: Collection[str] = ()) -> tuple[gym.Env[Any, Any], Policy]:

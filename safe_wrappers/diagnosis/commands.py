@@ -1,0 +1,113 @@
+"""Commands that spike at switches and seams; and energy that a late link makes."""
+
+import numpy as np
+
+from safe_wrappers import info as keys
+from safe_wrappers.checks import Array
+from safe_wrappers.diagnosis.finding import Evidence
+from safe_wrappers.diagnosis.recording import Env, Recording, box
+from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom, Treatment, wrapped
+from safe_wrappers.errors import SafeWrappersError
+from safe_wrappers.plants import RigidModelCheck, rigid_model_check
+from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.wrappers.teleop import Link
+from safe_wrappers.wrappers.teleop_channel import TeleopChannel
+
+RATE = 0.05
+"""Share of the range of commands by which the proposed handover lets them change in a control step."""
+RINGS = 0.05
+"""Of the amplitude of a full step, what a ramp at the rate proposed for joints that ring leaves vibrating."""
+
+
+def command_steps(env: Env, recording: Recording) -> Array:
+    """The largest change of a command in each step, as a share of the range, shape (k,); 0 at an episode's start."""
+    low, high = box(env.unwrapped)
+    commands = recording.executed / np.where(high > low, high - low, 1.0)
+    steps = np.abs(np.diff(commands, axis=0, prepend=commands[:1])).max(axis=1)
+    return np.asarray(np.where(recording.first, 0.0, steps))
+
+
+def measure_steps(env: Env, recording: Recording) -> Measured:
+    """The largest command steps, but for one in a hundred control steps, as a share of the range."""
+    if len(recording.executed) < 2:
+        raise NotMeasuredError("a command step takes two control steps")
+    steps = command_steps(env, recording)
+    figure = float(np.percentile(steps, 99.0))
+    evidence = [Evidence("median command step", float(np.median(steps)), "of the range")]
+    gaps = np.diff(np.flatnonzero(steps > 0.5 * figure)) if figure > 0.0 else np.zeros(0)
+    if gaps.size:
+        evidence.append(Evidence("control steps between large ones, median", float(np.median(gaps)), ""))
+    springs = _ringing(env)
+    if springs is not None:
+        evidence.append(Evidence("slowest resonance of its joints", springs.resonances[0], "rad/s"))
+    return Measured(figure, evidence)
+
+
+def _ringing(env: Env) -> RigidModelCheck | None:
+    """Springs behind the motors that ring on after a step; None where there are none, or none can be read."""
+    try:
+        check = rigid_model_check(env.unwrapped)
+    except SafeWrappersError:
+        return None
+    return None if not check.springs or check.rigid_is_good_enough else check
+
+
+def treatment_of_steps(env: Env, recording: Recording) -> Treatment:
+    """A handover of single actions that bounds the rate of commands.
+
+    A ramp at rate r leaves at most 2 r / (w range) of the amplitude that a step of the whole range leaves in a
+    resonance w.
+    """
+    low, high = box(env)
+    chunks = "If the policy gives chunks, pass them whole: ChunkHandover(env, chunk_size=..., execution_horizon=...)."
+    springs = _ringing(env)
+    if springs is None:
+        rate = [RATE * float((high - low).min()) / recording.control_dt]
+    else:
+        rate = [0.5 * springs.resonances[0] * RINGS * float(span) for span in high - low]
+        chunks = f'Its joints ring: this limit is slow. {chunks[:-2]}, flexible="auto").'
+    limit = [float(f"{each:.4g}") for each in rate]
+    return wrapped(
+        ChunkHandover, chunks, chunk_size=1, execution_horizon=1,
+        rate_limit=limit if len(limit) > 1 else limit[0],
+    )  # fmt: skip
+
+
+def measure_energy(env: Env, recording: Recording) -> Measured:
+    """The most energy that operator and machine together had got out of a `TeleopChannel` in an episode, J."""
+    created = recording.of_info(keys.TELEOP_CREATED_J)
+    if np.isnan(created).all():
+        raise NotMeasuredError("no TeleopChannel accounts for the energy at a port of this env")
+    figure = float(np.nanmax(created))
+    seconds = len(created) * recording.control_dt
+    return Measured(figure, [Evidence("energy made per second of the run", figure / seconds, "W")])
+
+
+def treatment_of_energy(env: Env, recording: Recording) -> Treatment:
+    """The same link with waves, where it is the outermost wrapper and has no ceiling."""
+    advice = "Passive is not harmless: waves bound neither force nor displacement; a RoundTripCeiling bounds the way."
+    ceiling = np.isfinite(recording.of_info(keys.TELEOP_CEILING_S)).any()
+    if not isinstance(env, TeleopChannel) or env.port is None or ceiling:
+        return Treatment(advice=f'Give the TeleopChannel coding="wave" and an impedance. {advice}')
+    link = {
+        name: given.delay_s if given == Link(given.delay_s) else given
+        for name, given in (("uplink", env.uplink), ("downlink", env.downlink))
+    }
+    impedance = env.port.feedthrough or 1.0  # that of the coupling reflects least
+    inner = wrapped(TeleopChannel, advice, **link, coding="wave", impedance=impedance)
+    make = inner.wrap
+    assert make is not None
+    return Treatment(inner.code.replace("(env,", "(env.env,"), lambda outer: make(env.env), advice)
+
+
+STEPS = Symptom(
+    "commands that spike at switches or chunk seams",
+    0.2,
+    "of the range",
+    measure_steps,
+    treatment_of_steps,
+    True,
+)
+ENERGY = Symptom(
+    "energy made by a late link: contacts that chatter", 0.1, "J", measure_energy, treatment_of_energy, True
+)
