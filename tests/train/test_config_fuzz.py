@@ -312,7 +312,7 @@ PARTS = {
         st.sampled_from(["safe_wrappers:CBFActionFilter", "safe_wrappers:protect", "nowhere:f", "json:nope"]),
         options_of(["constraints", "margin", "fallback", "plant"]),
     ),
-    "arms.a.learner": st.sampled_from(["safe_set_map", {"kind": "safe_set_map", "anchor": "nowhere:f"}]),
+    "arms.a.learner": st.sampled_from(["safe_set_map", "both"]),
     "arms.a.start_from": st.sampled_from(["b", "a.zip", "/", ".zip"]),
     "hyperparameters": options_of(
         ["policy", "policy_kwargs", "ent_coef", "train_freq", "rollout_buffer_class"]

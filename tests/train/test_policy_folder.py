@@ -331,7 +331,6 @@ def test_a_policy_imports_no_module_that_was_not_named(reacher, policy, tmp_path
         "env.cost": {**arm, "env": {**arm["env"], "cost": "unread:f"}},
         "env.judge.factory": {**arm, "env": {**arm["env"], "judge": factory}},
         "env.observation.factory": {**arm, "env": {**arm["env"], "observation": factory}},
-        "learner.anchor": {**arm, "learner": {"kind": "safe_set_map", "anchor": "unread:f"}},
         "env.id": {**arm, "env": {**arm["env"], "id": "unread:Reacher-v5"}},
     }.items():
         (policy / "config.json").write_text(json.dumps({**plain, "config": config}))

@@ -9,14 +9,9 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.replaced_actions import ANCHORS
 
 from .section import Section
-from .types import Number, matching
-
-_ANCHOR: Final = "centre"
-_NAMED: Final = ", ".join(ANCHORS)
-AnchorName = Annotated[str, matching(rf"{'|'.join(ANCHORS)}|[\w.]+:\w+", f"{_NAMED} or 'module:function'")]
+from .types import Number
 
 
 @dataclass(frozen=True)
@@ -38,7 +33,7 @@ class LearnerConfig(Section):
 
     text_is: ClassVar[str] = "kind"
     _PENALISED: ClassVar = ("adaption_penalty", "both")
-    _PENALTIES: ClassVar = ("penalty", "per_correction", "per_squared", "bounded", "scale")
+    _PENALTIES: ClassVar = ("penalty", "per_correction")
 
     kind: Literal["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"] = "naive"
     """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ. `safe_set_map` is a
@@ -47,14 +42,6 @@ class LearnerConfig(Section):
     """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
     """For the same: taken off per unit of correction."""
-    per_squared: Annotated[Number, Field(ge=0)] = 0.0
-    """For the same: taken off per squared unit of correction."""
-    bounded: Annotated[Number, Field(ge=0)] = 0.0
-    """For the same: taken off times `1 - exp(-(correction / scale)^2)`, so that no correction costs more."""
-    scale: Annotated[Number, Field(gt=0)] = 1.0
-    """Of `bounded`, in action units."""
-    anchor: AnchorName = _ANCHOR
-    """For `safe_set_map`: `centre`, `backup`, `closest`, or `module:function`, a function of the env."""
     margin_curriculum: MarginCurriculumConfig | None = None
     """A margin that the arm's filter adds in training and that changes; see [its
     keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
@@ -66,24 +53,18 @@ class LearnerConfig(Section):
 
     @model_validator(mode="after")
     def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
-        given = bool(self.penalty or self.per_correction or self.per_squared or self.bounded)
+        given = bool(self.penalty or self.per_correction)
         if self.penalised and not given:
             raise ConfigurationError(
                 f"{self.kind} needs a penalty in units of the task's reward, per changed step or by the size of the"
-                f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction, per_squared or bounded."
+                f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction."
             )
         if given and not self.penalised:
             raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
-        if self.scale != 1.0 and not self.bounded:
-            raise ConfigurationError(
-                f"scale belongs to bounded: {{kind: {self.kind}, bounded: 0.1, scale: 0.5}}."
-            )
         if self.multiplier_rate != LearnerConfig.multiplier_rate and self.cost_limit is None:
             raise ConfigurationError(
                 "multiplier_rate belongs to cost_limit: {cost_limit: 25, multiplier_rate: 0.001}."
             )
-        if self.anchor != _ANCHOR and not self.maps:
-            raise ConfigurationError(f"{self.kind} takes no anchor; safe_set_map does.")
         return self
 
     @property

@@ -45,8 +45,8 @@ class FilterConfig(Section):
     """Further arguments of the factory."""
     lease: Annotated[Options | None, AfterValidator(check_lease)] = None
     """Arguments of a [LeaseExpiry](wrappers/lease-expiry.md) around the filter."""
-    escape: Annotated[Options | None, with_keys(arguments(StuckEscape, "value"))] = None
-    """Arguments of a [StuckEscape](wrappers/stuck-escape.md) around the filter, but for `value`."""
+    escape: Annotated[Options | None, with_keys(arguments(StuckEscape))] = None
+    """Arguments of a [StuckEscape](wrappers/stuck-escape.md) around the filter."""
 
     @model_validator(mode="before")
     @classmethod

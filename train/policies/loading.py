@@ -97,8 +97,8 @@ def _of_folder(folder: Path, other_filter: bool, imports: Collection[str]) -> Tr
 
 def _modules(arm: ArmConfig) -> Iterator[tuple[str, str]]:
     """Where a config names a module that is not of this library, and the module."""
-    env, learner = arm.env, arm.learner
-    names = {"env.id": env.id, "env.cost": env.cost, "learner.anchor": learner.anchor}
+    env = arm.env
+    names = {"env.id": env.id, "env.cost": env.cost}
     for place, used in (
         ("filter", arm.filter),
         ("env.judge", env.judge),

@@ -10,7 +10,6 @@ import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
 
 import safe_wrappers
-from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
@@ -67,8 +66,7 @@ def make_stack(
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
     if learner.maps and action_filter.kind != "none":
-        named = ":" in learner.anchor
-        task = SafeActionMap(task, _function(learner.anchor, "learner.anchor") if named else learner.anchor)
+        task = SafeActionMap(task)
     if observed is not None:
         task = _with_features(task, observed)
     if action_filter.escape is not None:
@@ -79,7 +77,7 @@ def make_stack(
             recorded = FAULTS[name](recorded, **arguments)
         except TypeError as error:
             raise ConfigurationError(f"env.faults.{name}: {error}") from None
-    monitored = Monitor(recorded, info_keywords=keys.RUNNING)
+    monitored = Monitor(recorded)
     if not learner.penalised:
         return monitored
     return AdaptionPenalty(monitored, **learner.penalties)
