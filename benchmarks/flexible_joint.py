@@ -46,7 +46,9 @@ def smoothstep_energy(
 
     With `cut_short` for a blend that may stop anywhere on its way.
     """
-    share = smoothstep_share(resonances(*machine) * duration, cut_short)
+    phase = resonances(*machine) * duration
+    # Stopped on its way, a change whose rate rises once and falls once leaves at most 2 max(s') / w, by parts.
+    share = np.minimum(1.0, 3.75 / phase) ** 2 if cut_short else smoothstep_share(phase)
     return np.asarray((step_energies(torque_step, *machine) * share).sum(axis=-1))
 
 

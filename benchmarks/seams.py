@@ -77,7 +77,7 @@ class Job:
 
 def jobs(task: Task, episodes: int, seed: int) -> list[Job]:
     """The rows of an env's table."""
-    ways = [("replace", "-"), ("ensemble", "-")]
+    ways = [("replace", "-")]
     springs = (FLEXIBLE,) if "Flex" in task.env else ()
     ways += [(blend, bounds) for bounds in (RATE, TIME, RATE_AND_TIME, *springs) for blend in BLENDS]
     return [

@@ -48,14 +48,8 @@ SETTLED_S = 1.5
 """After the first touch the force is ramped up until then."""
 CODINGS: Final[dict[str, dict[str, Any]]] = {
     "plain": {"coding": "plain"},
-    "controller": {"coding": "plain", "passivity": "controller", "storage_j": 0.02},
     "wave": {"coding": "wave", "impedance": 40.0},
 }
-RULES: Final[dict[str, dict[str, Any]]] = {
-    "wave, hold": {**CODINGS["wave"], "wave_rule": "hold"},
-    "wave, zero": {**CODINGS["wave"], "wave_rule": "zero"},
-}
-"""Other rules for packets that are late; where no packet is, they are all the same."""
 NETWORKS = ("steady", "rough", "outages")
 OPERATORS = ("careful", "looks away", "corners")
 CORNERS_DELAYS_S = (0.0, 0.05, 0.2)
@@ -102,7 +96,7 @@ def channel(job: Job) -> sw.TeleopChannel:
         uplink=link(job.network, job.delay_s),
         downlink=link(job.network, job.delay_s),
         ceiling=ceiling if job.revocation else None,
-        **{**CODINGS, **RULES}[job.coding],
+        **CODINGS[job.coding],
     )
 
 
@@ -179,12 +173,11 @@ def run(job: Job) -> dict[str, Any]:
         breached += int(info["cost"] > 0.0)
         revoked += int(info["teleop/revoked"])
         created = info["teleop/created_j"]
-    storage = 2.0 * float(CODINGS.get(job.coding, {}).get("storage_j", 0.0))  # at each end
     return {
         **asdict(job),
         "excess_j": excess(net, flying),
-        "made_j": max(-float(net.min()) - storage, 0.0),
-        "made_at_hand_j": max(-at_hand - storage, 0.0),
+        "made_j": max(-float(net.min()), 0.0),
+        "made_at_hand_j": max(-at_hand, 0.0),
         "created_j": created,
         "flying_j": float(flying.max()),
         "breached_steps": breached,
@@ -280,7 +273,6 @@ def tables(rows: list[dict[str, Any]]) -> str:
     return "\n\n".join(
         [
             energy_table(rows, tuple(CODINGS), NETWORKS),
-            energy_table(rows, ("wave", *RULES), ("rough",)),
             clearance_table(rows),
             both_table(rows),
         ]
@@ -294,11 +286,10 @@ def jobs(seeds: int) -> list[Job]:
         for seed in range(seeds)
         for network in NETWORKS
         for delay in DELAYS_S
-        for coding in (*CODINGS, *RULES)
+        for coding in CODINGS
         for operator in OPERATORS
         for revocation in (False, True)
-        if (coding not in RULES or (network, operator, revocation) == ("rough", "careful", False))
-        and (operator != "corners" or delay in CORNERS_DELAYS_S)
+        if operator != "corners" or delay in CORNERS_DELAYS_S
     ]
 
 

@@ -53,10 +53,9 @@ ROWS: list[tuple[str, str, Wrap]] = [
     *(
         (env, f"ChunkHandover, {blend}", bounded(blend))
         for env in ("Reacher-v5", "FlexJointReach-v0", "HalfCheetah-v5")
-        for blend in ("smoothstep", "quintic", "hermite")
+        for blend in ("smoothstep", "quintic")
     ),
     ("Reacher-v5", "ChunkHandover, replacement", chunks(blend="replace")),
-    ("Reacher-v5", "ChunkHandover, temporal ensembling", chunks(blend="ensemble")),
     (
         "Reacher-v5",
         "LeaseExpiry, the user's clearance",

@@ -181,6 +181,8 @@ HANDOVER_SEAM_JUMP: Final = _key("handover/seam_jump", "float64", shape="(3,)", 
 of the three after it."""
 HANDOVER_PEAK_JERK: Final = _key("handover/peak_jerk", "float64", unit="action/s", log="peak_jerk")
 """The largest rate of change between neighbouring executed commands, of any component."""
+HANDOVER_BLEND_TIME: Final = _key("handover/blend_time", "float64", unit="s", log="blend_time")
+"""Duration of the longest blend that began in this step; 0 where none did."""
 HANDOVER_STARVED: Final = _key("handover/starved", "int64", log="starved")
 """Control steps of this step at which the queue was empty and the fallback gave the command."""
 HANDOVER_LIMITED: Final = _key("handover/limited", "int64", log="limited")

@@ -18,7 +18,6 @@ KINDS: tuple[tuple[str, dict[str, float]], ...] = (
     ("FrozenPolicy", {"mean_between_s": 1.0, "mean_length_s": 0.5}),
     ("RepeatedCommands", {"share": 0.3}),
     ("Jitter", {"longest_s": 0.3}),
-    ("ClockSkew", {"offset_s": -0.1, "drift": 0.04}),
 )
 
 

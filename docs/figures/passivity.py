@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, panels
 from safe_wrappers.control.teleop.passivity import ChannelLedger
-from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
+from safe_wrappers.control.teleop.wave_line import WaveLine
 
 TICKS = 48
 """Per period."""
@@ -79,15 +79,12 @@ def _lines(ax: Axes) -> None:
         newest = max([newest, *due[tick]])
         repeated[tick] = energy[newest] if newest >= 0 else 0.0
     ax.plot(times, 1e3 * np.cumsum(repeated), color=FORBIDDEN, label="last one repeated")
-    rules: tuple[Rule, ...] = ("queue", "hold", "zero")
-    for rule in rules:
-        line, out = WaveLine(TICK_S, rule), []
-        for tick in range(PACKETS):
-            line.send(waves[tick], tick)
-            line.deliver([(k, waves[k]) for k in due[tick]])
-            out.append(line.put_out_j)
-        label = "a wave line, by any rule" if rule == rules[0] else None
-        ax.plot(times, 1e3 * np.array(out), color=ON, lw=1.2, label=label)
+    line, out = WaveLine(TICK_S), []
+    for tick in range(PACKETS):
+        line.send(waves[tick], tick)
+        line.deliver([(k, waves[k]) for k in due[tick]])
+        out.append(line.put_out_j)
+    ax.plot(times, 1e3 * np.array(out), color=ON, lw=1.2, label="a wave line")
     ax.grid(axis="y", lw=0.4, color=GRID)
     ax.set(xlabel="time (ms)", ylabel="energy put out (mJ)")
     ax.legend(loc="upper left", fontsize=8)

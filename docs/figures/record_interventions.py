@@ -1,4 +1,4 @@
-"""What one recorded episode looks like: corrections step by step, and the running figures beside them."""
+"""What one recorded episode looks like: corrections step by step, and their means so far."""
 
 import gymnasium as gym
 import numpy as np
@@ -20,9 +20,11 @@ def draw() -> Figure:
     time = np.arange(STEPS) * 0.02
     steps.fill_between(time, [i["cbf/correction"] for i in infos], step="mid", color=ON, alpha=0.8, lw=0)
     steps.set_ylabel("cbf/correction")
-    running.plot(time, [i["interventions/rate"] for i in infos], color=OFF, label="interventions/rate")
-    mean = [i["interventions/correction_mean"] for i in infos]
-    running.plot(time, mean, color=OTHER, label="interventions/correction_mean")
+    count = np.arange(1, STEPS + 1)
+    rate = np.cumsum([i["cbf/intervened"] for i in infos]) / count
+    running.plot(time, rate, color=OFF, label="intervention_rate")
+    mean = np.cumsum([i["cbf/correction"] for i in infos]) / count
+    running.plot(time, mean, color=OTHER, label="correction_mean")
     running.legend(loc="upper left")
     running.set_ylim(0.0, 1.0)
     for ax in (steps, running):

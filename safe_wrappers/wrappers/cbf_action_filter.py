@@ -2,6 +2,7 @@
 
 import copy
 import math
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -105,6 +106,16 @@ class CBFActionFilter(LayerWrapper):
         self.filter = self._filter()
         self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
+        self._deciding = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the lock, which no copy shares."""
+        return {name: value for name, value in vars(self).items() if name != "_deciding"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a state of `__getstate__`."""
+        vars(self).update(state)
+        self._deciding = threading.Lock()
 
     def _take_action_space(self, env: Env) -> None:
         space = check_actions(env)
@@ -166,13 +177,14 @@ class CBFActionFilter(LayerWrapper):
         return report | self.filter.info(None, None)
 
     def step(self, action: Any) -> Step:
-        """Filter the action and step the env with what may be executed."""
-        started = time.perf_counter()
-        sent, report = self.judge(action)
-        self.filter_seconds += time.perf_counter() - started
-        self.filter_calls += 1
-        observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
-        self.plant.received(observation, info)
+        """Filter the action and step the env with what may be executed; another thread waits meanwhile."""
+        with self._deciding:  # the env makes the step that was judged, from the state in which it was
+            started = time.perf_counter()
+            sent, report = self.judge(action)
+            self.filter_seconds += time.perf_counter() - started
+            self.filter_calls += 1
+            observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
+            self.plant.received(observation, info)
         info |= report
         info[keys.CBF_MISMATCH] = self.deviates()
         if self.filter.reporting:

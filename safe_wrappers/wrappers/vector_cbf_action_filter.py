@@ -19,7 +19,6 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, CBFActionFilter
-from safe_wrappers.wrappers.episode_guard import EpisodeGuard
 from safe_wrappers.wrappers.layer import action_array
 
 Mask = NDArray[np.bool_]
@@ -33,7 +32,7 @@ else:
     _Wrapper = VectorWrapper  # no generic class in Gymnasium 1.1
 
 
-class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
+class VectorCBFActionFilter(_Wrapper):
     """Filters the actions of all envs of a `SyncVectorEnv`.
 
     Every env has a `CBFActionFilter` of its own beside it, with the same guarantees; its executed actions are the
@@ -80,7 +79,6 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         margin: float = 0.0,
     ) -> None:
         super().__init__(env)
-        self.await_reset()
         envs = single_envs(env)
         plants = [copy.deepcopy(plant) for _ in envs]
         self.filters = [
