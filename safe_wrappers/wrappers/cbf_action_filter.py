@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
@@ -61,6 +62,7 @@ class CBFActionFilter(LayerWrapper):
         added_margin: Added to every constraint's own; `set_margin` changes it.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         warned: What has been warned of: "nonfinite", "clipped", "mismatch", and "unsafe" until the next reset.
+        started: Whether there was a reset.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
     Raises:
@@ -104,7 +106,7 @@ class CBFActionFilter(LayerWrapper):
         self.plant.bind(env)
         self._fallback, self._solver = fallback, solver
         self.filter = self._filter()
-        self._observed = False
+        self.started = self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
         self._deciding = threading.Lock()
 
@@ -163,7 +165,7 @@ class CBFActionFilter(LayerWrapper):
     def start_report(self) -> dict[str, Any]:
         """Take the state that a reset has left: the info keys of a new episode."""
         self.warned.discard("unsafe")
-        self._observed = False
+        self.started, self._observed = True, False
         self.filter.start()
         margin, unsafe = self._margin()
         report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
@@ -214,6 +216,8 @@ class CBFActionFilter(LayerWrapper):
 
         The env must be stepped with it next. The constraints' own keys are not among these.
         """
+        if not self.started:
+            raise gym.error.ResetNeeded("call reset before step")
         proposed: Array = action_array(action, self._shape, np.float64)
         if not self._observed:
             self.filter.observe()

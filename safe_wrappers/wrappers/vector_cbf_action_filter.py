@@ -138,6 +138,8 @@ class VectorCBFActionFilter(_Wrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Filter the actions, shape (n, m), and step the envs with what may be executed."""
+        if not self.filters[0].started:
+            raise gym.error.ResetNeeded("call reset before step")
         started = time.perf_counter()
         given = action_array(actions, (self.num_envs, *self._low.shape))
         judged = ~self._ended if self._next_step else np.ones(self.num_envs, dtype=bool)

@@ -70,8 +70,8 @@ def test_what_is_written_is_registered_as_it_is_and_what_is_registered_is_writte
 
 
 def test_the_constants_are_the_names_and_figures_are_made_of_registered_keys():
-    constants = {v for k, v in vars(keys).items() if k.isupper() and type(v) is str} - {keys.RUNNING_PREFIX}
-    assert constants | set(keys.RUNNING) == set(keys.KEYS)
+    constants = {v for k, v in vars(keys).items() if k.isupper() and type(v) is str}
+    assert constants == set(keys.KEYS)
     assert all(key.name == name for name, key in keys.KEYS.items())
     assert {name for figure in keys.EPISODE for name in figure.of} <= set(keys.KEYS)
     assert {key.where for key in keys.KEYS.values()} - {""} <= set(keys.KEYS)
