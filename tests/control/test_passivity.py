@@ -51,16 +51,6 @@ def test_every_way_through_the_transform_ends_at_the_same_port(port, b):
     np.testing.assert_allclose(operator.outgoing, u, **waves)
 
 
-def test_waves_by_hand():
-    u, w = to_waves(4.0, 1.0, 2.0)
-    assert (u, w) == (3.0, 1.0)  # (4 + 2) / 2 and (4 - 2) / 2
-    batch = to_waves(np.full((5, 2), 4.0), np.full((5, 2), 1.0), 2.0)
-    assert batch.u.shape == (5, 2)
-
-
-DT = 0.01
-
-
 class Behind:
     """What is connected at the remote port: a damper, a spring or a mass; flow in, effort back."""
 

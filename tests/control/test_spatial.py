@@ -113,48 +113,11 @@ def test_the_derivative_of_the_gyro_is_the_angular_acceleration(spinning):
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_the_terms_are_the_derivatives_of_the_points_position():
-    """A point on a body that turns faster and faster about a fixed axis while its centre flies on a parabola."""
-    axis, start, pull = np.array([0.36, 0.48, 0.8]), np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -9.81])
-    arm_in_body = np.array([0.4, -0.3, 0.2])
-
-    def turned(t):
-        return Rotation.from_rotvec((1.5 * t + 0.5 * 2.0 * t**2) * axis)
-
-    def position(t):
-        return start * t + 0.5 * pull * t**2 + turned(t).apply(arm_in_body)
-
-    t, step = 0.7, 1e-4
-    arm, turning, speeding = turned(t).apply(arm_in_body), (1.5 + 2.0 * t) * axis, 2.0 * axis
-    velocity = lever_arm_velocity(start + pull * t, turning, arm)
-    acceleration = lever_arm_acceleration(pull, turning, speeding, arm)
-    behind, here, ahead = position(t - step), position(t), position(t + step)
-    np.testing.assert_allclose(velocity, (ahead - behind) / (2 * step), atol=1e-6)
-    np.testing.assert_allclose(acceleration, (ahead - 2 * here + behind) / step**2, atol=1e-5)
-
-
-def test_the_acceleration_has_a_tangential_and_a_centripetal_part():
-    """Turning about z at 3 rad/s, faster by 2 rad/s each second, 0.5 m out along x: -w² r inwards, α r across."""
-    found = lever_arm_acceleration(
-        np.zeros(3), np.array([0.0, 0.0, 3.0]), np.array([0.0, 0.0, 2.0]), np.array([0.5, 0.0, 0.0])
-    )
-    np.testing.assert_allclose(found, [-4.5, 1.0, 0.0])
-
-
 @given(VECTORS, VECTORS, VECTORS, VECTORS)
 def test_the_inverse_undoes_the_lever_arm(value, turning, speeding, arm):
     there = lever_arm_acceleration(value, turning, speeding, arm)
     back = centre_acceleration(there, turning, speeding, arm)
     np.testing.assert_allclose(back, value, atol=1e-10)
-
-
-def test_leading_axes_broadcast():
-    rng = np.random.default_rng(1)
-    a, w, dw, arms = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3), rng.normal(size=(4, 2, 3))
-    many = lever_arm_acceleration(a, w, dw, arms)
-    assert many.shape == (4, 2, 3)
-    np.testing.assert_allclose(many[3, 1], lever_arm_acceleration(a, w, dw, arms[3, 1]))
-    np.testing.assert_allclose(lever_arm_velocity(a, w, arms)[2, 0], lever_arm_velocity(a, w, arms[2, 0]))
 
 
 @given(arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), VECTORS, VECTORS, VECTORS)
@@ -168,24 +131,6 @@ def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
     np.testing.assert_allclose(seen, pose.inv().apply(points), atol=1e-12)
     np.testing.assert_allclose(from_sensor(seen, rotation, origin), points, atol=1e-12)
     np.testing.assert_allclose(to_sensor(points[2], rotation, origin), seen[2], atol=1e-14)
-
-
-def test_a_sensors_own_position_is_its_origin():
-    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    pose = rigid_transform(quarter, [1.0, 2.0, 0.0]) * rigid_transform(np.eye(3), [0.5, 0.0, 0.0])
-    np.testing.assert_allclose(pose.translation, [1.0, 2.5, 0.0], atol=1e-15)
-    # What is 1 m to the left of the sensor is at -x in the world.
-    np.testing.assert_allclose(
-        from_sensor(np.array([0.0, 1.0, 0.0]), pose.rotation.as_matrix(), pose.translation),
-        [0.0, 2.5, 0.0],
-        atol=1e-15,
-    )
-
-
-def test_many_poses_at_once():
-    turns = Rotation.random(3, rng=np.random.default_rng(0))
-    poses = rigid_transform(turns.as_matrix(), np.arange(9.0).reshape(3, 3))
-    np.testing.assert_allclose(poses.translation[1], [3.0, 4.0, 5.0])
 
 
 @pytest.mark.parametrize(

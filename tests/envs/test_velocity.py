@@ -324,10 +324,8 @@ def test_the_training_stack_counts_the_cost():
     while not truncated:
         *_, truncated, info = stack.step(stack.action_space.sample())
         costs.append(info["cost"])
-        assert info["interventions/cost"] == info["interventions/cost_substep"] == sum(costs)
     assert 0 < sum(costs) < 50
     assert info["interventions"]["violations"] == info["interventions"]["cost"] == sum(costs)
-    assert info["episode"]["interventions/cost"] == sum(costs)
 
 
 # Frames ------------------------------------------------------------------------------------------------------

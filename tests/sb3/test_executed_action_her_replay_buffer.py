@@ -6,16 +6,15 @@ import goal_line
 import numpy as np
 import pytest
 import torch
-from goal_line import BonusLine, filtered, penalised
+from goal_line import filtered, penalised
 from line_world import HOLD, WALL, cost
 from scipy import stats
 from stable_baselines3 import SAC, HerReplayBuffer
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
-from safe_wrappers.train.run.checkpoint import _move
 
 torch.set_num_threads(1)
 ENVS = {"safe_action": filtered, "both": penalised, "adaption_penalty": penalised}
@@ -129,16 +128,6 @@ def test_without_a_changed_step_it_is_sb3s_buffer_bit_for_bit(mode, n_envs):
         np.testing.assert_array_equal(mine, other)
 
 
-def test_the_penalty_is_all_that_sb3s_buffer_lacks():
-    ours = draw(learn("adaption_penalty").replay_buffer, 500)
-    theirs = draw(learn("adaption_penalty", buffer=HerReplayBuffer).replay_buffer, 500)
-    for name in sorted(vars(ours).keys() - {"reward"}):
-        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
-    np.testing.assert_array_equal(ours.reward[:100], theirs.reward[:100])
-    np.testing.assert_allclose(ours.reward[100:], (theirs.reward - ours.charged)[100:], atol=1e-4)
-    assert ours.refused[100:].any()
-
-
 def test_both_draws_uniformly_from_all_transitions():
     buffer = learn("both").replay_buffer
     whole = sum(len(slots) for _, slots in episodes(buffer))
@@ -148,13 +137,6 @@ def test_both_draws_uniformly_from_all_transitions():
     _, counts = np.unique(np.stack([drawn.number, drawn.refused]), axis=1, return_counts=True)
     assert len(counts) == whole + twice
     assert stats.chisquare(counts).pvalue > 1e-3
-
-
-def test_a_full_buffer_forgets_whole_episodes():
-    drawn = draw(learn("both", n_envs=1, buffer_size=40).replay_buffer, 400)
-    np.testing.assert_allclose(drawn.reward, -np.abs(drawn.x_after - drawn.goal) - drawn.charged, atol=1e-4)
-    assert len(np.unique(drawn.number)) <= 40
-    assert drawn.refused.any() and not drawn.refused.all()
 
 
 @all_modes
@@ -190,30 +172,6 @@ def test_what_is_drawn_is_normalised_after_the_penalty(mode):
     rms = envs.obs_rms["desired_goal"]
     centred = np.clip((raw.goal - rms.mean) / np.sqrt(rms.var + envs.epsilon), -10, 10)
     np.testing.assert_allclose(drawn.observations["desired_goal"].ravel(), centred, rtol=1e-4, atol=1e-5)
-
-
-@all_modes
-def test_a_reward_that_needs_the_infos_gets_those_of_its_step(mode):
-    make = functools.partial(ENVS[mode], task=BonusLine)
-    drawn = draw(learn(mode, make, copy_info_dict=True).replay_buffer, 300)
-    expected = 100.0 * drawn.steps_after - np.abs(drawn.x_after - drawn.goal) - drawn.charged
-    np.testing.assert_allclose(drawn.reward, expected, atol=2e-4)
-
-
-def test_compute_reward_is_the_tasks_through_all_wrappers_and_processes():
-    for vec_env in (DummyVecEnv, functools.partial(SubprocVecEnv, start_method="fork")):
-        envs = vec_env([penalised] * 2)
-        achieved, goals = np.array([[0.0], [0.25], [-1.0]]), np.array([[1.0], [0.0], [-1.0]])
-        (rewards,) = envs.env_method("compute_reward", achieved, goals, [{}] * 3, indices=[0])
-        np.testing.assert_array_equal(rewards, [-1.0, -0.25, 0.0])
-        envs.close()
-
-
-def test_it_works_with_envs_in_other_processes():
-    fork = functools.partial(SubprocVecEnv, start_method="fork")
-    there, here = learn("both", vec_env=fork), learn("both")
-    np.testing.assert_array_equal(there.replay_buffer.penalties, here.replay_buffer.penalties)
-    there.env.close()
 
 
 # One step, by hand ---------------------------------------------------------------------------------------------
@@ -259,18 +217,6 @@ def test_an_action_that_is_not_finite_is_neither_stored_nor_charged(mode):
     np.testing.assert_allclose(drawn.reward[10:], 0.0)  # the new goal is where it was
 
 
-@pytest.mark.parametrize(
-    ("mode", "wrote", "message"),
-    [
-        ("adaption_penalty", {}, "mode 'adaption_penalty' stores a penalised transition; wrap the env in"),
-        ("safe_action", {keys.ADAPTION_PENALTY: 0.0}, "has an AdaptionPenalty"),
-    ],
-)
-def test_infos_that_do_not_fit_are_refused(mode, wrote, message):
-    with pytest.raises(sw.SafeWrappersError, match=message):
-        add(by_hand(mode), 0.2, 0.0, True, info(1.0, 1.0, **wrote))
-
-
 def test_no_whole_episode_is_sb3s_error_and_an_unknown_mode_ours():
     buffer = by_hand("both")
     add(
@@ -291,23 +237,3 @@ def test_no_whole_episode_is_sb3s_error_and_an_unknown_mode_ours():
         sw.SafeWrappersError, match="or 'adaption_penalty', got 'naive'; the naive learner uses"
     ):
         by_hand("naive")
-
-
-def test_moved_into_a_larger_buffer_episodes_stay_whole():
-    model = learn("safe_action", buffer_size=90)  # 45 rows per env, 60 steps: the oldest are overwritten
-    old = model.replay_buffer
-    old.truncate_last_trajectory()
-    spaces = model.observation_space, model.action_space
-    new = type(old)(400, *spaces, env=model.get_env(), device="cpu", n_envs=2, mode="safe_action")
-    _move(old, new)
-    assert new.size() == old.size() == 45 and old.pos != 0
-    assert (new._current_ep_start == new.pos).all()
-    for env in range(2):
-        steps = new.observations["observation"][:45, env, 1]
-        drawn = np.flatnonzero(new.ep_length[:45, env])
-        assert len(drawn) == np.count_nonzero(old.ep_length[:, env]) > 20
-        for row in drawn:
-            start, length = new.ep_start[row, env], new.ep_length[row, env]
-            assert start <= row < start + length
-            assert steps[start : start + length].tolist() == list(range(length))
-    assert len(new.sample(64).rewards) == 64

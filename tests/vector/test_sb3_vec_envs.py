@@ -14,7 +14,6 @@ from single_loops import by_hand, script
 from vector_worlds import AtHazard, cart, cart_filter
 
 import safe_wrappers as sw
-from safe_wrappers import info as keys
 
 pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.monitor import Monitor
@@ -29,7 +28,7 @@ every_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 def monitored_cart(index):
-    return Monitor(cart(index), info_keywords=keys.RUNNING)
+    return Monitor(cart(index))
 
 
 def stack(env_id, name, steps, index):
@@ -70,7 +69,6 @@ def test_a_vec_env_is_its_single_envs(task, kind):
             info = episode.steps[-1].info
             assert info["episode"]["l"] == info["interventions"]["length"] == len(episode.steps)
             assert info["episode"]["r"] == round(info["interventions"]["return"], 6)
-            assert {key: info["episode"][key] for key in keys.RUNNING} == {k: info[k] for k in keys.RUNNING}
 
 
 @pytest.mark.parametrize(("kind", "examples"), [("dummy", 12), ("subproc", 8)])
@@ -129,7 +127,7 @@ SHARED = [
 
 def sharing(index):
     env = sw.CBFActionFilter(AtHazard(gym.make("SafePointGoal1-v0", max_episode_steps=8 + index)), SHARED)
-    return Monitor(sw.RecordInterventions(env), info_keywords=keys.RUNNING)
+    return Monitor(sw.RecordInterventions(env))
 
 
 def test_two_envs_in_one_process_share_nothing_but_what_they_were_given():

@@ -49,10 +49,3 @@ def test_one_control_step_is_the_env_itself():
 def test_a_repeat_that_is_no_count_is_refused(repeat):
     with pytest.raises(sw.SafeWrappersError, match="repeat"):
         sw.ActionRepeat(stack(), repeat)
-
-
-def test_what_counts_control_steps_belongs_inside():
-    env = sw.ActionRepeat(sw.protect(gym.make("SafePointGoal1-v0")), 2)
-    for layer in (sw.RecordInterventions, sw.protect, sw.FilterObservation):
-        with pytest.raises(sw.SafeWrappersError, match=r"put it outside|chunk"):
-            layer(env)

@@ -55,21 +55,6 @@ def test_of_the_admitted_the_preferred_one_is_executed():
     assert info["executed_action"][0] == max(np.flatnonzero(masks), key=lambda a: -abs(a - 3))
 
 
-def test_an_admitted_action_passes_as_the_env_wants_it():
-    class Seen(Grid):
-        def step(self, action):
-            assert self.action_space.contains(action)
-            self.action = action
-            return super().step(action)
-
-    env = sw.ActionShield(Seen(), [PredictiveShield("cost", 2, backup=EVERY)])
-    env.reset(seed=0)
-    for action in (2, np.int64(2), np.array(2)):
-        env.reset(seed=0)
-        env.step(action)
-        assert env.unwrapped.action == 2
-
-
 def test_if_nothing_is_admitted_that_is_said_and_one_action_is_left():
     env = sw.ActionShield(Grid(), [PredictiveShield(lambda o: -1.0 - o[0], horizon=2, backup=EVERY)])
     with pytest.warns(sw.UnsafeStateWarning):
@@ -135,16 +120,6 @@ def test_bad_input_is_refused():
     for action in (4, -1, 1.5, None, [0]):
         with pytest.raises(ActionError, match=r"expected an action of Discrete\(4\)"):
             env.step(action)
-
-
-def test_its_figures_are_recorded():
-    env = sw.RecordInterventions(gym.wrappers.TimeLimit(grid(), 20))
-    env.reset(seed=0)
-    done = False
-    while not done:
-        _, _, terminated, truncated, info = env.step(1)
-        done = terminated or truncated
-    assert info["interventions"]["violations"] == 0 and info["interventions"]["intervention_rate"] > 0
 
 
 def test_maskable_ppo_reads_the_masks():

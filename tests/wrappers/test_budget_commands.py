@@ -56,10 +56,3 @@ def test_while_the_brake_only_begins_to_act_no_command_is_known_to_lead_away():
         budget = measured(0.0, {}, {"act_s": act_s})
         assert budget.longest_time() < HOLD
         assert budget.can_stop_after(throttle(-1.0), HOLD) == admitted
-
-
-def test_the_rows_know_nothing_of_a_limit_on_the_jerk():
-    for jerk, admitted in ((None, True), (50.0, False)):
-        budget = measured(0.0, {}, {"jerk": jerk})
-        assert budget.longest_time() < HOLD
-        assert budget.can_stop_after(throttle(-1.0), HOLD) == admitted

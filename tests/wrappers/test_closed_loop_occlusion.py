@@ -35,21 +35,6 @@ def test_without_a_filter_they_are_hit():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("driver", DRIVERS)
-@pytest.mark.parametrize("cars", ["true", "estimated"])
-def test_nothing_unflagged_hits_it_in_twenty_episodes(cars, driver):
-    told = drive(crossing(cars), driver, episodes=20, seed=7, watch=kept_or_flagged)
-    assert told["unflagged"] == 0 and told["collisions"] <= 2, told
-    assert told["flagged"] <= 0.01 * told["steps"], told
-
-
-@pytest.mark.slow
-def test_where_they_were_seen_last_is_not_where_they_are():
-    told = drive(crossing("last_seen"), CarSeeking, episodes=4)
-    assert told["collisions"] >= 5, told
-
-
-@pytest.mark.slow
 def test_under_a_delay_it_holds_as_well():
     raw = gym.make("OccludedCrossing-v0")
     env = sw.OcclusionPenalty(raw, CARS, sw.occlusion.Sensor("eye", view_deg=120, range_m=6.0), 0.5)

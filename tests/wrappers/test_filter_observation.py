@@ -3,13 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from worlds import Cart, SpeedRow, cart_plant
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.control.numerics.nearest_discs import nearest_discs, squashed
 
 LOOKED_AT = ("SafePointGoal1-v0", "SafeCarGoal2-v0", "InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5")
 
@@ -45,14 +42,6 @@ def test_of_hazards_the_nearest_are_shown_in_the_robots_frame():
         observation, _, _, _, info = env.step(action)
         share = (info[keys.EXECUTED_ACTION] - info[keys.PROPOSED_ACTION]) / 2.0
         np.testing.assert_allclose(features_of(env, observation)[-2:], share, atol=1e-7)
-
-
-def test_hazards_that_are_not_there_are_far_away():
-    env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")), neighbours=2)
-    observation, _ = env.reset(seed=0, options={"layout": {"hazards": [[1.0, 1.0]]}})
-    assert features_of(env, observation)[2:].tolist()[4:] == [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
-    observation, _ = env.reset(seed=0, options={"layout": {"hazards": []}})
-    assert features_of(env, observation).tolist() == [1.0, 0.0] + 2 * [0.0, 0.0, 1.0, 0.0] + [0.0, 0.0]
 
 
 def test_a_detour_is_shown_with_the_time_that_is_left_of_it():
@@ -198,18 +187,3 @@ def test_refused():
     space = gym.spaces.Dict({"filter": gym.spaces.Box(0, 1, (1,))})
     with pytest.raises(sw.SafeWrappersError, match="has a key 'filter' already"):
         sw.FilterObservation(sw.protect(Pictured(env, space, lambda o: o)))
-
-
-@given(st.floats(allow_nan=False), st.floats(allow_nan=False), st.floats(1e-3, 1e3))
-def test_squashed_is_bounded_monotone_and_odd(one, other, scale):
-    found = squashed(one, scale)
-    assert -1.0 <= found <= 1.0
-    assert squashed(-one, scale) == -found
-    if one < other:
-        assert squashed(other, scale) >= found - 3e-16  # the last digit of a quotient near 1
-    assert squashed(scale, scale) == 0.5
-
-
-def test_a_disc_around_the_origin_has_no_direction():
-    discs = np.array([[1.0, 2.0, 0.5]])
-    assert nearest_discs(discs, 1.0, 2.0, 0.3, 1.0, 0.0, 1).tolist() == [0.0, 0.0, -0.5 / 1.5, 0.0]

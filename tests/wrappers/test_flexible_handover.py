@@ -1,8 +1,6 @@
 """ChunkHandover(flexible=): what it chooses, smoothsteps that are not cut short, what a seam leaves."""
 
-import dataclasses
 import itertools
-import json
 
 import gymnasium as gym
 import numpy as np
@@ -13,12 +11,11 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.control.handover.vibration import smoothstep_share
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.plants import RigidModelCheck, rigid_model_check
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants import RigidModelCheck
 
 HOLD = 0.1
 RINGS = RigidModelCheck(("spring",), (12.0,), (0.01,), 0.1, 8.3, HOLD)
-RIGID = dataclasses.replace(RINGS, boundary_layer_s=0.01)
 SHARE = 0.05
 pytestmark = pytest.mark.filterwarnings("ignore:a command was held back:UserWarning")
 
@@ -75,22 +72,6 @@ def test_it_is_the_stricter_of_what_springs_ask_and_what_the_user_gave():
     assert infos[1]["handover/blend_time"] == pytest.approx(1.5)
 
 
-def test_where_a_rigid_model_is_good_enough_nothing_changes():
-    rng = np.random.default_rng(0)
-    chunks = [rng.uniform(-1, 1, (16, 2)) for _ in range(6)]
-    for blend in ("smoothstep", "quintic"):
-        plain, _ = sent(chunks, 5, blend=blend, rate_limit=4.0)
-        with_check, _ = sent(chunks, 5, blend=blend, rate_limit=4.0, flexible=RIGID)
-        assert np.array_equal(plain, with_check)
-    env = sw.ChunkHandover(gym.make("Reacher-v5"), 16, 8, rate_limit=20.0, flexible="auto")
-    reference = sw.ChunkHandover(gym.make("Reacher-v5"), 16, 8, rate_limit=20.0)
-    env.action_space.seed(0)
-    env.reset(seed=0), reference.reset(seed=0)
-    for _ in range(3):
-        chunk = env.action_space.sample()
-        assert np.array_equal(env.step(chunk)[0], reference.step(chunk)[0])
-
-
 def test_a_seam_on_the_flexible_arm_leaves_no_more_than_its_share():
     """One change of torque at the elbow from rest: what rings on after it, against what rings on after a step."""
 
@@ -109,22 +90,6 @@ def test_a_seam_on_the_flexible_arm_leaves_no_more_than_its_share():
     assert left(blend_time=0.03) > 0.1 * step
 
 
-def test_auto_is_the_check_at_construction_and_both_are_recorded():
-    arm = gym.make("FlexJointReach-v0")
-    check = rigid_model_check(arm)
-    one = sw.ChunkHandover(arm, 32, 16, flexible=check)
-    recorded = one.spec.additional_wrappers[-1].kwargs["flexible"]
-    assert json.loads(json.dumps(recorded)) == json.loads(json.dumps(dataclasses.asdict(check)))
-    other = sw.ChunkHandover(gym.make("FlexJointReach-v0"), 32, 16, flexible="auto")
-    again = sw.ChunkHandover(gym.make("FlexJointReach-v0"), 32, 16, flexible=recorded)
-    times = []
-    for env in (one, other, again):
-        env.reset(seed=0)
-        env.step(np.zeros((32, 2), np.float32))
-        times.append(env.step(np.full((32, 2), 0.01, np.float32))[4]["handover/blend_time"])
-    assert times == pytest.approx([0.18] * 3)
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -137,8 +102,3 @@ def test_auto_is_the_check_at_construction_and_both_are_recorded():
 def test_bad_input_is_refused(arguments, says):
     with pytest.raises(ConfigurationError, match=says):
         sw.ChunkHandover(Line(1), 16, 8, fallback="hold", **arguments)
-
-
-def test_an_unknown_field_is_named():
-    with pytest.raises(UnknownNameError, match="flexible has no 'resonance'"):
-        sw.ChunkHandover(Line(1), 16, 8, fallback="hold", flexible={"resonance": 60.0})

@@ -34,13 +34,12 @@ def flat(*levels, entries=12):
     st.floats(1.0, 40.0),
     st.floats(10.0, 400.0),
     st.floats(50.0, 8000.0),
-    st.sampled_from(["quintic", "hermite"]),
 )
-def test_no_executed_bridge_breaks_a_limit_anywhere(seed, velocity, acceleration, jerk, blend):
+def test_no_executed_bridge_breaks_a_limit_anywhere(seed, velocity, acceleration, jerk):
     rng = np.random.default_rng(seed)
     chunks = [np.linspace(*rng.uniform(-1, 1, (2, 2)), 12) for _ in range(8)]
-    limits = sw.SeamLimits(velocity=velocity, acceleration=[acceleration, None], jerk=jerk)
-    infos, sent = driven(chunks, blend, horizon=12, limits=limits)
+    limits = sw.SeamLimits(velocity=velocity, acceleration=[acceleration, 1e9], jerk=jerk)
+    infos, sent = driven(chunks, "quintic", horizon=12, limits=limits)
     for k in range(1, len(chunks)):
         steps = round(infos[k]["handover/blend_time"] / HOLD) - 1
         begins = 12 * k
@@ -50,8 +49,7 @@ def test_no_executed_bridge_breaks_a_limit_anywhere(seed, velocity, acceleration
         slope, bend = chunks[k][1] - chunks[k][0], np.zeros(2)
         starts = [last[-1], (last[-1] - last[-2]) / HOLD, np.diff(last, n=2, axis=0)[0] / HOLD**2]
         ends = [chunks[k][steps], slope / HOLD, bend]
-        kept = 3 if blend == "quintic" else 2
-        curve = BPoly.from_derivatives([0.0, (steps + 1) * HOLD], [starts[:kept], ends[:kept]])
+        curve = BPoly.from_derivatives([0.0, (steps + 1) * HOLD], [starts, ends])
         t = np.linspace(0.0, (steps + 1) * HOLD, 5000)
         np.testing.assert_allclose(
             curve(HOLD * np.arange(1, steps + 1)), sent[begins : begins + steps], atol=1e-9
@@ -69,9 +67,6 @@ def test_a_blend_is_as_long_as_its_limit_asks_and_no_longer(name, order, peak):
         limit = peak * 1.0 / ((steps + 1) * HOLD) ** order * 1.0001
         infos, _ = driven(flat(-0.5, 0.5), "smoothstep", limits={name: limit})
         assert infos[1]["handover/blend_time"] == pytest.approx((steps + 1) * HOLD)
-        assert infos[1]["handover/stretched"] == 1
-    infos, _ = driven(flat(-0.5, 0.5), "smoothstep", limits={name: 1e9})
-    assert infos[1]["handover/stretched"] == 0
 
 
 def test_without_a_blend_that_will_do_the_chunk_is_refused_and_the_old_one_goes_on():
@@ -80,13 +75,7 @@ def test_without_a_blend_that_will_do_the_chunk_is_refused_and_the_old_one_goes_
     assert [info["handover/refused"] for info in infos] == [False, True, True]
     assert (sent == -0.5).all()
     assert [info["handover/latency"] for info in infos] == [0, -1, -1]
-    assert infos[2]["handover/stretched"] == 0 and not any(info["handover/starved"] for info in infos)
-    # The same within a time that would do, and beyond it.
-    enough = 5.7735026919 / 1.0**2 * 1.0001  # a second
-    for longest, refused in ((1.0, False), (0.9, True)):
-        limits = {"acceleration": enough, "max_blend_time": longest}
-        infos, _ = driven(flat(-0.5, 0.5), limits=limits)
-        assert infos[1]["handover/refused"] is refused
+    assert not any(info["handover/starved"] for info in infos)
 
 
 def test_a_bridge_that_the_box_would_cut_is_not_taken():
@@ -99,14 +88,6 @@ def test_a_bridge_that_the_box_would_cut_is_not_taken():
         assert (
             sent[12:15] == 1.0
         ).any() or refused  # it was cut: the bridge goes on with the rate that it had
-
-
-def test_torque_commands_are_limited_themselves_and_by_their_slew():
-    slow = {"torque_slew": 1.875 / 0.6 * 1.0001, "command": "torque"}
-    infos, _ = driven(flat(-0.5, 0.5), limits=slow)
-    assert infos[1]["handover/blend_time"] == pytest.approx(0.6)
-    infos, _ = driven(flat(-0.5, 0.5), limits={"torque": 0.49, "command": "torque"})
-    assert infos[1]["handover/refused"]
 
 
 def test_a_change_of_source_is_faded_within_the_limits():
@@ -124,7 +105,7 @@ def test_a_change_of_source_is_faded_within_the_limits():
 def test_generous_limits_change_no_command_of_a_blend_time():
     rng = np.random.default_rng(0)
     chunks = [rng.uniform(-0.2, 0.2, (12, 2)) for _ in range(6)]
-    for blend in ("smoothstep", "quintic", "hermite"):
+    for blend in ("smoothstep", "quintic"):
         _, without = driven(chunks, blend, blend_time=0.4)
         _, sent = driven(chunks, blend, blend_time=0.4, limits={"jerk": 1e12})
         assert np.array_equal(without, sent)
@@ -191,14 +172,6 @@ def test_a_position_commands_torque_is_that_of_the_equations_of_motion():
             assert peak[steps - 1, column] > limit
 
 
-def test_a_gear_turns_the_joint_by_less_and_a_stop_of_the_joint_is_no_torque():
-    geared = SERVO.replace("kp=", 'gear="2" kp=')
-    stopped = SERVO + "</actuator><default><joint limited='true' range='-0.1 0.1'/></default><actuator>"
-    plain = held_pendulum({"torque": 12.0}, (0.2, 0.6))[1]["handover/blend_time"]
-    assert held_pendulum({"torque": 12.0}, (0.4, 1.2), actuator=geared)[1]["handover/blend_time"] == plain
-    assert held_pendulum({"torque": 12.0}, (0.2, 0.6), actuator=stopped)[1]["handover/blend_time"] == plain
-
-
 def test_a_slow_chunks_knots_are_refused_by_the_torque_steps_there():
     rng = np.random.default_rng(1)
     chunk = 0.3 * rng.uniform(-1, 1, (6, 1))
@@ -211,7 +184,7 @@ def test_a_slow_chunks_knots_are_refused_by_the_torque_steps_there():
     for factor, refused in ((1.001, False), (0.999, True)):
         limits = {"torque_slew": factor * largest}
         env = sw.ChunkHandover(
-            Pendulum(), 6, 8, steps_per_entry=4, blend="hermite", fallback="zero", limits=limits
+            Pendulum(), 6, 8, steps_per_entry=4, blend="quintic", fallback="zero", limits=limits
         )
         env.reset(seed=0)
         assert env.step(chunk)[4]["handover/refused"] is refused
@@ -241,9 +214,6 @@ def test_what_is_no_position_servo_tells_no_torque(actuator):
         ({"velocity": 0.0}, "limits.velocity must be a finite number > 0"),
         ({"jerk": [1.0, -2.0]}, "limits.jerk"),
         ({"velocity": [1.0, 2.0]}, "limits.velocity has 2 entries, a command 1"),
-        ({"velocity": 1.0, "command": "torque"}, "limit its torque_slew"),
-        ({"torque": 1.0, "command": "force"}, '"position" or "torque"'),
-        ({"velocity": 1.0, "max_blend_time": 0.0}, "max_blend_time"),
         ({"speed": 1.0}, "limits has no 'speed'; it has velocity"),
         (3.0, "limits is a SeamLimits"),
     ],
@@ -268,8 +238,6 @@ def test_they_are_recorded_as_plain_data():
         "jerk": 5.0,
         "torque": None,
         "torque_slew": None,
-        "command": "position",
-        "max_blend_time": None,
     }
     again = gym.make(copy.deepcopy(env.spec))
     assert again.get_wrapper_attr("action_space") == env.action_space

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from asking import Asked
-from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection, read_cart
+from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection
 from worlds import BoundSpeedRow, SpeedRow
 
 import safe_wrappers as sw
@@ -69,22 +69,6 @@ def test_a_clearance_on_a_mujoco_cart(reserve):
             leases += 1
         assert data.time > 0.0
     assert leases > 5 and refused > 5
-
-
-def test_its_own_braking_unless_another_is_given():
-    def lease_of(**more):
-        cart = BrakedCart(wall=5.0, v=2.0, drive=0.0)
-        near = sw.constraints.Clearance(
-            [sw.constraints.Plane([5.0], [-1.0])], braking=1.0, position=[0], velocity=[1]
-        )
-        env = lease(
-            cart, near, acceleration=0.0, plant=cart_plant(0.1), fallback="zero", max_lease_s=9.0, **more
-        )
-        env.reset()
-        return granted(env, FULL)
-
-    assert lease_of() == pytest.approx((5.0 - 2.0) / 2.0, abs=1e-6)
-    assert lease_of(braking=4.0) == pytest.approx((5.0 - 0.5) / 2.0, abs=1e-6)
 
 
 def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
@@ -162,29 +146,6 @@ def at_hazard(robot):
     return np.array([1.0, np.clip(4.0 * angle, -1.0, 1.0)], np.float32)
 
 
-def test_a_heading_drive_brakes_by_its_own_backup():
-    clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01)
-    env = sw.LeaseExpiry(
-        gym.make("SafePointGoal1-v0"), sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=0.2
-    )
-    again, plant = copy.deepcopy(clearance), sw.MujocoPlant()
-    plant.bind(env.env)
-    again = Asked(again, plant)
-    layout = {"layout": {"agent": [0.0, 0.0, 0.0], "hazards": [[1.5, 0.0]]}}
-    env.reset(seed=0, options=layout)
-    braked = 0
-    for t in range(120):
-        if t > 25:
-            env.set_observation_time(None)
-        plant.observe()
-        wanted = again.backup()
-        info = env.step(np.array([1.0, 0.0], np.float32))[4]
-        if info["lease/braking"]:
-            braked += 1
-            np.testing.assert_allclose(info["executed_action"], np.clip(wanted, -1.0, 1.0), atol=1e-6)
-    assert braked > 50 and float(np.linalg.norm(env.unwrapped.data.qvel[:2])) < 1e-2
-
-
 def test_a_heading_drive_never_violates_when_commands_stop():
     # The lease alone, no filter inside. The closing speed is measured first: the fastest that the value ever falls.
     clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01)
@@ -232,37 +193,6 @@ class BoundFar(BoundSpeedRow):
         return np.array(self.spec.values)
 
 
-@pytest.mark.parametrize(
-    ("values", "wanted"),
-    [([], 0.4), ([math.inf], 0.4), ([math.inf, 0.3], 0.3), ([math.nan], None), ([-math.inf, 1.0], None)],
-)
-def test_a_value_of_nothing_near_is_no_limit(values, wanted):
-    far = Far(1.0)
-    far.values = values
-    env = sw.LeaseExpiry(
-        BrakedCart(),
-        sw.StoppingBudget(far, closing_speed=1.0),
-        max_lease_s=0.4,
-        plant=cart_plant(0.1),
-        fallback="zero",
-    )
-    env.reset()
-    got = granted(env, FULL)
-    assert got is None if wanted is None else got == pytest.approx(wanted, abs=1e-6)
-
-
-def test_a_state_error_counts_for_values_too():
-    def lease(error):
-        clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01, state_error=error)
-        env = sw.LeaseExpiry(
-            gym.make("SafePointGoal1-v0"), sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=5.0
-        )
-        env.reset(seed=0, options={"layout": {"agent": [0.0, 0.0, 0.0], "hazards": [[1.0, 0.0]]}})
-        return granted(env, np.zeros(2, np.float32))
-
-    assert lease(0.08) == pytest.approx(lease(0.0) - 0.08 / 4.0, abs=1e-6)
-
-
 def test_a_constraint_forgets_the_episode():
     begun = []
 
@@ -305,25 +235,6 @@ def told(answer, **more):
     return env
 
 
-@pytest.mark.parametrize(
-    ("answer", "wanted"),
-    [
-        ((1.5, 1.0), 1.0),
-        (([1.5, 9.0], [1.0, 1.0]), 1.0),
-        ((np.array([9.0, 1.5]), 1.0), 1.0),
-        (([9.0, -1.5, 3.5], [-9.0, -2.0, 2.0]), None),  # behind the surface, though it leaves
-        (([], []), 2.0),
-        ((np.zeros((0,)), np.zeros((0,))), 2.0),
-        ((1.0, 0.0), 2.0),
-        ((1.0, -3.0), 2.0),
-        ((0.4, 1.0), None),
-    ],
-)
-def test_the_shortest_lease_of_all_surfaces_counts(answer, wanted):
-    got = granted(told(answer), FULL)
-    assert got is None if wanted is None else got == pytest.approx(wanted, abs=1e-6)
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("where", [0, 1])
 def test_a_reading_that_is_not_finite_revokes(bad, where):
@@ -335,25 +246,6 @@ def test_a_reading_that_is_not_finite_revokes(bad, where):
     assert info["lease/refused"] and info["lease/braking"] and info["lease/remaining_s"] == 0.0
     answer[where][1] = 0.1
     assert granted(env, FULL) is not None
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_it_revokes_whatever_the_least_lease_is(bad):
-    readings = [[9.0], [0.1]]
-    inside = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [rail()])
-    env = sw.LeaseExpiry(
-        inside,
-        sw.StoppingBudget(lambda env: readings, braking=1.0, acceleration=1.0),
-        min_lease_s=0.04,
-        max_lease_s=1.0,
-    )
-    env.reset(seed=0)
-    action = np.zeros(1, np.float32)
-    assert granted(env, action) is not None
-    readings[0][0] = 1e-9  # no room at all: the filter inside vouches for the step
-    assert granted(env, action) == pytest.approx(0.04)
-    readings[0][0] = bad
-    assert granted(env, action) is None
 
 
 @pytest.mark.parametrize(
@@ -378,55 +270,7 @@ def test_a_mujoco_state_that_is_not_a_number_revokes_and_nothing_else_passes(cle
 # Sharing ------------------------------------------------------------------------------------------------------
 
 
-def test_a_constraint_may_serve_the_filter_inside_and_a_second_env_too():
-    def run(share):
-        mine = [sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01) for _ in range(3)]
-        if share:
-            mine = mine[:1] * 3
-        env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [mine[0]])
-        env = sw.LeaseExpiry(env, sw.StoppingBudget(mine[1], closing_speed=4.0), max_lease_s=0.3)
-        other = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), sw.StoppingBudget(mine[2], closing_speed=4.0))
-        env.reset(seed=0)
-        other.reset(seed=5)
-        seen = []
-        for t in range(120):
-            if t % 30 > 15:
-                env.set_observation_time(None)
-            info = env.step(at_hazard(env.unwrapped))[4]
-            theirs = other.step(at_hazard(other.unwrapped))[4]
-            seen.append(
-                (info["lease/remaining_s"], info["executed_action"].tobytes(), theirs["lease/remaining_s"])
-            )
-        return seen
-
-    assert run(True) == run(False)
-
-
 # Bad input ----------------------------------------------------------------------------------------------------
-
-
-def test_what_constraints_with_a_value_need():
-    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, ["joint1"])
-    with pytest.raises(ConfigurationError, match=r"JointPositionLimit does not say how fast.*closing_speed"):
-        sw.LeaseExpiry(gym.make("Reacher-v5"), limit)
-    for value in (0.0, -1.0, math.nan, math.inf, "fast"):
-        with pytest.raises(ConfigurationError, match="closing_speed"):
-            sw.StoppingBudget(limit, closing_speed=value)
-    for name in ("braking", "acceleration", "top_speed"):
-        with pytest.raises(ConfigurationError, match="closing_speed alone"):
-            sw.StoppingBudget(limit, closing_speed=1.0, **{name: 1.0})
-    with pytest.raises(ConfigurationError, match="SpeedRow has no value"):
-        budget = sw.StoppingBudget(SpeedRow(1.0), closing_speed=1.0)
-        sw.LeaseExpiry(BrakedCart(), budget, plant=cart_plant(0.1), fallback="zero")
-
-
-def test_a_clearance_still_needs_the_acceleration():
-    with pytest.raises(ConfigurationError, match="acceleration is missing"):
-        sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), rail())
-    with pytest.raises(ConfigurationError, match="closing_speed is for constraints"):
-        sw.LeaseExpiry(
-            gym.make("InvertedPendulum-v5"), sw.StoppingBudget(rail(), acceleration=1.0, closing_speed=1.0)
-        )
 
 
 def test_least_s_needs_a_filter_inside_and_no_more_than_max_lease_s():
@@ -437,20 +281,6 @@ def test_least_s_needs_a_filter_inside_and_no_more_than_max_lease_s():
         sw.LeaseExpiry(inside, sw.StoppingBudget(rail(), acceleration=1.0), min_lease_s=2.0)
     with pytest.raises(ConfigurationError, match="min_lease_s"):
         sw.LeaseExpiry(inside, sw.StoppingBudget(rail(), acceleration=1.0), min_lease_s=-0.1)
-
-
-def test_reading_is_of_the_env_that_it_wraps():
-    seen = []
-
-    def look(env):
-        seen.append(env)
-        return read_cart(env)
-
-    inner = gym.wrappers.TimeLimit(BrakedCart(), 100)
-    env = sw.LeaseExpiry(inner, sw.StoppingBudget(look, braking=1.0, acceleration=1.0), fallback="zero")
-    env.reset()
-    env.step(FULL)
-    assert seen == [inner]
 
 
 class Checked(sw.Constraint):

@@ -8,7 +8,7 @@ from teleop_worlds import ceiling, channel, clamp, place
 
 import safe_wrappers as sw
 from safe_wrappers.envs.teleop_operator import TeleopOperator
-from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
 from safe_wrappers.wrappers.faults import Jitter, Outages
 
 
@@ -39,7 +39,7 @@ def test_an_ideal_channel_is_no_channel(env_id):
     assert np.array_equal(seen, expected) and rewards == expected_rewards
     info = env.step(actions[0])[4]
     assert info["teleop/round_trip_s"] == 0.0 and info["teleop/ceiling_s"] == np.inf
-    assert not info["teleop/revoked"] and info["teleop/lost"] == 0
+    assert not info["teleop/revoked"]
 
 
 @pytest.mark.parametrize(("up", "down"), [(3, 0), (0, 5), (4, 2)])
@@ -97,17 +97,16 @@ def test_faults_and_recording_belong_outside():
     assert max(env.step(np.zeros(2))[4]["teleop/round_trip_s"] for _ in range(200)) > 0.003
 
 
-def test_overtaken_and_lost_packets_are_counted_and_the_newest_acts():
+def test_overtaken_packets_never_act():
     env = channel(sw.teleop.Link(0.002, 0.01, 0.2, in_order=False), sw.teleop.Link(loss=0.1))
     place(env)
-    raw, lost, stamps = env.unwrapped, 0, []
+    raw, stamps = env.unwrapped, []
     for k in range(1000):
         info = env.step(np.array([k * 1e-4, 0.0]))[4]
         stamps.append(info["executed_action"][0])
-        lost += info["teleop/lost"]
     assert raw.data.time == pytest.approx(1.0)
     assert (np.diff(stamps) >= 0.0).all()  # never back to an older one
-    assert 240 < lost < 360 and len(set(stamps)) < 550  # many are overtaken
+    assert len(set(stamps)) < 550  # many are overtaken or lost
 
 
 def test_links_and_operators_are_seeded_bit_for_bit():
@@ -122,29 +121,13 @@ def test_links_and_operators_are_seeded_bit_for_bit():
     assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
 
 
-def test_the_observation_is_the_operators_own():
-    env = channel(0.0, 0.002)
-    place(env)
-    seen = env.step(np.zeros(2))[0]
-    seen[:] = 99.0
-    assert (env.step(np.zeros(2))[0] != 99.0).any()
-    action = np.array([0.3, 0.3], np.float32)
-    late = channel(0.001, 0.0)
-    place(late)
-    late.step(action)
-    action[:] = -1.0  # a policy that reuses its buffer
-    assert (late.step(action)[4]["executed_action"] == np.float64(np.float32(0.3))).all()
-
-
 def test_an_action_that_is_not_finite_is_not_sent():
     env = channel()
     place(env)
-    assert env.step(np.full(2, 0.5))[4]["teleop/lost"] == 0
+    env.step(np.full(2, 0.5))
     with pytest.warns(UserWarning, match="not sent"):
         info = env.step(np.array([np.nan, 0.0]))[4]
     assert (info["executed_action"] == 0.5).all() and info["teleop/round_trip_s"] > 0.0
-    assert info["teleop/lost"] == 1  # warned of once, counted each time
-    assert env.step(np.array([np.inf, 0.0]))[4]["teleop/lost"] == 1
     for wrong in (np.zeros(3), "left"):
         with pytest.raises(ActionError, match="shape"):
             env.step(wrong)
@@ -213,22 +196,6 @@ def test_what_cannot_be_is_refused_when_it_is_built(options, match):
     refused(match=match, **options)
 
 
-def test_unknown_names_are_refused_with_those_there_are():
-    refused(UnknownNameError, uplink={"delay": 0.1}, match="delay_s")
-    refused(UnknownNameError, port={"flows": [0], "effort": [1]}, match="feedthrough")
-    refused(UnknownNameError, ceiling={"budget": {"clearence": None}}, match="clearance")
-    refused(UnknownNameError, ceiling=ceiling(), fallback="stop", match="brake")
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"video_s": -0.1}, {"human_s": np.nan}, {"longest_s": 0.0}, {"release": 1.2}, {"release": 0.0}],
-)
-def test_ceilings_that_cannot_be_are_refused(changes):
-    with pytest.raises(ConfigurationError):
-        ceiling(**changes)
-
-
 def test_waves_need_a_port():
     refused(env_id="Reacher-v5", match="needs a port", coding="wave", impedance=10.0)
 
@@ -238,29 +205,9 @@ def test_envs_that_do_not_fit_are_refused():
     refused(UnsupportedEnvError, env_id="Pendulum-v1", ceiling=ceiling(), control_dt=0.05, match="MuJoCo")
 
 
-def test_wrong_orders_are_refused():
-    link = {"uplink": 0.1, "downlink": 0.1}
-    refused(inside=sw.RecordInterventions, match="put it outside")
-    refused(inside=lambda env: sw.TeleopChannel(env, **link), match="TeleopChannel inside")
-    refused(inside=lambda env: sw.ChunkHandover(env, 4, 2), match="ChunkHandover inside")
-    lease = {"budget": {"clearance": clamp(), "acceleration": 55.0}}
-    refused(inside=lambda env: sw.LeaseExpiry(env, **lease), match="LeaseExpiry inside")
-    late = sw.TeleopChannel(gym.make("TeleopContact-v0"), **link)
-    for outside in (
-        lambda: sw.CBFActionFilter(late, [clamp()]),
-        lambda: sw.LeaseExpiry(late, **lease),
-    ):
-        with pytest.raises(ConfigurationError, match="TeleopChannel inside"):
-            outside()
-    clipped = gym.wrappers.ClipAction(gym.make("TeleopContact-v0"))
-    with pytest.raises(ConfigurationError, match="ClipAction"):
-        sw.TeleopChannel(clipped, **link, coding="wave", impedance=40.0)
-
-
 def test_chunks_may_come_through_a_channel():
     env = sw.ChunkHandover(channel(0.002, 0.002, ceiling=ceiling()), 8, 4, inference_delay=2)
     env.reset(seed=0)
     for _ in range(20):
         info = env.step(np.full((8, 2), 0.1))[4]
     assert info["teleop/round_trip_s"] >= 0.004 and not info["teleop/revoked"]
-    assert isinstance(info["teleop/lost"], int)

@@ -157,17 +157,6 @@ def test_next_to_the_clamp_the_operator_may_still_back_off():
     assert info["clearance"] > 0.03 and not info["teleop/revoked"]
 
 
-def test_a_state_that_is_no_number_revokes():
-    answers = iter([(0.5, 0.0)] * 5 + [(np.nan, 0.0)] * 3 + [(0.5, 0.0)] * 50)
-    wanted = sw.teleop.RoundTripCeiling(
-        sw.StoppingBudget(lambda env: next(answers), braking=1.0, acceleration=0.0)
-    )
-    env = channel(ceiling=wanted)
-    place(env)
-    flags = [env.step(np.zeros(2))[4]["teleop/revoked"] for _ in range(20)]
-    assert flags[:5] == [False] * 5 and flags[5:8] == [True] * 3 and not any(flags[9:])
-
-
 def test_an_arm_that_is_far_from_the_task_is_watched_as_well():
     # A cart on a rail, 40 ms a step, whose operator drives at its end.
     rail = sw.constraints.Clearance(

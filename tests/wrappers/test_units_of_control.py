@@ -4,20 +4,11 @@ import functools
 from types import SimpleNamespace
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutMemory
-from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.filter.fallback import brake
-
-SLIDER = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
-<body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1" contype="0" conaffinity="0"/>
-<body><joint name="y" type="slide" axis="0 1 0"/><geom size=".1" mass="1" contype="0" conaffinity="0"/></body></body>
-</worldbody><actuator><motor joint="x" gear="{gear}" ctrlrange="-{unit} {unit}" ctrllimited="true"/>
-<motor joint="y" gear="{gear}" ctrlrange="-{unit} {unit}" ctrllimited="true"/></actuator></mujoco>"""
 
 
 class Sled(gym.Env):
@@ -89,43 +80,6 @@ def test_the_unit_of_the_control_does_not_matter(unit, constraints):
     assert intervened.mean() > 0.2 and not fallback.any() and margin.min() > -1e-9
     assert margin.min() < 0.01  # it did come to the walls
     np.testing.assert_allclose(other, one, atol=1e-6)
-
-
-class Slider(gym.Env):
-    """Two axes of 1 kg (y) and 2 kg (x), each with a motor of 10 N whose control is counted in `unit`."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    dt = 0.05
-    frame_skip = 5
-
-    def __init__(self, unit, space=1.0):
-        self.model = mujoco.MjModel.from_xml_string(SLIDER.format(unit=unit, gear=10.0 / unit))
-        self.data = mujoco.MjData(self.model)
-        self.action_space = gym.spaces.Box(-unit * space, unit * space, (2,), np.float64)
-
-
-def test_braking_uses_the_whole_box_however_large_its_numbers_are():
-    def braked(unit):
-        env = Slider(unit)
-        plant = sw.MujocoPlant()
-        plant.bind(env)
-        env.data.qvel[:] = [0.1, -5.0]
-        plant.observe()
-        return brake(plant) / unit
-
-    expected = braked(1.0)
-    assert (
-        abs(expected[0]) < 0.99 and expected[1] == 1.0
-    )  # one can be stopped within the hold, the other cannot
-    for unit in (1e-7, 1e7):
-        np.testing.assert_allclose(braked(unit), expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("unit", [1e-7, 1.0, 1e7])
-def test_an_action_space_of_another_size_is_refused_in_every_unit(unit):
-    sw.MujocoPlant().bind(Slider(unit))
-    with pytest.raises(UnsupportedEnvError, match="rescales or limits actions in its own step"):
-        sw.MujocoPlant().bind(Slider(unit, space=0.5))
 
 
 class Forecasting(BoundRollout):

@@ -20,11 +20,6 @@ def test_commands_between_entries_are_the_spline_through_them(entries, steps):
     assert np.array_equal(commands[::steps], chunk)
 
 
-def test_one_step_per_entry_changes_nothing():
-    chunk = np.random.default_rng(0).normal(size=(4, 2))
-    assert Upsampling(4, 1).commands(chunk) is chunk
-
-
 class Sent(gym.Wrapper):
     def __init__(self, env):
         super().__init__(env)
@@ -67,16 +62,6 @@ def test_a_late_slow_chunk_is_consumed_from_where_its_delay_ended():
     # 21 commands of a chunk: the first's from its fourth on, its left-over for three steps, then the second's.
     assert sent[3:13] == pytest.approx(spline[0][3:13], abs=1e-6)
     assert sent[13:20] == pytest.approx(spline[1][3:10], abs=1e-6)
-
-
-def test_entries_of_a_chunk_are_executed_bit_for_bit():
-    inner = Sent(gym.make("Reacher-v5"))
-    env = sw.ChunkHandover(inner, 3, 4, steps_per_entry=2, blend="replace")
-    env.reset(seed=0)
-    chunk = env.action_space.sample()
-    env.step(chunk)
-    assert np.array_equal(inner.sent[0], chunk[0]) and np.array_equal(inner.sent[2], chunk[1])
-    assert len(inner.sent) == 4
 
 
 @pytest.mark.parametrize(

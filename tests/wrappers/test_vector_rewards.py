@@ -107,9 +107,3 @@ def test_what_needs_one_number_says_at_construction_what_makes_it(name, tmp_path
             return (observation, float(WEIGHT @ reward), *rest)
 
     np.testing.assert_allclose(driven(WEIGHING[name](stopping(LinearReward(Cart()))))[0], rewards, rtol=1e-6)
-
-
-def test_a_penalty_for_not_seeing_needs_one_number():
-    crossing = Two(gym.make("OccludedCrossing-v0").unwrapped)
-    with pytest.raises(ConfigurationError, match="OcclusionPenalty needs rewards that are one number"):
-        sw.OcclusionPenalty(crossing, [], sw.occlusion.Sensor("eye"), 0.5)
