@@ -75,7 +75,6 @@ def measured(wanted: list[str], steps: int) -> Iterator[tuple[str, str, Row]]:
     if asked("SafePointGoal1-v0, 64 envs"):
         yield "SafePointGoal1-v0, 64 envs", "the vector env", vector_row()
     calls = {f"project, {m} x {k}": (peers.projections, (m, k)) for m, k in peers.SIZES}
-    calls |= {f"project_batch, {m} x {k}": (peers.batches, (m, k)) for m, k in peers.SIZES}
     calls["double integrator"] = (peers.filter_calls, ())  # type: ignore[assignment]
     for what in filter(asked, calls):
         measure, size = calls[what]

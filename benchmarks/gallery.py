@@ -232,7 +232,7 @@ _HEAD = """# Gallery
 Every task twice: without the filter at the left, with it at the right. Both sides begin with the same reset, and the
 same seeded driver acts on both; nothing is trained. A film is five seconds long and goes round. Who judges, and what
 else was tried: [standard envs](results/standard-envs.md). What the marks and the strip mean:
-[`SafetyOverlay`](wrappers/safety-overlay.md). All of it, this page too, is made by `make gallery`.
+[`SafetyOverlay`](wrappers/recording.md#safetyoverlay). All of it, this page too, is made by `make gallery`.
 
 """
 

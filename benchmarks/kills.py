@@ -20,16 +20,19 @@ after it, as it was.
 import argparse
 import ctypes
 import hashlib
+import io
 import json
 import mmap
 import multiprocessing
 import os
+import pickle
 import select
 import shutil
 import signal
 import struct
 import time
 import traceback
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -44,10 +47,11 @@ from benchmarks.tables import RESULTS
 from safe_wrappers.train import cli, experiment
 from safe_wrappers.train.config import ArmConfig, ExperimentConfig, parse_experiment, read_config
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
-from safe_wrappers.train.processes.job import Progress
+from safe_wrappers.train.processes import Progress
 from safe_wrappers.train.run import training
 from safe_wrappers.train.run.callbacks import EpisodeRows
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.data_pickles import read_pickle
 from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.videos import record
 
@@ -271,6 +275,12 @@ def left_by(run: Path) -> dict[str, str]:
     ).encode()
     for path in sorted((*run.glob("evaluation/*.csv"), *run.glob("policy/*.json"))):
         found[str(path.relative_to(run))] = path.read_bytes()
+    with zipfile.ZipFile(run / "policy" / "model.zip") as model:
+        weights = torch.load(io.BytesIO(model.read("policy.pth")), weights_only=True)
+    found |= {f"policy:{name}": tensor.numpy().tobytes() for name, tensor in weights.items()}
+    scaling = run / "policy" / "vecnormalize.pkl"
+    if scaling.exists():
+        found["scaling"] = pickle.dumps(read_pickle(scaling).obs_rms)
     for path in sorted(run.glob("*/*.npz")):
         with np.load(path, allow_pickle=False) as arrays:
             for name in arrays.files:
@@ -286,7 +296,7 @@ def done(told: ExperimentConfig) -> dict[str, str]:
     found = {}
     for name, (arm, seed) in runs_of(told).items():
         run = told.run_folder(arm, seed)
-        of_training = ("finished.json", "episodes.csv", "policy/config.json", "policy/model.npz")
+        of_training = ("finished.json", "episodes.csv", "policy/config.json", "policy/model.zip")
         names = of_training if (run / "finished.json").exists() else ()
         if (run / "evaluation" / "evaluation.json").exists():
             names = (*names, *(f"evaluation/{path.name}" for path in (run / "evaluation").iterdir()))
@@ -297,7 +307,7 @@ def done(told: ExperimentConfig) -> dict[str, str]:
 
 def resumes_at(run: Path) -> int:
     """The step from which a run will go on."""
-    checkpoint = latest_checkpoint(run / "checkpoints", lambda line: None)
+    checkpoint = latest_checkpoint(run / "checkpoints")
     return 0 if checkpoint is None else checkpoint.timesteps
 
 

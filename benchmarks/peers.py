@@ -17,7 +17,6 @@ from benchmarks.timing import paired_us
 
 SIZES = ((2, 1), (2, 8), (6, 12), (17, 40))
 """Controls and rows: a point robot, several discs, a runner, a humanoid."""
-BATCH = 4096
 WALL, BRAKE, ALPHA = 1.0, 1.0, 2.0
 
 Problem = tuple[np.ndarray, ...]
@@ -65,17 +64,6 @@ def projections(m: int, k: int, active: bool) -> Times:
     items = problems(m, k, active)
     calls = {"project": sw.project} | {f"qpsolvers+{s}": by_qpsolvers(s) for s in ("daqp", "clarabel")}
     return paired_us({name: cycling(call, items) for name, call in calls.items()}, rounds=20)
-
-
-def batches(m: int, k: int, active: bool) -> Times:
-    """`project_batch` beside as many calls of `project`, for each problem."""
-    items = problems(m, k, active, BATCH)
-    arrays = [np.stack(part) for part in zip(*items, strict=True)]
-    sides = {
-        "project_batch": lambda: sw.project_batch(*arrays),
-        "project": lambda: [sw.project(*i) for i in items],
-    }
-    return {name: us / BATCH for name, us in paired_us(sides, batch=1, rounds=15).items()}
 
 
 class DoubleIntegrator(gym.Env[np.ndarray, np.ndarray]):

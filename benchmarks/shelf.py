@@ -29,7 +29,7 @@ import safe_wrappers as sw
 from benchmarks.tables import markdown
 from safe_wrappers.plants import View
 from safe_wrappers.shelf import PLANTS
-from safe_wrappers.train.tables import write_rows
+from safe_wrappers.train.files import write_rows
 
 RESULTS = Path(__file__).parent / "results" / "shelf.csv"
 DRIVERS = ("random", "greedy", "attacking")

@@ -19,11 +19,10 @@ from typing import Any
 
 from rich.console import Console
 
-from safe_wrappers.train.config import ExperimentConfig, parse_experiment
-from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.config import ExperimentConfig, parse_experiment, read_config
 from safe_wrappers.train.evaluation.summary import estimate, number, summarize
 from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
-from safe_wrappers.train.tables import write_rows
+from safe_wrappers.train.files import write_rows
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results" / "table.csv"

@@ -100,8 +100,7 @@ def is_learned(config: str) -> bool:
 
 
 def _run_folder(config: str) -> tuple[Any, Path]:
-    from safe_wrappers.train.config import parse_experiment
-    from safe_wrappers.train.config.file import read_config
+    from safe_wrappers.train.config import parse_experiment, read_config
 
     experiment = parse_experiment(read_config(Path(config)))
     arm = next(a for a in experiment.arms if a.filter.kind == "none")

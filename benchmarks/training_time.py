@@ -17,9 +17,8 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from safe_wrappers.sb3 import InterventionCallback
-from safe_wrappers.train.config import ArmConfig, parse_experiment
+from safe_wrappers.train.config import ArmConfig, parse_experiment, read_config
 from safe_wrappers.train.config.algorithms import ALGORITHMS
-from safe_wrappers.train.config.file import read_config
 from safe_wrappers.train.run.stack import make_stack
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -162,8 +162,7 @@ class Judge:
 
 def learned(robot: str) -> Callable[[Any], Any]:
     """The trained policy of a robot; says how to train it where there is none."""
-    from safe_wrappers.train.config import parse_experiment
-    from safe_wrappers.train.config.file import read_config
+    from safe_wrappers.train.config import parse_experiment, read_config
     from safe_wrappers.train.run.policy import TrainedPolicy
     from safe_wrappers.train.run.training import finished_checkpoint
 

@@ -1,13 +1,17 @@
 """The documentation site: `make docs` builds it into build/docs, ready for file://.
 
 A new page is a Markdown file and a line in its folder's `index.md`; a new picture is a module in `figures/` with a
-function `draw`, shown by the directive `drawn`; a new class is three lines in `api/`.
+function `draw`, shown by the directive `drawn`. The API is read from the modules.
 """
 
 import contextlib
+import importlib
 import io
+import pkgutil
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
 with contextlib.redirect_stderr(io.StringIO()):  # it greets on stderr
     import gymnasium_robotics  # noqa: F401
@@ -60,6 +64,7 @@ html_theme_options = {
 }
 
 autodoc_member_order = "bysource"
+autodoc_default_options = {"exclude-members": "close, render, reset, step"}
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
@@ -68,3 +73,23 @@ python_maximum_signature_line_length = 90
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_attr_annotations = False
+
+
+def _list_modules(app: Any, page: str, source: list[str]) -> None:
+    """`{modules PACKAGE}`, on a line of its own, is the API of every module of the package."""
+
+    def listed(line: re.Match[str]) -> str:
+        found = pkgutil.walk_packages(
+            importlib.import_module(line[1]).__path__, f"{line[1]}."
+        )
+        names = [module.name for module in found if not module.ispkg]
+        return "\n\n".join(f".. automodule:: {name}\n   :members:" for name in names)
+
+    source[0] = re.sub(
+        r"^\{modules ([\w.]+)\}$", listed, source[0], flags=re.MULTILINE
+    )
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", _list_modules)

@@ -12,7 +12,6 @@ from safe_wrappers.control.handover.seam_limits import SeamLimits
 from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
-from safe_wrappers.filter.batch import project_batch
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
 from safe_wrappers.filter.projection import project
 from safe_wrappers.plants import AnalyticPlant, IdentifiedPlant, MujocoPlant, Plant, SimulatorPlant
@@ -72,7 +71,6 @@ __all__ = [
     "occlusion",
     "plants",
     "project",
-    "project_batch",
     "protect",
     "teleop",
 ]

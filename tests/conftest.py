@@ -19,7 +19,6 @@ BEGIN = (
     "test_drive_among_discs",
     "test_point_decision",
     "test_support_distances",
-    "test_way_clearances",
     "test_contact_feasibility",
     # What takes long comes early, so that no worker is alone with it in the end.
     "test_cli",

@@ -217,7 +217,7 @@ def test_options_reach_the_filter():
     narrow, wide = (sw.protect(gym.make("Reacher-v5"), margin=m) for m in (0.0, 0.5))
     assert wide.constraints[0].margin == pytest.approx(narrow.constraints[0].margin + 0.5)
     plant = sw.MujocoPlant()
-    env = sw.protect(gym.make("Reacher-v5"), plant=plant, solver="clarabel", fallback="zero")
+    env = sw.protect(gym.make("Reacher-v5"), plant=plant, fallback="zero")
     assert env.plant is plant
 
 

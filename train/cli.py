@@ -7,49 +7,114 @@ and not before the config file could be read.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
-
-from .command_line import DIAGNOSED_STEPS, ENJOYED_EPISODES, FILTERS, parse
-from .local_imports import importable
-from .processes.output import lasting_output
-from .processes.stopping import Interrupted
-from .processes.storage import telling_of_storage
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from .config import ExperimentConfig
+
+COMMANDS: Final = {
+    "train": "train every arm with every seed; a killed run goes on where it was, a finished one is left",
+    "evaluate": "evaluate the trained policies on the same episodes, with the filter off and on",
+    "compare": "train, evaluate, and print the comparison",
+    "sweep": "search the settings under `sweep` in the config, for the most return at cost zero",
+    "report": "write the comparison as one HTML page, from what is already there; of several, one each",
+    "enjoy": "let a trained policy act, in a window or on film if asked",
+    "push": "upload a run's policy to the Hugging Face hub",
+    "diagnose": "run an env, and a policy: what is wrong, and which wrapper treats it",
+    "list": "print the names of envs, recipes, wrappers, algorithms and configs, or of those kinds that are named",
+    "init": "write a commented config to begin with",
+    "schema": "print the JSON schema of configs, from which editors complete keys",
+}
+_OF_EXPERIMENTS: Final = ("train", "evaluate", "compare", "sweep", "report")
+FILTERS: Final = ("trained", "none", "protect", "both")
+
+
+def make_parser(command: str) -> argparse.ArgumentParser:
+    """The words and options of one command."""
+    parser = argparse.ArgumentParser(prog=f"safe-wrappers {command}", description=COMMANDS[command])
+    add = parser.add_argument
+    if command in _OF_EXPERIMENTS:
+        many = "+" if command == "report" else 1
+        add("configs", nargs=many, type=Path, metavar="CONFIG.yaml", help="the experiment")
+        # They may stand before the config and behind options: `main` tells them by their "=".
+        parser.epilog = "key=value overrides a setting: total_steps=1000, arms.filtered.filter=protect"
+        if command == "report":
+            what = "where to (default: report.html beside the runs)"
+            add("--output", type=Path, metavar="FILE", help=what)
+        else:
+            add("--on", metavar="ray[:ADDRESS]", help="run on a Ray cluster whose nodes share the folders")
+        if command == "compare":
+            add("--report", action="store_true", help="also write the HTML report")
+    elif command in ("enjoy", "diagnose"):
+        if command == "enjoy":
+            add("run", metavar="RUN", help="runs/NAME/ARM/seed_N, a policy's folder, or hub:owner/name")
+            add("--episodes", type=int, default=3, help="episodes, seeds 0, 1, ... (default: %(default)s)")
+            what = (
+                "another filter than it was trained with (default: trained); both: without one, then with it"
+            )
+            add("--filter", choices=FILTERS, default=FILTERS[0], help=what)
+            how = parser.add_mutually_exclusive_group()
+            how.add_argument("--render", action="store_true", help="draw in a window")
+            what = "a film of a typical episode and the worst one"
+            how.add_argument("--output", type=Path, metavar="FILM.webp", help=what)
+        else:
+            add("env", metavar="ENV", help="an id of gymnasium.make")
+            add("--policy", type=Path, metavar="RUN", help="a run's folder, or a model.zip of SB3")
+            add("--steps", type=int, default=2000, help="control steps of each driver (default: %(default)s)")
+            what = "the same as JSON (default: %(default)s)"
+            add("--output", type=Path, metavar="FILE", default=Path("diagnosis.json"), help=what)
+        what = "a module that a policy's folder may import; may be given several times"
+        add("--imports", action="append", metavar="MODULE", default=[], help=what)
+    elif command == "push":
+        add("run", type=Path, metavar="RUN", help="a run's folder, or a policy's")
+        add("repository", metavar="owner/name", help="made if it is not there")
+    elif command == "list":
+        add("kinds", nargs="*", metavar="KIND", help="envs, recipes, wrappers, algorithms, configs")
+    elif command == "init":
+        default = Path("experiment.yaml")
+        add("config", nargs="?", type=Path, default=default, metavar="CONFIG.yaml", help="the file to write")
+        parser.epilog = "env=ID and algorithm=NAME fill it in"
+    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit status. Output that nobody reads any more does not stop it."""
-    with lasting_output():
-        return _main(arguments)
-
-
-def _main(arguments: Sequence[str] | None) -> int:
-    options = parse(arguments)
+    """Runs the command; returns its exit status."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    whole = argparse.ArgumentParser(
+        prog="safe-wrappers",
+        description="Train with and without a safety filter, and compare.",
+        epilog="commands:\n" + "\n".join(f"  {name:10}{text}" for name, text in COMMANDS.items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    whole.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those below")
+    whole.add_argument("--version", action="version", version=version("safe-wrappers"))
+    command = whole.parse_args(given[:1]).command
+    overrides = [word for word in given[1:] if "=" in word and not word.startswith("-")]
+    takes = command in (*_OF_EXPERIMENTS, "init")
+    words = [word for word in given[1:] if not takes or word not in overrides]
+    options = make_parser(command).parse_intermixed_args(words)
     from rich.console import Console
 
+    from .processes import Interrupted
+
     try:
-        with (
-            telling_of_storage(Path.cwd()),
-            importable([*(config.parent for config in options.configs), Path.cwd()]),
-        ):
-            _run(options, Console())
-    except SafeWrappersError as error:
+        with importable([*(config.parent for config in getattr(options, "configs", [])), Path.cwd()]):
+            _RUN.get(command, _experiment)(command, options, overrides, Console())
+    except (SafeWrappersError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except Interrupted as stop:
-        lines = [f"  {line}" for line in stop.standing]
-        print("\n".join(["Stopped. The same command goes on" + ":" * bool(lines), *lines]), file=sys.stderr)
+        print("Stopped. The same command goes on.", file=sys.stderr)
         return 128 + stop.signum
     except KeyboardInterrupt:
         print("Stopped.", file=sys.stderr)
@@ -57,92 +122,102 @@ def _main(arguments: Sequence[str] | None) -> int:
     return 0
 
 
-def _run(options: argparse.Namespace, console: Console) -> None:
-    if options.command in _WITHOUT_EXPERIMENT:
-        _WITHOUT_EXPERIMENT[options.command](options, console)
-        return
+@contextlib.contextmanager
+def importable(folders: Sequence[Path]) -> Iterator[None]:
+    """Lets Python find modules in these folders too, last of all; so do the processes that are started meanwhile."""
+    added = [path for path in dict.fromkeys(str(f.resolve()) for f in folders) if path not in sys.path]
+    # Last: a file of one's own called yaml.py must not take an installed module's place.
+    sys.path.extend(added)
+    try:
+        yield
+    finally:
+        sys.path[:] = [path for path in sys.path if path not in added]
+
+
+def _experiment(command: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
     from .config import parse_experiment, read_config
     from .processes.on_ray import check_place
 
     check_place(options.on)
-    settings = [read_config(config, options.overrides) for config in options.configs]
-    if options.command == "report":
-        _report(options, [parse_experiment(each) for each in settings], console)
-        return
-    if options.command == "sweep":
+    settings = read_config(options.configs[0], overrides)
+    if command == "sweep":
         from .sweep import sweep_experiment
 
-        sweep_experiment(settings[0], options.configs[0], options.overrides, console, options.on)
+        sweep_experiment(settings, options.configs[0], overrides, console, options.on)
         return
 
     from .experiment import evaluate_experiment, summarize_experiment, train_experiment
-    from .report import verdict, write_report
-    from .report.terminal_table import comparison_table
+    from .report import comparison_table, verdict, write_report
 
-    experiment = parse_experiment(settings[0])
-    if options.command in ("train", "compare"):
+    experiment = parse_experiment(settings)
+    if command in ("train", "compare"):
         train_experiment(experiment, console, options.on)
-    if options.command in ("evaluate", "compare"):
+    if command in ("evaluate", "compare"):
         evaluate_experiment(experiment, console, options.on)
     summary = summarize_experiment(experiment)
-    if options.command in ("evaluate", "compare"):
+    if command in ("evaluate", "compare"):
         console.print(comparison_table(experiment, summary))
         console.print("\n".join(verdict(experiment, summary)), highlight=False, markup=False)
-    if options.report:
-        path = write_report(experiment, summary, _compare_command(options.configs[0], options.overrides))
-        console.print(f"Report: {path}", soft_wrap=True, highlight=False)
-    console.print(f"Files: {experiment.folder}", soft_wrap=True, highlight=False)
+    if command == "compare" and options.report:
+        path = write_report(experiment, summary, _compare_command(options.configs[0], overrides))
+        _say(console, f"Report: {path}")
+    _say(console, f"Files: {experiment.folder}")
 
 
-def _diagnose(options: argparse.Namespace, console: Console) -> None:
+def _report(_: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
+    """A page of each config."""
+    from .config import parse_experiment, read_config
+    from .experiment import summarize_experiment
+    from .report import write_report
+
+    if options.output and len(options.configs) > 1:
+        raise ConfigurationError("--output is for one config; of several each page lies beside its runs")
+    for config in options.configs:
+        experiment = parse_experiment(read_config(config, overrides))
+        command = _compare_command(config, overrides)
+        path = write_report(experiment, summarize_experiment(experiment), command, options.output)
+        _say(console, f"Report: {path}")
+
+
+def _diagnose(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
     from .diagnose import diagnose_command
 
-    output = options.output or Path("diagnosis.json")
-    steps = DIAGNOSED_STEPS if options.steps is None else options.steps
-    diagnose_command(options.words[0], options.policy, steps, output, console, options.imports or ())
+    diagnose_command(options.env, options.policy, options.steps, options.output, console, options.imports)
 
 
-def _enjoy(options: argparse.Namespace, console: Console) -> None:
+def _enjoy(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
     from .enjoy import enjoy_command
 
-    episodes = options.episodes or ENJOYED_EPISODES
-    enjoy_command(
-        options.words[0],
-        episodes,
-        options.filter or FILTERS[0],
-        options.render,
-        options.output,
-        console,
-        options.imports or (),
-    )
+    how = options.filter, options.render, options.output
+    enjoy_command(options.run, options.episodes, *how, console, options.imports)
 
 
-def _push(options: argparse.Namespace, console: Console) -> None:
-    from .policies.hub import upload
+def _push(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
+    from .policies import upload
 
-    names = upload(Path(options.words[0]), options.words[1])
-    console.print(f"Uploaded: {', '.join(names)}", highlight=False, soft_wrap=True)
-
-
-def _list(options: argparse.Namespace, console: Console) -> None:
-    from .listing import list_command
-
-    list_command(options.words, console)
+    _say(console, f"Uploaded: {', '.join(upload(options.run, options.repository))}")
 
 
-def _init(options: argparse.Namespace, console: Console) -> None:
-    from .first_config import init_command
+def _list(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
+    from .init import list_command
 
-    init_command(next(iter(options.configs), None), options.overrides, console)
+    list_command(options.kinds, console)
 
 
-def _schema(options: argparse.Namespace, console: Console) -> None:
+def _init(_: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
+    from .init import init_command
+
+    init_command(options.config, overrides, console)
+
+
+def _schema(*_: Any) -> None:
     from .config.schema import config_schema
 
     print(json.dumps(config_schema(), indent=1))
 
 
-_WITHOUT_EXPERIMENT: Final = {
+_RUN: Final[dict[str, Callable[[str, argparse.Namespace, list[str], Console], None]]] = {
+    "report": _report,
     "diagnose": _diagnose,
     "enjoy": _enjoy,
     "push": _push,
@@ -152,26 +227,8 @@ _WITHOUT_EXPERIMENT: Final = {
 }
 
 
-def _report(options: argparse.Namespace, experiments: list[ExperimentConfig], console: Console) -> None:
-    """Of one config its page; of several a page each, and one that puts them side by side."""
-    from .experiment import summarize_experiment
-    from .report import write_overview, write_report
-
-    folders = [experiment.folder for experiment in experiments]
-    for folder in folders:
-        if folders.count(folder) > 1:
-            raise ConfigurationError(f"report: two configs name the same experiment, {str(folder)!r}.")
-    entries = [(experiment, summarize_experiment(experiment)) for experiment in experiments]
-    for config, (experiment, summary) in zip(options.configs, entries, strict=True):
-        alone = options.output if len(entries) == 1 else None
-        path = write_report(experiment, summary, _compare_command(config, options.overrides), alone)
-        console.print(f"Report: {path}", soft_wrap=True, highlight=False)
-        console.print(f"Files: {experiment.folder}", soft_wrap=True, highlight=False)
-    if len(entries) > 1:
-        path = options.output or experiments[0].output / "overview.html"
-        again = ["safe-wrappers", "report", *map(str, options.configs), *options.overrides]
-        write_overview(entries, path, shlex.join(again))
-        console.print(f"Overview: {path}", soft_wrap=True, highlight=False)
+def _say(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def _compare_command(config: Path, overrides: Sequence[str]) -> str:

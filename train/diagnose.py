@@ -16,11 +16,11 @@ from safe_wrappers.diagnosis import Diagnosis, diagnose
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
-from .atomic import write_text
 from .config.algorithms import ALGORITHMS
-from .config.env_ids import make_env
+from .files import write_text
 from .policies import load_policy
 from .run.data_pickles import pickles_of_model
+from .run.stack import make_env
 
 Policy = Callable[[Any], Any]
 _OF_PACKAGE: Final = {"recurrent": "RecurrentPPO", "maskable": "MaskablePPO"}

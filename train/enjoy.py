@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,10 +12,10 @@ from rich.console import Console
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 
-from .atomic import write_bytes
 from .evaluation.episode_selection import filmed_seeds, typical_and_worst
+from .files import write_bytes
 from .policies import load_policy
-from .processes.parallel import environment
+from .processes import environment
 from .run.policy import TrainedPolicy
 from .videos.film import film_episodes, for_film
 from .videos.rendering import find_rendering
@@ -45,8 +46,10 @@ def enjoy_command(
         imports: As `load_policy` takes it.
 
     Raises:
-        ConfigurationError: No such run, or the task cannot be drawn in this way.
+        ConfigurationError: No such run, no episode, or the task cannot be drawn in this way.
     """
+    if episodes < 1:
+        raise ConfigurationError(f"--episodes: expected at least 1, got {episodes}")
     trained = load_policy(run, other_filter=action_filter != "trained", imports=imports)
     _check_modes(trained, "human" if window else "rgb_array" if film is not None else None)
 
@@ -63,7 +66,9 @@ def enjoy_command(
     for name in ("none", "trained" if own else "protect") if both else (action_filter,):
         figures = _drive(trained, name, episodes, window, None if both else say)
         on = name == "protect" or (name == "trained" and own)
-        say(f"{trained.arm.name}, filter {'on' if on else 'off'}, {episodes} episodes: {_mean(figures)}")
+        say(
+            f"{trained.arm.name}, filter {'on' if on else 'off'}, mean of {episodes} episodes: {_told(figures)}"
+        )
         if film is not None and (on == own or not both):
             returns = {seed: episode["return"] for seed, episode in enumerate(figures)}
             say(_film(trained, name, returns, film))
@@ -87,9 +92,8 @@ def _drive(
     trained: TrainedPolicy, used: Any, episodes: int, window: bool, say: Callable[[str], None] | None
 ) -> list[dict[str, Any]]:
     """Runs episodes; returns their figures, each of which is told as it ends."""
-    env = trained.make_env(used, "human" if window else None)
     found = []
-    try:
+    with closing(trained.make_env(used, "human" if window else None)) as env:
         for seed in range(episodes):
             observation, _ = env.reset(seed=seed)
             trained.begin(env)
@@ -99,27 +103,16 @@ def _drive(
                 done = terminated or truncated
             found.append(info[keys.EPISODE_SUMMARY])
             if say is not None:
-                say(f"episode {seed}: {_episode(found[-1])}")
-    finally:
-        env.close()
+                say(f"episode {seed}: {_told(found[-1:])}")
     return found
 
 
-def _episode(figures: dict[str, Any]) -> str:
-    words = [f"return {figures['return']:.2f}", f"{figures['length']} steps"]
-    if "violations" in figures:
-        words.append(f"{figures['violations']} in violation")
-    if "intervention_rate" in figures:
-        words.append(f"{100 * figures['intervention_rate']:.1f} % changed")
-    return ", ".join(words)
-
-
-def _mean(figures: list[dict[str, Any]]) -> str:
-    """What episodes come to, by step where steps are counted."""
+def _told(figures: list[dict[str, Any]]) -> str:
+    """What episodes come to: their mean return, and by step what is counted by step."""
     steps = sum(episode["length"] for episode in figures)
-    words = [f"return {sum(episode['return'] for episode in figures) / len(figures):.1f} per episode"]
+    words = [f"return {sum(episode['return'] for episode in figures) / len(figures):.2f}", f"{steps:,} steps"]
     if all("violations" in episode for episode in figures):
-        words.append(f"{sum(episode['violations'] for episode in figures):,} of {steps:,} steps in violation")
+        words.append(f"{sum(episode['violations'] for episode in figures):,} in violation")
     if all("intervention_rate" in episode for episode in figures):
         changed = sum(episode["intervention_rate"] * episode["length"] for episode in figures)
         words.append(f"{100 * changed / steps:.1f} % changed")
@@ -132,11 +125,7 @@ def _film(trained: TrainedPolicy, used: Any, returns: dict[int, float], path: Pa
     if rendering.problem:
         return f"No film: {rendering.problem}"
     typical, worst = typical_and_worst(returns)
-    with environment(rendering.variables):
-        env = for_film(trained.make_env(used, "rgb_array"))
-        try:
-            write_bytes(path, film_episodes(trained, env, filmed_seeds(typical, worst))[0])
-        finally:
-            env.close()
+    with environment(rendering.variables), closing(for_film(trained.make_env(used, "rgb_array"))) as env:
+        write_bytes(path, film_episodes(trained, env, filmed_seeds(typical, worst))[0])
     beside = "" if worst == typical else f", beside it {worst}, the lowest"
     return f"Film: {path} (episode {typical} has the median return{beside})"

@@ -10,21 +10,16 @@ from rich.console import Console
 
 from .config import ArmConfig, ExperimentConfig
 from .evaluation.evaluate import evaluate_run
-from .evaluation.intact import check_training_table
 from .evaluation.summary import Summary, summarize, write_summary
-from .hyperparameters import check_task, whole_rollouts
-from .policies.card import write_card
-from .processes.job import Job
-from .processes.lock import check_free
+from .policies import write_card
+from .processes import Job
 from .processes.parallel import run_jobs
-from .processes.stopping import Interrupted
-from .processes.storage import check_writable
 from .run.folder import check_finished, check_folder, is_outgrown
-from .run.learner_callbacks import check_margins
+from .run.model import check_task, whole_rollouts
+from .run.stack import make_training_env
 from .run.start import Start
 from .run.trackers import check_trackers
-from .run.training import check_start, standing, train_run
-from .run.vec_envs import make_training_env
+from .run.training import check_start, train_run
 from .videos.record import delete_videos, record_videos
 
 
@@ -40,28 +35,14 @@ def train_experiment(experiment: ExperimentConfig, console: Console, on: str | N
         ConfigurationError: A task, a filter or an algorithm refuses its settings; nothing has been started.
         RunStateError: A run folder belongs to another config; nothing has been started.
         RunsFailedError: Some runs failed.
-        Interrupted: A signal came; says where each run will go on.
+        Interrupted: A signal came; the same command goes on.
     """
     check_training(experiment)
     for arm in experiment.arms:
         if any(is_outgrown(arm, experiment.run_folder(arm, seed)) for seed in experiment.seeds):
             delete_videos(experiment, arm)
-    try:
-        every = sum(whole_rollouts(arm) for arm in experiment.arms) * len(experiment.seeds)
-        before = 0
-        for arms in generations(experiment):
-            jobs = training_jobs(experiment, arms)
-            now = sum(job.total for job in jobs)
-            later = every - before - now
-            run_jobs(jobs, experiment.workers, console, "Training", before, later, on=on)
-            before += now
-    except Interrupted as stop:
-        stop.standing = [
-            f"{arm.name} seed {seed}: {standing(arm, experiment.run_folder(arm, seed))}"
-            for seed in experiment.seeds
-            for arm in experiment.arms
-        ]
-        raise
+    for arms in generations(experiment):
+        run_jobs(training_jobs(experiment, arms), experiment.workers, console, "Training", on=on)
     write_cards(experiment)
 
 
@@ -70,24 +51,19 @@ def check_training(experiment: ExperimentConfig) -> None:
 
     Raises:
         ConfigurationError: A task, a filter or an algorithm refuses its settings.
-        RunStateError: A run folder belongs to another config, cannot be written to, or another process is at work
-            in it.
+        RunStateError: A run folder belongs to another config.
     """
     for arm in experiment.arms:
         env = make_training_env(arm)
         check_task(arm, env)
         env.reset()  # the task alone knows its options, and a filter of one's own is asked here first
-        check_margins(arm, env)
         check_trackers(arm)
         env.close()
         start = _start(experiment, arm, experiment.seeds[0])
         if start is not None:
             check_start(arm, start)
         for seed in experiment.seeds:
-            folder = experiment.run_folder(arm, seed)
-            check_folder(arm, seed, folder)
-            check_writable(folder)
-            check_free(folder)
+            check_folder(arm, seed, experiment.run_folder(arm, seed))
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
@@ -99,17 +75,12 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str 
         on: Where to evaluate, as in training; films are made on this machine.
 
     Raises:
-        RunStateError: A run is not trained to its end, its folder cannot be written to, or another process is at work
-            in it; nothing has been started.
+        RunStateError: A run is not trained to its end; nothing has been started.
         RunsFailedError: Some runs failed.
     """
     for arm in experiment.arms:
         for seed in experiment.seeds:
-            folder = experiment.run_folder(arm, seed)
-            check_finished(arm, folder)
-            check_training_table(folder)
-            check_writable(folder)
-            check_free(folder)
+            check_finished(arm, experiment.run_folder(arm, seed))
     jobs = evaluation_jobs(experiment, experiment.arms)
     run_jobs(jobs, experiment.workers, console, "Evaluation", on=on)
     write_cards(experiment)

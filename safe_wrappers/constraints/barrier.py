@@ -108,7 +108,6 @@ class BoundBarrier(BoundConstraint):
         room, alpha = self._now - self.spec.margin, self.spec.alpha
         decay = alpha(room) if callable(alpha) else alpha * room
         bend = 0.5 * self.spec.curvature * self.plant.control_dt
-        # The condition of `cbf.cbf_rows`, for one barrier without its conversions.
         drift, effect = gradient @ self.plant.f, gradient @ self.plant.g
         return HalfSpaces(-effect[None, :], np.array([drift + (decay - bend)]))
 

@@ -14,7 +14,7 @@ from safe_wrappers.constraints.obstacles import (
     obstacles_from,
     refuse_more_dimensions,
 )
-from safe_wrappers.control.backup.approach_rows import (
+from safe_wrappers.control.backup.stopping import (
     Machine,
     approach_rows,
     approach_rows_of,

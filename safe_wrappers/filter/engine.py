@@ -10,7 +10,7 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
-from safe_wrappers.filter.projection import load_compiled
+from safe_wrappers.filter.projection import load_solvers
 from safe_wrappers.filter.search import Decision, SafeActionSearch
 from safe_wrappers.plants.plant import Plant
 
@@ -24,7 +24,6 @@ class SafetyFilter:
         plant: Bound to its env.
         constraints: Specifications; each is bound to the plant.
         fallback: "brake", "hold", "zero", or a function of the plant.
-        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         low: Action box, shape (m,).
         high: Likewise.
         dtype: Of the actions; decisions are rounded to it before they are judged.
@@ -49,23 +48,22 @@ class SafetyFilter:
         plant: Plant,
         constraints: Sequence[Constraint],
         fallback: str | FallbackFunction,
-        solver: str,
         low: Array,
         high: Array,
         dtype: Any = np.float64,
         search: type[SafeActionSearch] = SafeActionSearch,
     ) -> None:
         self.plant, self._constraints = plant, constraints
-        self._making = fallback, solver, low, high, dtype, search
+        self._making = fallback, low, high, dtype, search
         self._low, self._high = low, high
         self._narrower = not plant.bounds_are_action_space
         self._loaded = False
-        load_compiled()
+        load_solvers()
         self._bind()
 
     def _bind(self) -> None:
         """Let the constraints read what they need of the plant's model."""
-        fallback, solver, low, high, dtype, search = self._making
+        fallback, low, high, dtype, search = self._making
         plant = self.plant
         self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in self._constraints]
         self.reporting = [c for c in self.bound if c.info_keys]
@@ -74,7 +72,7 @@ class SafetyFilter:
             if kinds.count(kind) > 1:
                 twice = f"{kind} is in the list {kinds.count(kind)} times"
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
-        self._search = search(plant, self.bound, Fallback(fallback, self.bound), solver, low, high, dtype)
+        self._search = search(plant, self.bound, Fallback(fallback, self.bound), low, high, dtype)
         self._all_predict = all(c.predicts for c in self.bound)
         self._model_version = plant.model_version  # last: what does not fit is refused at every observation
 

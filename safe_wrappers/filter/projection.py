@@ -2,36 +2,77 @@
 
 Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1.
 
-`rows_and_box` answers: the nominal is feasible (returned bit for bit), or the compiled active set, whose answer is
-checked. Named solvers see problems of several rows only, and their answers are checked, too. Calls share no state.
+An admissible nominal is returned bit for bit. One row is answered in closed form, several by daqp. Where daqp has no
+answer that passes the check, least distance programming by SciPy's non-negative least squares decides (Lawson and
+Hanson, "Solving Least Squares Problems", 1974, chapter 23): it is exact to rounding in thin wedges, and "infeasible"
+is believed only with multipliers that prove it. Calls share no state.
 """
 
+import functools
 import math
-from functools import cache
-from typing import Any
+from enum import StrEnum
+from typing import Any, Final, NamedTuple
 
+import daqp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter import rows_and_box
-from safe_wrappers.filter.problem import Projection, Status
-from safe_wrappers.filter.qp import OPTIMALITY_TOLERANCE, control_unit, nearest, plain, solve_with_daqp
-from safe_wrappers.filter.rows_and_box import LARGEST, OVERFLOWING, keep_rows, row_slacks
+from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.errors import ConfigurationError
 
-OWN = "active-set"
-"""The solver that is compiled with the library."""
-STATUSES = (Status.INACTIVE, Status.PROJECTED, Status.INFEASIBLE, Status.FAILED)
+_TOLERANCE: Final = 1e-9
+"""Largest residual that the nominal may have, as a share of `_scale`; answers may have ten times as much."""
+_EXACT: Final = 1e-3
+"""Share of what the nominal is allowed that round-off leaves. More may be far from every admissible control."""
+_NARROWEST: Final = 1e-6  # share of its distance from zero below which a box's width is rounding
+_ORDINARY: Final = 16.0  # half of a box; where it is wider the sizes of the numbers matter
+_NO_BOUND: Final = 1e15  # a box that reaches farther (control units) bounds nothing
+_UNBOUNDED: Final = 1e30  # what daqp takes as "no bound"
+_LARGEST: Final = 1e150  # from here on squares may overflow
+_OVERFLOWING: Final = 1e300  # an offset from here on asks for nothing
+_SHORTEST: Final = 1e-150  # rows below this are zero
+_ROUNDING: Final = 1e-15  # share of the numbers that are compared which round-off may leave
+_OPTIMAL: Final = (
+    1e-9  # what the multipliers' control may differ from the answer by, as a share of the controls
+)
+_DOWNHILL: Final = 1e-4  # likewise of a least squares answer
+_SOFT: Final = 1e-10  # weight of the distance from the nominal beside squared violations
+_FAR: Final = 1e8  # from the nominal, in the program's units: nobody looks for a control farther away
+_SOFTENED: Final = 8  # daqp's mark of a row that may be violated
+_SLACK, _LENGTH, _ALLOWED = range(3)
+_ADMITTED, _UNUSUAL, _BAD_NOMINAL, _BAD_BOX = -1, -2, -3, -4
+
+
+class Status(StrEnum):
+    """How a projection ended."""
+
+    INACTIVE = "inactive"
+    """The nominal control satisfies everything; `control` is that control, bit for bit."""
+    PROJECTED = "projected"
+    """`control` is the closest admissible control, residual checked."""
+    INFEASIBLE = "infeasible"
+    """No control in the box satisfies every row; `control` violates them least."""
+    FAILED = "failed"
+    """No method gave an answer that passed the check; `control` is only inside the box."""
+
+
+class Projection(NamedTuple):
+    """An answer that has been checked.
+
+    Attributes:
+        control: Shape (m,), always finite and inside the box.
+        status: See `Status`; compares equal to its string.
+        violation: Largest `normals @ control - offsets` over all rows, at least 0, in row units.
+    """
+
+    control: Array
+    status: Status
+    violation: float
 
 
 def project(
-    u_nom: ArrayLike,
-    normals: ArrayLike,
-    offsets: ArrayLike,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    solver: str = OWN,
+    u_nom: ArrayLike, normals: ArrayLike, offsets: ArrayLike, lower: ArrayLike, upper: ArrayLike
 ) -> Projection:
     """Project a nominal control onto `{u : normals @ u <= offsets, lower <= u <= upper}`.
 
@@ -47,15 +88,10 @@ def project(
         offsets: Shape (k,).
         lower: Box, shape (m,); -inf is no bound.
         upper: Box, shape (m,); +inf is no bound.
-        solver: "active-set" (compiled, exact to round-off), "daqp" (called directly) or any installed qpsolvers
-            backend by name. Where a named one has no answer that passes the check, the active set answers.
 
     Raises:
         ConfigurationError: Shapes do not match, bounds cross, or an argument that must be finite is not.
-        UnknownNameError: No such solver is installed.
     """
-    if solver != OWN:
-        check_solver(solver)
     u = np.array(u_nom, dtype=np.float64, ndmin=1)
     m = u.size
     a = np.asarray(normals, dtype=np.float64)
@@ -72,85 +108,346 @@ def project(
             hi = np.full(m, hi)
     except ValueError:
         raise ConfigurationError(f"expected bounds of shape ({m},); got {lo.shape} and {hi.shape}") from None
-    return project_unchecked(u, a, b, lo, hi, solver)
+    return project_unchecked(u, a, b, lo, hi)
 
 
-def check_solver(solver: str) -> None:
-    """Refuse a solver that is not installed, naming those that are."""
-    if solver in (OWN, "daqp"):
-        return
-    import qpsolvers  # here: it imports every solver that is installed, JAX and torch among them
+class _Problem(NamedTuple):
+    """The arguments of a projection, as compiled code takes them, and what `_prepare` writes.
 
-    if solver not in qpsolvers.available_solvers:
-        there = ", ".join(sorted(qpsolvers.available_solvers))
-        raise UnknownNameError(f"solver {solver!r} is not installed; installed: {OWN}, {there}")
+    In the program rows have length one and controls are of order one, by a division by a power of two, which rounds
+    nothing: solvers know only absolute tolerances.
+    """
+
+    u: Array  # shape (m,)
+    a: Array  # shape (k, m)
+    b: Array  # shape (k,)
+    lo: Array  # shape (m,)
+    hi: Array  # shape (m,)
+    control: Array  # the nominal, clipped to the box
+    rows: Array  # shape (3, k): _SLACK, _LENGTH (0: asks for nothing), _ALLOWED, in row units
+    target: Array  # of the program: u, shape (m,)
+    normals: Array  # of the program, shape (k, m)
+    upper: Array  # of the program: of the controls, then of the rows, shape (m + k,)
+    lower: Array  # likewise
+
+    @staticmethod
+    def of(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> "_Problem":
+        """Copied where compiled code would have to be compiled anew: strides, read-only memory."""
+        given = [part if part.flags.carray else part.copy() for part in (u, a, b, lo, hi)]
+        m, k = u.size, b.size
+        sizes = np.empty(m), np.empty((3, k)), np.empty(m), np.empty((k, m)), np.empty(m + k), np.empty(m + k)
+        return _Problem(*given, *sizes)
 
 
-def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
+@compiled
+def _half_width(low: float, high: float) -> float:
+    """Half of what a box spans in one component, control units."""
+    return min(max(0.5 * high - 0.5 * low, _NARROWEST * max(high, -low)), _UNBOUNDED)
+
+
+@compiled
+def _scale(box: float, length: float, values: float, widest: float) -> float:
+    """What a residual is compared with, row units.
+
+    Args:
+        box: How far the row's value changes over half of the box.
+        length: Of the normal: what it changes by over one control unit.
+        values: Size of the two numbers that the row compares.
+        widest: Half of the box's largest width, control units.
+    """
+    if widest <= _ORDINARY:
+        return box
+    return values if box >= _NO_BOUND * length else min(box, max(values, length))
+
+
+@compiled
+def _prepare(p: _Problem) -> tuple[int, float]:
+    """Read a problem and write what is small in it, and the program.
+
+    Returns:
+        How many rows ask for something, or a code below 0; the power of two that is one in the program.
+    """
+    k, m = p.a.shape
+    usual, inside, within, unit = True, True, True, 1.0
+    largest = farthest = widest = away = 0.0
+    for j in range(m):
+        x, low, high = p.u[j], p.lo[j], p.hi[j]
+        if not math.isfinite(x):
+            return _BAD_NOMINAL, unit
+        if not low <= high:
+            return _BAD_BOX, unit
+        p.control[j] = min(max(x, low), high)
+        inside = inside and p.control[j] == x
+        usual = usual and abs(x) < _LARGEST and abs(p.control[j]) < _LARGEST
+        largest, farthest = max(largest, abs(x)), max(farthest, abs(p.control[j]))
+        p.target[j] = _half_width(low, high)
+        widest = max(widest, p.target[j])
+    for i in range(k):
+        excess = -p.b[i]
+        for j in range(m):
+            usual = usual and abs(p.a[i, j]) < _LARGEST
+            excess += p.a[i, j] * p.u[j]
+        usual = usual and p.b[i] > -_OVERFLOWING
+        p.rows[_ALLOWED, i] = excess
+        within = within and excess <= 0.0
+    if not usual:
+        return _UNUSUAL, unit
+    if inside and within:
+        return _ADMITTED, unit
+    asking, within = 0, True
+    for i in range(k):
+        length = box = 0.0
+        for j in range(m):
+            length += p.a[i, j] * p.a[i, j]
+        length = math.sqrt(length)
+        for j in range(m if length > 0.0 else 0):
+            part = p.a[i, j] / length * p.target[j]
+            box += part * part
+        offset, excess = abs(p.b[i]), p.rows[_ALLOWED, i]
+        p.rows[_SLACK, i] = _TOLERANCE * _scale(
+            length * math.sqrt(box), length, length * largest + offset, widest
+        )
+        within = within and excess <= p.rows[_SLACK, i]
+        rounding = _ROUNDING * (length * max(largest, farthest) + offset)
+        p.rows[_ALLOWED, i] = max(_EXACT * p.rows[_SLACK, i], rounding)
+        asks = length > _SHORTEST and offset < _OVERFLOWING
+        p.rows[_LENGTH, i] = length if asks else 0.0
+        if asks:
+            away, asking = max(away, excess / length), asking + 1
+    if inside and within:
+        return _ADMITTED, unit
+    size = widest
+    if size > _ORDINARY:
+        size = _scale(size, 1.0, max(largest, away), size)
+    if size > 0.0:
+        while unit > size:
+            unit *= 0.5
+        while 2.0 * unit <= size:
+            unit *= 2.0
+    for j in range(m):
+        p.target[j] = p.u[j] / unit
+        p.upper[j], p.lower[j] = min(p.hi[j] / unit, _UNBOUNDED), max(p.lo[j] / unit, -_UNBOUNDED)
+    for i in range(k):
+        length = p.rows[_LENGTH, i]
+        for j in range(m):
+            p.normals[i, j] = p.a[i, j] / length if length > 0.0 else 0.0
+        p.upper[m + i] = p.b[i] / length / unit if length > 0.0 else _UNBOUNDED
+        p.lower[m + i] = -_UNBOUNDED
+    return asking, unit
+
+
+@compiled
+def _judge(p: _Problem, unit: float, found: Array, multipliers: Array) -> tuple[bool, bool, float]:
+    """Check the program's answer and write it, inside the box, to `control`.
+
+    Returns:
+        Whether it keeps the rows but for round-off, and its multipliers lead to it from the nominal; whether it
+        misses none by more than an answer may; its violation.
+    """
+    k, m = p.a.shape
+    closest, within, violation, size, widest = True, True, 0.0, 0.0, 0.0
+    for j in range(m):
+        closest = closest and math.isfinite(found[j])
+        p.control[j] = min(max(found[j] * unit, p.lo[j]), p.hi[j])
+        size = max(size, abs(p.u[j]), abs(p.control[j]))
+        widest = max(widest, _half_width(p.lo[j], p.hi[j]))
+    for i in range(k):
+        excess = -p.b[i]
+        for j in range(m):
+            excess += p.a[i, j] * p.control[j]
+        violation = max(violation, excess)
+        within = within and excess <= 10.0 * p.rows[_SLACK, i]
+        closest = closest and (excess <= 2.0 * p.rows[_ALLOWED, i] or p.rows[_LENGTH, i] == 0.0)
+    for j in range(m):
+        pulled, pull = p.target[j], 0.0
+        for i in range(k):
+            step = max(multipliers[m + i], 0.0) * p.normals[i, j]
+            pulled, pull = pulled - step, pull + abs(step)
+        near = _EXACT * _TOLERANCE * _scale(_half_width(p.lo[j], p.hi[j]), 1.0, size, widest)
+        away = abs(min(max(pulled * unit, p.lo[j]), p.hi[j]) - p.control[j])
+        closest = closest and away <= _OPTIMAL * size + 10.0 * _ROUNDING * pull * unit + near
+    return closest, within, violation
+
+
+def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Projection:
     """`project` for callers that have already checked types and shapes.
 
     Raises:
         ConfigurationError: A nominal that is not finite, or bounds that cross.
     """
-    control, multipliers = np.empty(u.size), np.empty(b.size)
-    problem = plain(u, a, b, lo, hi)
-    ended, violation, steps = keep_rows(*problem, solver != OWN, control, multipliers)
-    if ended == rows_and_box.INACTIVE:
-        return Projection(u, Status.INACTIVE, 0.0, multipliers, 0)
-    if ended <= rows_and_box.INFEASIBLE:
-        return Projection(control, STATUSES[ended], violation, multipliers, steps)
-    if ended == rows_and_box.UNUSUAL:
-        return _finite_rows_only(u, a, b, lo, hi, solver)
-    if ended == rows_and_box.BAD_NOMINAL:
-        raise ConfigurationError(f"u_nom must be finite, got {u}; replace it before projecting")
-    if ended == rows_and_box.BAD_BOX:
-        raise ConfigurationError(f"lower must not exceed upper, got {lo} and {hi}")
-    answer = nearest("daqp" if solver == OWN else solver, u, a, b, lo, hi)
-    if answer is not None:
-        violation = max(0.0, float((a @ answer[0] - b).max()))
-        return Projection(answer[0], Status.PROJECTED, violation, *answer[1:])
-    if solver != OWN:  # its failure does not make the problem infeasible
-        return project_unchecked(u, a, b, lo, hi, OWN)
-    return Projection(control, Status.FAILED, max(0.0, float((a @ control - b).max())), multipliers, steps)
+    p = _Problem.of(u, a, b, lo, hi)
+    asking, unit = _prepare(p)
+    if asking == _ADMITTED:
+        return Projection(u, Status.INACTIVE, 0.0)
+    if asking < 0:
+        return _without_program(p, asking)
+    clipped = p.control.copy()
+    if asking <= 1:
+        _, within, violation = _judge(p, unit, *_along_one_row(p, unit))
+        return Projection(p.control, _status(within), violation)
+    closest, within, violation = _judge(p, unit, *_by_daqp(p))
+    if closest:
+        return Projection(p.control, _status(within), violation)
+    softened = _by_daqp(p, _SOFTENED)
+    proved = _prove_that_none_exists(p, softened[1])
+    if not proved:  # thin, or daqp has failed
+        found = _by_least_distance(p)
+        proved = _prove_that_none_exists(p, found[1])
+        closest, within, violation = _judge(p, unit, *_polished(p, *found))
+        if closest and not proved:
+            return Projection(p.control, _status(within), violation)
+    if proved and bool(np.isfinite(softened[0]).all()):
+        _, within, violation = _judge(p, unit, *softened)
+        return Projection(p.control, _status(within), violation)
+    return Projection(clipped, Status.FAILED, max(0.0, float((a @ clipped - b).max())))
 
 
-def _finite_rows_only(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
+def _status(within: bool) -> Status:
+    return Status.PROJECTED if within else Status.INFEASIBLE
+
+
+def _without_program(p: _Problem, code: int) -> Projection:
     """Rows with numbers that are not finite or too large cannot be checked: respect the others, say failed."""
-    fine = (np.abs(a) < LARGEST).all(axis=1) & (b > -OVERFLOWING)
-    control = np.clip(u, lo, hi)
-    if bool((np.abs(u) < LARGEST).all() and (np.abs(control) < LARGEST).all()):
-        control = project_unchecked(u, a[fine], b[fine], lo, hi, solver).control
-    return Projection(control, Status.FAILED, math.inf, np.zeros(b.size), 0)
+    if code == _BAD_NOMINAL:
+        raise ConfigurationError(f"u_nom must be finite, got {p.u}; replace it before projecting")
+    if code == _BAD_BOX:
+        raise ConfigurationError(f"lower must not exceed upper, got {p.lo} and {p.hi}")
+    fine = (np.abs(p.a) < _LARGEST).all(axis=1) & (p.b > -_OVERFLOWING)
+    control = np.clip(p.u, p.lo, p.hi)
+    if bool((np.abs(p.u) < _LARGEST).all() and (np.abs(control) < _LARGEST).all()):
+        control = project_unchecked(p.u, p.a[fine], p.b[fine], p.lo, p.hi).control
+    return Projection(control, Status.FAILED, math.inf)
 
 
-@cache
-def load_compiled() -> None:
-    """Load the compiled projection, or compile it (10 to 15 s, once per machine), so that no control step waits."""
-    one = np.ones(1)
-    row = one.reshape(1, 1), -0.5 * one, -one, one
-    project_unchecked(one, *row, OWN)
-    keeps_rows(one, *row)
+_Answer = tuple[Array, Array]
+"""Of the program: the control, shape (m,), and multipliers of the box (below 0: of lower bounds) and the rows."""
+
+
+def _along_one_row(p: _Problem, unit: float) -> _Answer:
+    """The first point of `clip(u - t row)`, t >= 0, that keeps the only row that asks; else the corner against it."""
+    u, m, multipliers = p.target, p.u.size, np.zeros(len(p.upper))
+    lo, hi = p.lo / unit, p.hi / unit
+    if not p.rows[_LENGTH].any():
+        return np.clip(u, lo, hi), multipliers
+    which = int(p.rows[_LENGTH].argmax())
+    row, offset = p.normals[which], p.upper[m + which]
+    x = u - max(row @ u - offset, 0.0) * row
+    if bool(((x >= lo) & (x <= hi) & (u >= lo) & (u <= hi)).all()):
+        return x, multipliers
+    with np.errstate(all="ignore"):
+        ends = np.concatenate([(u - lo) / row, (u - hi) / row])
+    # Where a component leaves a bound or ends at one.
+    ends = np.append(0.0, np.unique(ends[np.isfinite(ends) & (ends > 0.0)]))
+    points = np.clip(u - ends[:, None] * row, lo, hi)
+    first = int(np.append(points @ row <= offset, True).argmax())
+    if not first:
+        return points[0], multipliers
+    middle = 0.5 * (ends[first - 1] + ends[first]) if first < len(ends) else ends[-1] + 1.0
+    x = u - middle * row
+    moving = (x > lo) & (x < hi) & (row != 0.0)
+    x = np.clip(x, lo, hi)
+    if moving.any():
+        part = row[moving]
+        time = (row[~moving] @ x[~moving] + part @ u[moving] - offset) / (part @ part)
+        x[moving] = u[moving] - time * part
+    return x, multipliers
+
+
+def _by_daqp(p: _Problem, sense: int = 0) -> _Answer:
+    """By an active set; with `_SOFTENED` rows the least violation, and of that what is closest to the nominal."""
+    senses = np.zeros(len(p.upper), np.int32)
+    senses[p.u.size :] = sense
+    bounds = p.normals, p.upper, p.lower, senses
+    tolerance = _SOFT if sense else _ROUNDING
+    x, _, flag, info = daqp.solve(
+        _identity(p.u.size), -p.target, *bounds, primal_tol=tolerance, rho_soft=_SOFT
+    )
+    return np.asarray(x) if flag > 0 else np.full(p.u.size, np.nan), np.asarray(info["lam"])
+
+
+def _by_least_distance(p: _Problem) -> _Answer:
+    """By non-negative least squares: its residual leads from the nominal to the answer, and vanishes without one."""
+    from scipy.optimize import nnls  # here: it takes a fifth of the time of `import safe_wrappers`
+
+    m, unit = p.u.size, _identity(p.u.size)
+    above, below = np.flatnonzero(p.upper[:m] < _UNBOUNDED), np.flatnonzero(p.lower[:m] > -_UNBOUNDED)
+    normals = np.vstack([unit[above], -unit[below], p.normals])
+    limits = np.concatenate([p.upper[above], -p.lower[below], p.upper[m:]])
+    columns = -np.vstack([normals.T, limits - normals @ p.target])
+    multipliers = np.zeros(len(p.upper))
+    try:
+        y, _ = nnls(columns, np.append(np.zeros(m), 1.0))
+    except (RuntimeError, ValueError):  # too many steps; numbers that are not finite
+        return np.full(m, np.nan), multipliers
+    rest = columns @ y
+    scale = 1.0 - rest[-1] if rest[-1] < 1.0 else np.finfo(np.float64).eps
+    y /= scale
+    np.add.at(multipliers, above, y[: len(above)])
+    np.subtract.at(multipliers, below, y[len(above) : len(above) + len(below)])
+    multipliers[m:] = y[len(above) + len(below) :]
+    return p.target + rest[:-1] / scale, multipliers
+
+
+def _polished(p: _Problem, x: Array, multipliers: Array) -> _Answer:
+    """What rounding leaves of the rows that hold, taken out."""
+    m = p.u.size
+    holds, free = multipliers[m:] > 0.0, multipliers[:m] == 0.0
+    if not bool(holds.any() and np.isfinite(x).all()):
+        return x, multipliers
+    x = np.where(free, x, np.where(multipliers[:m] > 0.0, p.upper[:m], p.lower[:m]))
+    left, part = p.upper[m:][holds] - p.normals[holds] @ x, p.normals[holds][:, free]
+    x[free] += np.linalg.lstsq(part, left, rcond=None)[0]
+    multipliers[m:][holds] = np.linalg.lstsq(part.T, (p.target - x)[free], rcond=None)[0]
+    return x, multipliers
+
+
+def _prove_that_none_exists(p: _Problem, multipliers: Array) -> bool:
+    """Whether the multiples of rows and bounds contradict each other in the box (Farkas)."""
+    m = p.u.size
+    box, weights = multipliers[:m], np.maximum(multipliers[m:], 0.0)
+    with np.errstate(all="ignore"):
+        away = np.where(box > 0.0, p.upper[:m], p.lower[:m]) - p.target
+        missed = -float(weights @ (p.upper[m:] - p.normals @ p.target) + box[box != 0.0] @ away[box != 0.0])
+        left = float(np.linalg.norm(weights @ p.normals + box))
+        reach = np.maximum(np.abs(p.upper[:m] - p.target), np.abs(p.lower[:m] - p.target))
+    return missed > left * min(float(np.linalg.norm(reach)), _FAR)
+
+
+@functools.cache
+def _identity(n: int) -> Array:
+    """Shape (n, n); shared by all callers, not to be written to."""
+    return np.eye(n)
+
+
+@functools.cache
+def load_solvers() -> None:
+    """Load what a projection needs, or compile it (seconds, once per machine), so that no control step waits."""
+    rows = np.array([[1.0], [-1.0]]), np.array([-0.5, -0.5])
+    project_unchecked(np.ones(1), *rows, -np.ones(1), np.ones(1))
 
 
 def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upper: Array) -> bool:
     """Whether a control satisfies every row as closely as `project` asks of its answers."""
-    return row_slacks(*plain(control, normals, offsets, lower, upper))[0]
+    p = _Problem.of(control, normals, offsets, lower, upper)
+    asking, unit = _prepare(p)
+    if asking < 0:
+        return asking == _ADMITTED
+    anywhere = p._replace(lo=np.full(p.u.size, -math.inf), hi=np.full(p.u.size, math.inf))
+    return _judge(anywhere, unit, p.target, np.zeros(len(p.upper)))[1]
 
 
 def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
     """The x in the box that minimises `|a x - b|^2`, shape (n,); `a` has full column rank."""
-    hessian, linear = a.T @ a, -(a.T @ b)
-    best = np.asarray(np.linalg.solve(hessian, -linear), dtype=np.float64)
-    unit = control_unit(best, lower, upper, 0.0)
-    no_rows = np.zeros((0, linear.size)), np.zeros(0)
-    answer = solve_with_daqp(hessian, linear / unit, *no_rows, lower / unit, upper / unit)
-    if answer is not None:
-        found = np.clip(answer[0] * unit, lower, upper)
-        downhill = np.clip(found - (hessian @ found + linear) / np.diag(hessian), lower, upper)
-        if bool((np.abs(downhill - found) <= OPTIMALITY_TOLERANCE * unit).all()):
-            return np.asarray(found)
-    # Without rows the problem cannot be infeasible; on a numerical failure the unbounded answer, clipped.
-    return np.asarray(np.clip(best, lower, upper))
+    hessian, linear, n = a.T @ a, -(a.T @ b), len(lower)
+    clipped = np.clip(np.linalg.solve(hessian, -linear), lower, upper)
+    unit = float(np.abs(clipped).max()) or 1.0
+    bounds = np.minimum(upper / unit, _UNBOUNDED), np.maximum(lower / unit, -_UNBOUNDED)
+    x, _, flag, _ = daqp.solve(hessian, linear / unit, np.zeros((0, n)), *bounds, np.zeros(n, np.int32))
+    found = np.clip(np.asarray(x) * unit, lower, upper)
+    downhill = np.clip(found - (hessian @ found + linear) / np.diag(hessian), lower, upper)
+    if flag > 0 and bool((np.abs(downhill - found) <= _DOWNHILL * unit).all()):
+        return np.asarray(found)
+    return np.asarray(clipped)  # without rows the problem cannot be infeasible: a numerical failure
 
 
 def cast_inside(control: Array, dtype: Any, normals: Array, offsets: Array, low: Array, high: Array) -> Any:

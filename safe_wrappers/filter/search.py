@@ -14,8 +14,13 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
 from safe_wrappers.filter.fallback import Fallback
-from safe_wrappers.filter.problem import Projection, Status
-from safe_wrappers.filter.projection import cast_inside, keeps_rows, project_unchecked
+from safe_wrappers.filter.projection import (
+    Projection,
+    Status,
+    cast_inside,
+    keeps_rows,
+    project_unchecked,
+)
 from safe_wrappers.plants.plant import Plant
 
 Rows = tuple[Array, Array]
@@ -85,13 +90,12 @@ class SafeActionSearch:
         plant: Plant,
         constraints: Sequence[BoundConstraint],
         fallback: Fallback,
-        solver: str,
         low: Array,
         high: Array,
         dtype: Any = np.float64,
     ) -> None:
         self._dtype = np.dtype(dtype)
-        self._plant, self._fallback, self._solver, self._low, self._high = plant, fallback, solver, low, high
+        self._plant, self._fallback, self._low, self._high = plant, fallback, low, high
         self._constraints = list(constraints)
         self._predicting = [c for c in constraints if c.predicts]
         self._rows_only = [c for c in constraints if not c.predicts]
@@ -332,7 +336,7 @@ class SafeActionSearch:
         nominal = boxed if bool(((boxed >= low) & (boxed <= high)).all()) else np.clip(boxed, low, high)
         acting = self._plant.acting_range
         if acting is None or acting[0] is lower:
-            result = project_unchecked(nominal, normals, offsets, low, high, self._solver)
+            result = project_unchecked(nominal, normals, offsets, low, high)
             return result, result.control
         least, most = np.clip(acting[0], low, high), np.clip(acting[1], low, high)
         # Measured in shares of what acts: a control that saturates early must not look cheap to change.
@@ -340,7 +344,7 @@ class SafeActionSearch:
         reach, box = most - least, high - low
         unit = np.where(known := (reach > 0.0) & np.isfinite(box), reach, 1.0) / np.where(known, box, 1.0)
         scaled = force / unit, normals * unit, offsets, least / unit, most / unit
-        result = project_unchecked(*scaled, self._solver)
+        result = project_unchecked(*scaled)
         if result.status is Status.INACTIVE:
             return result, nominal
         # A component that saturates as the policy's did stays the policy's: the force is the same.

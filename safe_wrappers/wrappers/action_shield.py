@@ -66,7 +66,6 @@ class ActionShield(CBFActionFilter):
         if fallback == "zero":
             raise ConfigurationError("a discrete action has no zero: fallback is brake, hold, or a function")
         CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback, margin=margin)
-        del self._saved_kwargs["solver"]  # nothing is projected
 
     def _take_action_space(self, env: Env) -> None:
         space = env.action_space

@@ -16,7 +16,6 @@ from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.filter.projection import check_solver
 from safe_wrappers.filter.search import SafeActionSearch, Stage
 from safe_wrappers.plants.default import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
@@ -50,7 +49,6 @@ class CBFActionFilter(LayerWrapper):
         plant: None reads the env's MuJoCo model, or simulates the env where a constraint does; else an
             `AnalyticPlant`.
         fallback: "brake", "hold", "zero", or a function of the plant that returns a control.
-        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
 
     Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
@@ -86,7 +84,6 @@ class CBFActionFilter(LayerWrapper):
         constraints: Sequence[Constraint | dict[str, Any]],
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         arguments = dict(locals())
@@ -97,14 +94,13 @@ class CBFActionFilter(LayerWrapper):
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
         own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
         self.added_margin = margin = non_negative("margin", margin, "the constraints' own units")
-        check_solver(solver)
         self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
         self._own = own
         self.constraints: list[Constraint] = self._widened(margin)
         self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
         self.plant: Plant = plant if plant is not None else default_plant(env, own)
         self.plant.bind(env)
-        self._fallback, self._solver = fallback, solver
+        self._fallback = fallback
         self.filter = self._filter()
         self.started = self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
@@ -130,7 +126,7 @@ class CBFActionFilter(LayerWrapper):
 
     def _filter(self) -> SafetyFilter:
         of_actions = self._low, self._high, self._dtype, self._search
-        return SafetyFilter(self.plant, self.constraints, self._fallback, self._solver, *of_actions)
+        return SafetyFilter(self.plant, self.constraints, self._fallback, *of_actions)
 
     def set_margin(self, margin: float) -> None:
         """Add this to every constraint's own margin from the next decision on, in place of `margin`.

@@ -35,7 +35,6 @@ class SlipLimiter(CBFActionFilter):
         regularization: Speed below which slip is counted against it, m/s.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`. "brake" here brakes as hard as the slip limit allows.
-        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         margin: Slip kept free below the limit.
 
     Info, at every step: the keys of `CBFActionFilter` (``cbf/margin`` stays 0), and arrays with one entry
@@ -65,14 +64,13 @@ class SlipLimiter(CBFActionFilter):
         regularization: float = 0.5,
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         arguments = dict(locals())
         traction = Traction(wheels, max_slip, friction, regularization, margin)
         plant = own_plant(plant)
         self._record(arguments, wheels=list(wheels), plant=plant)
-        CBFActionFilter.__init__(self, env, [traction], plant=plant, fallback=fallback, solver=solver)
+        CBFActionFilter.__init__(self, env, [traction], plant=plant, fallback=fallback)
 
 
 TOLERANCE = 0.01
@@ -105,7 +103,6 @@ class WholeBodyFilter(CBFActionFilter):
         horizon: Control steps to look ahead for the joints, for forecasts: as many as braking takes; None is 3.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`.
-        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
 
     Info, at every step: the keys of `CBFActionFilter`, ``whole_body/contacts``, ``whole_body/cone_margin``, and for
     forecasts with a `zmp_inset` ``whole_body/zmp_margin`` and ``whole_body/supported``.
@@ -135,7 +132,6 @@ class WholeBodyFilter(CBFActionFilter):
         horizon: int | None = None,
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "active-set",
     ) -> None:
         arguments = dict(locals())
         refuse_vector_env(env, type(self).__name__)
@@ -173,4 +169,4 @@ class WholeBodyFilter(CBFActionFilter):
             raise UnknownNameError(f'contacts is "forecast", "pyramid" or "cone", got {contacts!r}')
         plant = own_plant(plant)
         self._record(arguments, bodies=None if bodies is None else list(bodies), plant=plant)
-        CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback, solver=solver)
+        CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback)

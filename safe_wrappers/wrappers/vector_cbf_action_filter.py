@@ -48,7 +48,6 @@ class VectorCBFActionFilter(_Wrapper):
         constraints: As for `CBFActionFilter`; so are the other arguments.
         plant: Not bound yet; every env gets a copy. None reads its MuJoCo model.
         fallback: See there.
-        solver: See there.
         margin: See there.
 
     Attributes:
@@ -75,14 +74,13 @@ class VectorCBFActionFilter(_Wrapper):
         constraints: Sequence[Constraint | dict[str, Any]],
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         super().__init__(env)
         envs = single_envs(env)
         plants = [copy.deepcopy(plant) for _ in envs]
         self.filters = [
-            CBFActionFilter(single, constraints, own, fallback, solver, margin)
+            CBFActionFilter(single, constraints, own, fallback, margin)
             for single, own in zip(envs, plants, strict=True)
         ]
         space = envs[0].action_space

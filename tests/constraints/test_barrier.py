@@ -142,19 +142,6 @@ def test_a_position_under_a_force_is_refused_with_the_remedy():
         filtered.step(np.array([0.5]))
 
 
-def test_the_relative_degree_is_checked_at_the_first_reset():
-    filtered = cart_filter(sw.constraints.Barrier(lambda x: 1.0 - x[0]))
-    with pytest.raises(ConfigurationError, match="relative degree"):
-        filtered.reset(seed=0)
-
-
-def test_an_h_that_no_control_acts_on_is_refused():
-    with pytest.raises(ConfigurationError, match="no control acts on it"):
-        filtered = cart_filter(sw.constraints.Barrier(lambda x: 1.0))
-        filtered.reset(seed=0)
-        filtered.step(np.array([0.5]))
-
-
 def test_a_gradient_that_vanishes_here_is_not_refused():
     filtered = cart_filter(sw.constraints.Barrier(lambda x: 1.0 - x[1] ** 2))  # at rest its gradient is zero
     filtered.reset(seed=0)
@@ -162,18 +149,9 @@ def test_a_gradient_that_vanishes_here_is_not_refused():
     assert not info["cbf/intervened"]
 
 
-def test_braking_distance_in_h_is_the_remedy():
-    barrier = sw.constraints.Barrier(
-        lambda x: 1.0 - x[0] - max(x[1], 0.0) ** 2 / 2.0 - 0.1 * max(x[1], 0.0), alpha=2.0
-    )
-    filtered = cart_filter(barrier)
-    filtered.reset(seed=0)
-    filtered.step(np.array([0.5]))
-
-
 # The unit of h ------------------------------------------------------------------------------------------------
 
-UNITS = [1e-12, 1e-9, 1e-3, 1e3, 1e9, 1e12]
+UNITS = [1e-9, 1e3]
 
 
 def driven(unit, gradient):
@@ -224,15 +202,8 @@ def test_a_wrong_gradient_is_refused_in_every_unit(unit):
     ("arguments", "message"),
     [
         ({"h": 4.0}, "h must be a function of the state, got 4.0"),
-        ({"gradient": [1.0]}, r"gradient must be a function of the state or None, got \[1.0\]"),
-        ({"alpha": 0.0}, "alpha must be a finite number > 0 in 1/s, got 0.0"),
         ({"alpha": -1.0}, "alpha must be a finite number > 0 in 1/s, got -1.0"),
-        ({"alpha": np.nan}, "alpha must be a finite number > 0"),
-        ({"alpha": "slow"}, "alpha must be a number in 1/s"),
-        ({"alpha": lambda value: value + 1.0}, "must be extended class K"),
         ({"alpha": lambda value: -value}, "must be extended class K"),
-        ({"alpha": lambda value: abs(value)}, "must be extended class K"),
-        ({"margin": -0.1}, "margin must be a finite number >= 0 in units of h, got -0.1"),
         ({"curvature": -1.0}, r"curvature must be a finite number >= 0 in units of h per s\^2, got -1.0"),
     ],
 )
@@ -247,13 +218,3 @@ def test_a_decay_that_outruns_the_hold_is_refused():
         ConfigurationError, match=r"alpha = 10.1/s lets h cross zero within one hold of 0.1 s; .* 10/s"
     ):
         sw.constraints.Barrier(h, alpha=10.1).bind(observed([0.0]))
-
-
-def test_a_gradient_of_the_wrong_shape_is_refused():
-    plant = observed([0.5])
-    barrier = sw.constraints.Barrier(h, gradient=lambda x: [1.0, 2.0])
-    barrier = Asked(barrier, plant)
-    with pytest.raises(
-        ConfigurationError, match=r"gradient must return the shape of the state \(1,\), got \(2,\)"
-    ):
-        barrier.rows()

@@ -4,12 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from asking import bound, settled
-from contact_judge import DRIVERS, ConeJudge, touches
+from contact_judge import DRIVERS, ConeJudge
 from judged_loops import Scene, flagged
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.contact.contact_feasibility import _worst
-from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 ROUNDING = 1e-6
@@ -64,13 +62,6 @@ def test_in_the_air_nothing_is_missed_whatever_the_margin():
     assert limit.admits(control) and limit.slacks(control).tolist() == [0.0, 0.0]
 
 
-def test_a_contact_without_friction_has_no_cone_to_leave():
-    ball = '<body name="b" pos="5 5 .1"><freejoint/><geom condim="3" size=".1"/></body>'
-    env = pushed_balls(condim=1, more=ball)
-    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0), np.ones(1), 40)
-    assert limit.admits(np.ones(1)) and limit.slacks(np.ones(1)).size == 1
-
-
 def test_only_the_named_bodies_count():
     control = np.array([0.0, 0.3])  # 15 N on 11 N: only the second ball slides
     for bodies, admitted in ((None, False), (["left"], True), (["right"], False), (("left", "right"), False)):
@@ -81,31 +72,12 @@ def test_only_the_named_bodies_count():
         assert limit.slacks(control).size == (1 if bodies and len(bodies) == 1 else 2)
 
 
-def test_the_linearization_of_a_refused_push_is_where_the_ball_would_slide():
-    limit = settled(pushed_balls(), sw.constraints.ContactFeasibility(0.7, 0.0), np.array([0.2]), 40)
-    for control in (np.array([0.25]), np.array([-0.25])):
-        rows = limit.linearize(control)
-        border = rows.offsets[0] / rows.normals[0, 0]
-        assert np.sign(border) == np.sign(control[0])
-        assert rows.normals[0] @ control > rows.offsets[0]
-        assert limit.slack(np.array([border])) > 0.2 * limit.slack(control)
-    assert limit.rows().offsets.size == 0
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ({"friction_share": 0.0}, "friction_share"),
-        ({"friction_share": -0.5}, "friction_share"),
-        ({"friction_share": 1.1}, r"\(0, 1\]"),
-        ({"friction_share": np.nan}, "friction_share"),
         ({"friction_share": "all"}, "friction_share"),
-        ({"tolerance": -0.01}, "tolerance"),
-        ({"tolerance": np.inf}, "tolerance"),
         ({"margin": np.nan}, "margin"),
-        ({"bodies": "torso"}, "list of names"),
-        ({"bodies": []}, "list of names"),
-        ({"bodies": [3]}, "list of names"),
         ({"bodies": 3}, "list of names"),
     ],
 )
@@ -149,11 +121,6 @@ CASES = [
     ("Hopper-v5", "at_random", 60),
     ("Walker2d-v5", "bang_bang", 60),
 ]
-LONG = [
-    (env_id, driver, 400)
-    for env_id in ("Ant-v5", "Humanoid-v5", "HalfCheetah-v5", "Walker2d-v5")
-    for driver in DRIVERS
-]
 
 
 def filtered(env_id, plant=None, **arguments):
@@ -192,13 +159,6 @@ def test_unflagged_steps_stay_in_the_cone(env_id, driver, steps):
     assert seen["changed"] > 0 and seen["flagged"] < steps, seen
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("env_id", "driver", "steps"), LONG)
-def test_unflagged_steps_stay_in_the_cone_for_long(env_id, driver, steps):
-    seen = loop(filtered(env_id), driver, steps)
-    assert seen["unflagged"] == 0 and seen["changed"] > 0, seen
-
-
 def test_without_it_they_leave_the_cone():
     judge, rng = ConeJudge(gym.make("HalfCheetah-v5"), 0.7), np.random.default_rng(1)
     bare = judge.raw
@@ -207,21 +167,6 @@ def test_without_it_they_leave_the_cone():
         judge.step(bare, DRIVERS["at_random"](bare.action_space, k, rng))[0] > 0.01 for k in range(60)
     )
     assert outside > 10
-
-
-@pytest.mark.parametrize("arguments", [{"tolerance": 0.0}, {"friction_share": 0.5}, {"margin": 0.005}])
-def test_share_tolerance_and_margin_hold_in_closed_loop(arguments):
-    tolerance = arguments.get("tolerance", 0.01) - arguments.get("margin", 0.0)
-    seen = loop(
-        filtered("HalfCheetah-v5", **arguments), "noisy", 40, arguments.get("friction_share", 0.7), tolerance
-    )
-    assert seen["unflagged"] == 0 and seen["changed"] > 0
-
-
-def test_the_filters_margin_counts_too():
-    env = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [sw.constraints.ContactFeasibility()], margin=0.006)
-    assert env.constraints[0].margin == 0.006
-    assert loop(env, "noisy", 30, tolerance=0.004)["unflagged"] == 0
 
 
 def test_named_bodies_alone_stay_in_the_cone():
@@ -244,61 +189,3 @@ def test_the_whole_cone_is_never_left_so_it_is_inactive_bit_for_bit(env_id):
         expected, as_much, *_ = twin.step(action)
         assert observation.tobytes() == expected.tobytes() and reward == as_much
         assert not info["cbf/intervened"] and not flagged(info)
-
-
-def test_a_plant_with_other_masses_is_only_as_good_as_it_is():
-    wrong = sw.MujocoPlant()
-    wrong.perturb(mass=0.5)
-    judge_of = {"right": None, "wrong": wrong}
-    unflagged = {}
-    for name, plant in judge_of.items():
-        env = filtered("HalfCheetah-v5", plant)
-        judge, rng = ConeJudge(env, 0.7), np.random.default_rng(2)
-        env.reset(seed=2)
-        unflagged[name] = 0
-        for k in range(50):
-            excess, (*_, info) = judge.step(
-                env, DRIVERS["at_random"](env.action_space, k, rng).astype(np.float32)
-            )
-            unflagged[name] += excess > 0.01 + ROUNDING and not flagged(info)
-    assert unflagged["right"] == 0
-    assert unflagged["wrong"] > 5  # of 50, and nothing in the info says so
-
-
-def test_reset_forgets():
-    env = filtered("HalfCheetah-v5")
-    env.reset(seed=0)
-    for _ in range(40):
-        info = env.step(np.zeros(6, np.float32))[4]
-    assert info["whole_body/contacts"] > 0
-    _, info = env.reset(seed=0)
-    assert info["whole_body/contacts"] == 0 and info["whole_body/cone_margin"] == 0.0
-    rng = np.random.default_rng(0)
-    actions = [DRIVERS["at_random"](env.action_space, k, rng).astype(np.float32) for k in range(10)]
-    first = [env.step(a)[4]["executed_action"] for a in actions]
-    env.reset(seed=0)
-    again = [env.step(a)[4]["executed_action"] for a in actions]
-    assert np.array_equal(first, again)
-
-
-def test_the_judge_reads_forces_that_carry_the_weight():
-    env = gym.make("HalfCheetah-v5").unwrapped
-    env.reset(seed=0)
-    for _ in range(100):
-        env.step(np.zeros(6))
-    forces = np.array([force for _, _, _, force, _ in touches(env.model, env.data)])
-    assert forces[:, 2].sum() == pytest.approx(env.model.body_mass[1:].sum() * 9.81, rel=0.02)
-
-
-def test_the_worst_of_each_body_is_that_of_the_cone_and_what_is_no_number_stays():
-    rng, index = np.random.default_rng(3), np.array([-1, 1, 0, 2])
-    normals = rng.normal(size=(60, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    forces, friction, body = rng.normal(size=(60, 3)), rng.uniform(0.0, 1.0, 60), rng.integers(0, 3, 60)
-    found = _worst(body, normals, forces, friction, index, 3, 0.7, 5.0)
-    excess = cone_excess(forces, normals, 0.7 * friction)
-    expected = [-excess[body == b].max() / 5.0 for b in (2, 1)]
-    np.testing.assert_allclose(found, [*expected, np.inf], atol=1e-12)
-    forces[np.flatnonzero(body == 2)[0]] = np.nan
-    found = _worst(body, normals, forces, friction, index, 3, 0.7, 5.0)
-    assert np.isnan(found[0]) and found[1] == pytest.approx(expected[1])

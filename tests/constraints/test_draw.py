@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.filter.constraint import BoundConstraint
 
 
 def looked(env):
@@ -21,10 +20,6 @@ def rods(marks, along=1):
     """Both ends of every rod; the size along it."""
     ends = [(m.position, m.size[along] * m.axes[:, 2]) for m in marks]
     return np.array([[middle - half, middle + half] for middle, half in ends])
-
-
-def test_a_constraint_draws_nothing_unless_it_says_so():
-    assert BoundConstraint(None, None).draw() == ()
 
 
 @pytest.mark.parametrize("uncertainty", [0.0, 0.1])
@@ -97,36 +92,6 @@ def test_walls_are_framed_where_the_ball_touches_and_braking_ends_where_it_is_dr
     np.testing.assert_allclose(end.position[:2], data.qpos[:2], atol=1e-6)
 
 
-def test_an_escape_begins_where_the_ball_is_and_the_patrols_have_their_bounds():
-    pytest.importorskip("gymnasium_robotics")
-    env = sw.protect(gym.make("PatrolledPointMaze-v0"))
-    env.reset(seed=0)
-    for _ in range(5):
-        env.step(np.array([1.0, 0.0], np.float32))
-    _, marks = looked(env)
-    task = env.unwrapped
-    np.testing.assert_allclose(rods(of(marks, "way", "capsule"))[0, 0, :2], task.agent_position, atol=1e-9)
-    bounds = of(marks, "estimate")
-    np.testing.assert_allclose([m.position[:2] for m in bounds], task.patrol_positions)
-    np.testing.assert_allclose([m.size for m in bounds], 0.1 + 0.15 + 0.03)  # known exactly: radii, margin
-
-
-def test_tracked_discs_are_ellipsoids_of_the_estimates():
-    cars = sw.occlusion.Track("car*", acceleration_noise=[0.02, 0.0], start_position_std=[0.3, 0.1])
-    env = sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), [cars], "eye", tolerance=0.5)
-    discs = sw.constraints.TrackedDiscs(radius=0.4, sigmas=2.0)
-    keep = sw.constraints.Clearance([discs], braking=2.0, bodies=["robot"], radius=0.2, margin=0.1)
-    env = sw.CBFActionFilter(env, [keep])
-    env.reset(seed=0)
-    (marks,) = looked(env)
-    tracking = env.get_wrapper_attr("tracking")
-    found = of(marks, "estimate")
-    np.testing.assert_allclose([m.position[:2] for m in found], tracking.positions)
-    for mark, covariance in zip(found, tracking.position_covariances, strict=True):
-        along = np.sort(mark.size[:2] - 0.7) / 2.0
-        np.testing.assert_allclose(along, np.sqrt(np.linalg.eigvalsh(covariance)), atol=1e-9)
-
-
 def test_clearance_draws_planes_moved_by_what_is_kept_free_and_the_way_that_braking_takes():
     rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
     keep = sw.constraints.Clearance(rail, 8.0, bodies=["cart"], radius=0.1, margin=0.05, state_error=0.01)
@@ -144,26 +109,6 @@ def test_clearance_draws_planes_moved_by_what_is_kept_free_and_the_way_that_brak
     ((start, end),) = rods([way])
     assert abs(v) > 0.1 and way.size[0] == 0.1
     assert sorted([start[0], end[0]]) == pytest.approx(sorted([x, x + v * abs(v) / 16.0]))
-
-
-@pytest.mark.parametrize(
-    ("obstacle", "shape", "position", "size"),
-    [
-        (sw.constraints.Sphere([0.3, 0.2, 0.1], 0.05), "sphere", [0.3, 0.2, 0.1], [0.08, 0.0, 0.0]),
-        (sw.constraints.Box([0.3, 0.2, 0.1], [0.1, 0.2, 0.3]), "box", [0.3, 0.2, 0.1], [0.13, 0.23, 0.33]),
-    ],
-)
-def test_a_workspace_draws_what_is_kept_out_of(obstacle, shape, position, size):
-    space = sw.constraints.Workspace(keep_out=[obstacle], bodies=["fingertip"], radius=0.01, margin=0.02)
-    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [space])
-    env.reset(seed=0)
-    (marks,) = looked(env)
-    (drawn,) = of(marks, "keep out")
-    assert drawn.shape == shape
-    np.testing.assert_allclose(drawn.position, position)
-    np.testing.assert_allclose(drawn.size, size)
-    (point,) = of(marks, "way")
-    np.testing.assert_allclose(point.position, env.unwrapped.data.body("fingertip").xpos, atol=1e-6)
 
 
 def test_a_workspace_draws_its_planes_or_if_it_is_closed_its_edges():

@@ -1,12 +1,26 @@
 """What is not seen through closed loops: the corners of the uncertainty, the side of a detour, recovery at rest."""
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import asked
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.backup.base import Detour
 from safe_wrappers.control.backup import drive_decision
+from safe_wrappers.control.backup.heading_drive import (
+    Motion,
+    beyond_reach,
+    brake_control,
+    end_distance,
+    path_distance,
+    predict,
+    stopping_path,
+)
 
 LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.2, 1.2], "hazards": [[0.6, 0.0]], "vases": []}
 
@@ -74,21 +88,6 @@ def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
     assert limit.start() == Detour(0.0, 0)
 
 
-def test_a_position_that_is_no_number_leaves_no_clearance_that_is_one():
-    env = filtered()
-    env.unwrapped._hazards[:] = np.nan
-    env.filter.observe()
-    assert np.isnan(env.filter.bound[0].value()).all()
-
-
-def test_without_brakes_the_backup_rolls_out():
-    backups = [
-        filtered({"hazards": [[9.0, 9.0]]}, (1.0, 0.0, 0.0), brake=brake).filter.bound[0].backup()
-        for brake in (True, False)
-    ]
-    assert backups[0][0] < 0.0 and backups[1].tolist() == [0.0, 0.0]
-
-
 def test_no_detour_without_a_drive_or_without_a_disc_ahead():
     env = filtered({"hazards": [[0.26, 0.0]]}, detour=True)
     (limit,) = env.filter.bound
@@ -120,3 +119,158 @@ def test_a_decision_that_is_not_finite_is_left_to_the_search(monkeypatch):
     monkeypatch.setattr(drive_decision, "closest_admitted", overflowing)
     assert limit.decide(np.array([1.0, 0.0]), *bounds) is None
     assert np.isfinite(env.filter.filter(np.array([1.0, 0.0])).control).all()
+
+
+# HeadingDriveClearance at the boundary of its safe set: an admissible control, and no disc touched until rest
+
+
+RADIUS = 0.2
+# A reset stands still among the hazards of a moving state.
+pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
+DISCS = [sw.constraints.Discs("hazard_positions", RADIUS)]
+
+
+def filtered_boundary(**options):
+    clearance = sw.constraints.HeadingDriveClearance(DISCS, **options)
+    return sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [clearance])
+
+
+def start(env, hazards, qpos, qvel):
+    layout = {"agent": [0.0, 0.0, 0.0], "goal": [3.0, 3.0], "hazards": list(hazards), "vases": []}
+    env.reset(seed=0, options={"layout": layout})
+    raw = env.unwrapped
+    positions, velocities = raw.data.qpos.copy(), raw.data.qvel.copy()
+    positions[:3], velocities[:3] = qpos, qvel
+    raw.set_state(positions, velocities)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    env = filtered_boundary()
+    env.reset(seed=0)
+    return env.filter.bound[0].drive
+
+
+def driven(drive, pairs):
+    """The motion after controls, (drive, turn, holds) each, from rest at the origin."""
+    motion = Motion(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for push, turn, holds in pairs:
+        for _ in range(holds):
+            motion = predict(drive, motion, push, turn)
+    return motion
+
+
+def touching(drive, motion, direction, clearance):
+    """The centre of a disc in that direction, this far from the area that the stopping path stays in."""
+    path = stopping_path(drive, motion, True)
+    x = motion.x + 0.5 * (path.forward * path.ex + path.sideways * path.sx)
+    y = motion.y + 0.5 * (path.forward * path.ey + path.sideways * path.sy)
+    near, far = 0.0, 4.0
+    for _ in range(50):
+        middle = 0.5 * (near + far)
+        there = x + middle * math.cos(direction), y + middle * math.sin(direction)
+        left = min(path_distance(path, *there), end_distance(path, *there) - 2.0 * drive.com_offset)
+        near, far = (middle, far) if left < RADIUS + clearance else (near, middle)
+    return [x + far * math.cos(direction), y + far * math.sin(direction)]
+
+
+EXTREME = st.tuples(
+    st.sampled_from([-1.0, 0.0, 1.0]), st.sampled_from([-1.0, -0.3, 0.0, 1.0]), st.integers(1, 60)
+)
+DRIVEN = st.lists(EXTREME, min_size=1, max_size=8)
+ANGLE = st.floats(-math.pi, math.pi)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.002, 0.004])
+def test_from_the_boundary_on_there_is_always_an_admissible_control(margin, drive):
+    rng, env, changed = np.random.default_rng(5), filtered_boundary(margin=margin, detour=True), 0
+    for _ in range(40):
+        pairs = [(*rng.choice([-1.0, 0.0, 1.0], 2), int(rng.integers(1, 60))) for _ in range(6)]
+        motion = driven(drive, pairs)
+        hazards = [
+            touching(drive, motion, rng.uniform(-math.pi, math.pi), rng.choice([0.002, 0.05]) * rng.random())
+            for _ in range(rng.integers(1, 7))
+        ]
+        start(env, hazards, motion[:3], motion[3:])
+        action = rng.uniform(-1.0, 1.0, 2)
+        for k in range(12):
+            if k % 4 == 0:
+                action = rng.uniform(-1.0, 1.0, 2)
+            info = env.step(action.astype(np.float32))[4]
+            assert not info["cbf/infeasible"] and not info["cost_substep"], (margin, motion, hazards, info)
+            assert not info["cbf/unsafe"]
+            changed += info["cbf/intervened"]
+    assert changed > 100
+
+
+@given(pairs=DRIVEN, direction=ANGLE, clearance=st.floats(0.0, 0.005))
+@settings(max_examples=30)
+def test_a_state_with_clearance_left_stops_clear_of_every_disc_in_mujoco(pairs, direction, clearance):
+    env = filtered_boundary(margin=0.004)
+    env.reset(seed=0)
+    drive = env.filter.bound[0].drive
+    motion = driven(drive, pairs)
+    start(env, [touching(drive, motion, direction, clearance)], motion[:3], motion[3:])
+    env.filter.observe()
+    assume(env.filter.margin >= 0.0)
+    raw = env.unwrapped
+    for _ in range(150):
+        _, _, heading, vx, vy, _ = *raw.data.qpos[:3], *raw.data.qvel[:3]
+        ahead = float(vx * math.cos(heading) + vy * math.sin(heading))
+        raw.step(np.array([brake_control(drive, ahead), 0.0]))
+        gaps = np.linalg.norm(raw._path[:, None] - raw.hazard_positions, axis=2) - RADIUS
+        assert gaps.min() >= -1e-7
+
+
+@given(pairs=DRIVEN)
+def test_no_driving_from_rest_leaves_what_is_promised_about(pairs, drive):
+    assert beyond_reach(drive, driven(drive, pairs)) <= 0.0
+
+
+@pytest.mark.parametrize(
+    ("velocity", "unsafe"),
+    [((1.5, 0.0, 0.0), False), ((0.0, 0.0, 3.0), False), ((1.65, 0.0, 0.0), True), ((0.0, 0.0, 3.2), True)],
+)
+def test_faster_than_the_actuators_make_it_is_unsafe_however_far_the_discs_are(velocity, unsafe):
+    env = filtered_boundary()
+    start(env, [[3.0, 0.0]], [0.0, 0.0, 0.0], velocity)
+    info = env.step(np.zeros(2, np.float32))[4]
+    assert info["cbf/unsafe"] == unsafe == (info["cbf/margin"] < 0.0)
+    assert not info["cost_substep"]
+
+
+# HeadingDriveClearance: how far away a disc may be and still come into play within one control step
+
+
+RADIUS_REACH, MARGIN = 0.2, 0.002
+PUSH, NONE = np.array([1.0, 0.0]), np.zeros(2)
+
+
+def at_rest(distance):
+    """A robot at the origin, at rest, whose backup is to coast; so far from the rim of a disc straight ahead."""
+    env = gym.make("SafePointGoal1-v0")
+    hazard = [RADIUS_REACH + distance, 0.0]
+    layout = {"agent": [0.0, 0.0, 0.0], "goal": [1.2, 1.2], "hazards": [hazard], "vases": []}
+    env.reset(seed=0, options={"layout": layout})
+    discs = [sw.constraints.Discs("hazard_positions", RADIUS_REACH)]
+    spec = sw.constraints.HeadingDriveClearance(discs, margin=MARGIN, brake=False)
+    return env.unwrapped, asked(env, spec)
+
+
+@pytest.fixture(scope="module")
+def way():
+    """Of one step of full drive and coasting to rest, on the env itself."""
+    env, _ = at_rest(1.0)
+    start = env.agent_position[0]
+    for control in (PUSH, *[NONE] * 400):
+        env.step(control)
+    return env.agent_position[0] - start
+
+
+@pytest.mark.parametrize("share", [0.55, 0.8, 0.95, 1.05, 1.2, 1.5, 1.8, 1.9, 2.1, 2.5, 4.0])
+def test_from_rest_full_drive_may_use_up_half_of_the_clearance(way, share):
+    turning = 1.0 - float(at_rest(1.0)[1].value()[0])  # kept free at rest as well
+    limit = at_rest(MARGIN + turning + share * way)[1]
+    assert limit.value() == pytest.approx([share * way + MARGIN])
+    assert limit.admits(PUSH) == (share > 2.0)
+    assert limit.admits(NONE)

@@ -89,19 +89,6 @@ def test_nothing_is_violated_and_nothing_flagged_whatever_drives(seed):
     assert farthest > WALL - 0.1
 
 
-def test_the_value_is_the_clearance_along_the_manoeuvre():
-    env, bound = filtered((4.0, 2.0))
-    assert bound.has_value and bound.has_backup and bound.predicts
-    np.testing.assert_allclose(bound.value(), [WALL - 4.0 - 1.0 - 0.0025])
-    assert env.step(np.zeros(1, np.float32))[4]["cbf/margin"] == pytest.approx(4.9975)
-
-
-def test_only_admission_is_known_of_a_slack():
-    _, bound = filtered((8.99, 2.0))
-    assert not bound.admits(np.array([4.0])) and bound.slack(np.array([4.0])) == -np.inf
-    assert bound.admits(np.array([-4.0])) and bound.slack(np.array([-4.0])) == 0.0
-
-
 def test_what_loses_no_more_than_the_backup_is_admitted_where_the_margin_is_lost():
     with pytest.warns(sw.UnsafeStateWarning):
         _, bound = filtered((9.5, 2.0))
@@ -113,23 +100,3 @@ def test_what_loses_no_more_than_the_backup_is_admitted_where_the_margin_is_lost
 def test_what_is_not_a_number_is_not_admitted():
     _, bound = filtered()
     assert not bound.admits(np.array([np.nan]))
-
-
-def test_constants_are_read_at_binding_and_when_the_model_has_changed():
-    env, bound = filtered()
-    env.step(np.zeros(1, np.float32))
-    assert bound.constants == 1
-    env.plant.model_version += 1
-    env.step(np.zeros(1, np.float32))
-    anew = env.filter.bound[0]
-    env.step(np.zeros(1, np.float32))
-    assert anew is not bound and anew is env.filter.bound[0]
-
-
-def test_one_that_says_neither_how_much_is_left_nor_what_is_admitted_is_refused():
-    class Half(BoundStopBefore):
-        clearance_after = BoundBackupClearance.clearance_after
-
-    _, bound = filtered()
-    with pytest.raises(NotImplementedError, match="Half overrides neither clearance_after nor admits"):
-        Half(StopBefore(), bound.plant).admits(np.zeros(1))

@@ -9,7 +9,7 @@ import pytest
 from point_worlds import PointWorld
 
 import safe_wrappers as sw
-from safe_wrappers.control.backup import point_scene
+from safe_wrappers.control.backup import point_decision
 from safe_wrappers.control.backup.damped_axis import damped_axis
 from safe_wrappers.filter.engine import SafetyFilter
 
@@ -32,7 +32,7 @@ def test_the_stage_and_the_control_are_those_of_the_general_search(options, subs
     env = sw.CBFActionFilter(PointWorld(substeps, clip=5.0), [sw.constraints.WallClearance(**options)])
     low, high = (end.astype(np.float64) for end in (env.action_space.low, env.action_space.high))
     box = low, high, env.action_space.dtype
-    searched = SafetyFilter(env.plant, [Searched(**options)], "brake", "daqp", *box)
+    searched = SafetyFilter(env.plant, [Searched(**options)], "brake", *box)
     rng, stages = np.random.default_rng(3), []
     for episode in range(12):
         env.reset(seed=episode)
@@ -56,7 +56,7 @@ def test_the_stage_and_the_control_are_those_of_the_general_search(options, subs
             env.env.step(by_itself.control)
             for one in (env.filter, searched):
                 one.executed(by_itself.control)
-    assert stages.count(point_scene.PROPOSAL) > 50 and stages.count(point_scene.CANDIDATE) > 50
+    assert stages.count(point_decision.PROPOSAL) > 50 and stages.count(point_decision.CANDIDATE) > 50
 
 
 def random_scenes(count):
@@ -70,21 +70,24 @@ def random_scenes(count):
             damped_axis(0.998, 0.24 / substeps, 0.01, substeps, low[0], high[0], clip),
             damped_axis(0.99, 0.2 / substeps, 0.01, substeps, low[1], high[1], clip),
         )
-        scene = point_scene.scene(
+        scene = point_decision.scene(
             axes, (0.1, -0.2), (1, 0), (0, 1), rng.uniform(0.05, 0.3), clip_known, WALLS + BLOCKS
         )
         motion, qpos, qvel = np.zeros(4), rng.uniform(-1.9, 1.9, 2), rng.uniform(-5.5, 5.5, 2)
-        left = point_scene.room_left(scene, qpos, qvel, motion)
+        left = point_decision.room_left(scene, qpos, qvel, motion)
         control = rng.uniform(low, high)
         asked = motion, left, control.copy()
         found = [
             left,
             motion,
-            point_scene.is_admitted(scene, *asked),
-            point_scene.candidates(scene, *asked),
+            point_decision.is_admitted(scene, *asked),
+            point_decision.candidates(scene, *asked),
         ]
-        found += [*point_scene.half_spaces(scene, *asked[:2]), point_scene.backup_pair(scene, *asked[:2])]
-        stages.append(point_scene.closest_admitted(scene, *asked[:2], low, high, control))
+        found += [
+            *point_decision.half_spaces(scene, *asked[:2]),
+            point_decision.backup_pair(scene, *asked[:2]),
+        ]
+        stages.append(point_decision.closest_admitted(scene, *asked[:2], low, high, control))
         for part in (*found, stages[-1], control):
             digest.update(np.asarray(part, dtype=np.float64).tobytes())
     return digest.hexdigest(), [stages.count(stage) for stage in range(8)]
@@ -92,4 +95,4 @@ def random_scenes(count):
 
 def test_the_random_scenes_have_everything_in_them():
     _, stages = random_scenes(200)
-    assert stages[point_scene.PROPOSAL] > 10 and stages[point_scene.CANDIDATE] > 10
+    assert stages[point_decision.PROPOSAL] > 10 and stages[point_decision.CANDIDATE] > 10

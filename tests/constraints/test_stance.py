@@ -116,56 +116,6 @@ def test_its_answer_is_that_of_the_whole_program(share, cone):
     assert changed >= 2
 
 
-def test_at_rest_the_admitted_torques_are_those_with_the_solvers_forces_in_the_cone():
-    # Legs that push outwards against each other: MuJoCo's own forces, after they have settled, are the program's.
-    env, spec = table(), sw.constraints.Stance(0.7, "exact", **STANCE)
-    for push in (0.0, 0.2, 0.5, 0.9):
-        control = push * np.array([1.0, 1.0, -1.0, -1.0])
-        stance = settled(env, spec, control, 100)
-        inside = []
-        for i in range(env.data.ncon):
-            wrench = np.zeros(6)
-            mujoco.mj_contactForce(env.model, env.data, i, wrench)
-            inside.append(0.7 * FRICTION * wrench[0] - np.hypot(*wrench[1:3]))
-        clear = min(inside) / stance.plant.weight_n
-        if abs(clear) > 0.01:
-            assert stance.admits(control) == (clear > 0.0)
-            assert stance.slack(control) == pytest.approx(clear, abs=0.01)
-        info = stance.info(control, control)
-        assert info["whole_body/contacts"] == 4
-        assert info["whole_body/cone_margin"] == pytest.approx(clear, abs=0.01)
-
-
-def test_what_the_pyramid_admits_the_cone_admits():
-    env = table()
-    rng = np.random.default_rng(0)
-    pushes = rng.uniform(-0.15, 0.15, (40, 4))
-    admitted = {}
-    for name, options in {"4": {"edges": 4}, "8": {"edges": 8}, "exact": {"cone": "exact"}}.items():
-        stance = settled(env, sw.constraints.Stance(0.4, **options, **STANCE), STILL, 100)
-        admitted[name] = []
-        for push in pushes:
-            stance.plant.observe()
-            admitted[name].append(stance.admits(push))
-    four, eight, exact = (np.array(admitted[name]) for name in ("4", "8", "exact"))
-    assert (exact | ~eight).all() and (exact | ~four).all()
-    assert 0 < four.sum() <= exact.sum() < 40
-
-
-def test_contacts_that_the_torques_lift_open():
-    # Two legs on one side pull up with all they have, and stand beside a floor that falls away: no force, no demand.
-    env = table(gravity="0 0 -1")
-    env.start = np.r_[0, 0, 0.33, 1, 0, 0, 0, 0, 0, 0, 0], np.r_[0, 0, 0.4, np.zeros(7)]
-    stance = settled(env, sw.constraints.Stance(0.7, **STANCE), STILL, 0)
-    env.reset()
-    env.data.qvel[2] = 0.4  # the whole robot on its way up
-    stance.plant.observe()
-    assert stance.admits(np.full(4, 0.3))
-    problem = stance.problem(np.full(4, 0.3))
-    assert problem.breaking.all() or not len(problem.normals)
-    assert stance.slack(np.full(4, 0.3)) >= 0.0
-
-
 @pytest.mark.parametrize("cone", ["pyramid", "exact"])
 @pytest.mark.parametrize("hopeless", ["slope", "inset"])
 def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone, hopeless):
@@ -209,35 +159,6 @@ def test_joints_are_predicted_to_stay_in_range():
             stance.plant.observe()
             answers.append(stance.admits(np.zeros(4)))
         assert answers == [fits, True]
-
-
-def test_other_contacts_count_as_the_forces_that_they_are():
-    # A load on the trunk presses on the feet, whatever the torques.
-    load = '</body><body pos="0 0 .43"><freejoint/><geom type="box" size=".2 .2 .05" mass="6" contype="1"/>'
-    heavy, light = table(more=load), table()
-    pressures = []
-    for env in (light, heavy):
-        stance = settled(env, sw.constraints.Stance(0.5, "exact", **STANCE), STILL, 200)
-        assert stance.admits(STILL)
-        pressures.append(stance.solve(stance.problem(STILL)).forces[:, 2].sum())
-        assert pressures[-1] == pytest.approx(stance.plant.weight_n, rel=0.02)
-        assert stance.info(STILL, STILL)["whole_body/contacts"] == 4
-    assert pressures[1] > 1.6 * pressures[0]
-
-
-def test_asked_second_it_still_answers_the_proposal():
-    env = table()
-    alone = sw.CBFActionFilter(env, [sw.constraints.Stance(0.3, **STANCE)])
-    both = sw.CBFActionFilter(
-        table(), [sw.constraints.JointSpeedLimit(1e3, horizon=1), sw.constraints.Stance(0.3, **STANCE)]
-    )
-    executed = []
-    for filtered in (alone, both):
-        filtered.reset()
-        rng = np.random.default_rng(0)
-        executed.append([filtered.step(rng.uniform(-1, 1, 4))[4]["executed_action"] for _ in range(30)])
-    np.testing.assert_array_equal(*executed)
-    assert any((u != 0).any() for u in executed[0])
 
 
 class Refusing(sw.Constraint):
@@ -327,14 +248,9 @@ def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
     [
         ({"friction_share": 0.0}, "friction_share"),
         ({"friction_share": 1.1}, r"\(0, 1\]"),
-        ({"friction_share": np.nan}, "friction_share"),
         ({"cone": "round"}, "pyramid"),
-        ({"edges": 2}, "edges"),
-        ({"edges": 4.0}, "edges"),
-        ({"edges": True}, "edges"),
         ({"joint_tolerance": -0.1}, "joint_tolerance"),
         ({"zmp_inset": 0.0}, "zmp_inset"),
-        ({"settle_s": 0.0}, "settle_s"),
     ],
 )
 def test_bad_arguments_are_refused_in_words(arguments, words):

@@ -8,7 +8,7 @@ import pytest
 from asking import Asked
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from point_worlds import BLOCKS, RADIUS, PointWorld
+from point_worlds import RADIUS, PointWorld
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
@@ -162,55 +162,6 @@ def test_along_a_wall_it_slides():
     assert y > 0.0  # and not held up along it
 
 
-def test_it_stops_in_a_corner_and_leaves_it_freely():
-    env = filtered(velocity_clip=5.0)
-    placed(env, (1.5, -1.5))
-    for _ in range(120):
-        env.step(np.array([1.0, -0.8], np.float32))
-    assert env.unwrapped.data.qpos[::-1] == pytest.approx([2.0 - ROOM, -2.0 + ROOM], abs=1e-5)
-    assert np.abs(env.unwrapped.data.qvel).max() < 1e-4
-    info = env.step(np.array([-1.0, 1.0], np.float32))[4]
-    assert not info["cbf/intervened"]
-
-
-def test_knowing_the_clip_lets_it_pass_a_corner_that_it_would_stop_at():
-    # Up and to the left past the upper right corner of the block at (1, 1), at 3.5 m/s along each axis.
-    at, velocity, asked = (1.3, 1.0), (-3.5, 3.5), np.array([0.0, 1.0])
-    known = placed(filtered(velocity_clip=5.0), at, velocity)
-    assert known.value()[0] > 0.05 and known.admits(asked)
-    unknown = placed(filtered(), at, velocity)
-    assert unknown.value()[0] < 0.0
-
-
-def test_at_a_corner_the_rows_leave_each_axis_its_share():
-    # The block's upper right corner is at (1, 1), the ball diagonally above it, a little farther away than needed.
-    limit = placed(filtered(), (1.0 + 0.075, 1.0 + 0.075))
-    rows = limit.rows()
-    towards = sw.project(
-        np.array([-0.8, -0.8]), rows.normals, rows.offsets, limit.plant.lower, limit.plant.upper
-    ).control
-    assert rows.offsets.size == 2 and (towards > -0.5).all() and (towards < -0.1).all()
-    assert limit.admits(towards)
-
-
-@pytest.mark.parametrize(
-    ("at", "velocity", "asked"),
-    [
-        ((1.395, 0.972), (-3.79, 1.96), (-1.0, 0.0)),
-        ((1.302, 0.809), (-3.09, 3.02), (0.0, 0.0)),
-        ((1.365, 0.897), (-3.46, 2.06), (-1.0, 1.0)),
-    ],
-)
-def test_past_a_corner_a_correction_goes_as_far_as_the_path_allows(at, velocity, asked):
-    # Up and to the left past the block's upper right corner.
-    limit = placed(filtered(velocity_clip=5.0), at, velocity)
-    asked = np.array(asked)
-    assert limit.value()[0] > limit.spec.margin and not limit.admits(asked)
-    grid = [np.array([x, y]) for x in np.linspace(-1, 1, 41) for y in np.linspace(-0.8, 1, 37)]
-    closest = min(np.linalg.norm(u - asked) for u in grid if limit.admits(u))
-    assert np.linalg.norm(limit.candidates(asked)[0] - asked) < closest + 0.15
-
-
 def test_far_from_walls_actions_pass_bit_for_bit():
     env = filtered(PointWorld(blocks=[(50, 0, 1, 1)]))
     action = np.array([0.1234567, -0.7654321], np.float32)
@@ -218,23 +169,6 @@ def test_far_from_walls_actions_pass_bit_for_bit():
         info = env.step(action)[4]
         assert not info["cbf/intervened"]
         assert (info["executed_action"] == action.astype(np.float64)).all()
-
-
-def test_without_walls_there_is_no_value():
-    env = filtered(PointWorld(blocks=[]))
-    assert env.filter.bound[0].value().shape == (0,)
-    info = env.step(np.array([1.0, 1.0], np.float32))[4]
-    assert info["cbf/margin"] == 0.0 and not info["cbf/intervened"]
-
-
-@pytest.mark.parametrize("margin", [0.0, 0.05])
-def test_the_margin_is_kept_and_not_taken_off_the_value(margin):
-    env = filtered(velocity_clip=5.0, margin=margin)
-    placed(env, (1.0, -1.2))
-    for _ in range(100):
-        info = env.step(np.array([1.0, 0.0], np.float32))[4]
-    assert info["cbf/margin"] == pytest.approx(margin, abs=1e-6)
-    assert info["nearest"] == pytest.approx(margin + 0.004, abs=1e-5)
 
 
 # Outside the safe set -----------------------------------------------------------------------------------------
@@ -255,15 +189,6 @@ def test_from_outside_it_comes_back_and_stays(options, asked, gap, lost):
     assert margins.min() >= margins[0] - 1e-9 and margins[-1] >= 0.05 - 1e-6
     back = int(np.argmax(margins >= 0.05 - 1e-6))
     assert back < 120 and margins[back:].min() >= 0.05 - 1e-6
-
-
-def test_too_fast_to_stop_it_brakes_as_hard_as_it_can():
-    env = filtered(velocity_clip=5.0)
-    limit = placed(env, (1.6, -1.2), (5.0, 0.0))
-    assert limit.value()[0] < 0.0
-    with pytest.warns(sw.UnsafeStateWarning):
-        info = env.step(np.array([1.0, 0.4], np.float32))[4]
-    assert info["executed_action"] == pytest.approx([-1.0, 0.4])
 
 
 # Composition --------------------------------------------------------------------------------------------------
@@ -297,26 +222,7 @@ def test_with_another_constraint_both_hold():
     assert 0.45 < fastest <= 0.5 + 1e-5
 
 
-def test_several_constraints_where_only_rows_can_agree():
-    # Held along y by rows, the suggestions of the walls are not enough: the projection on all rows decides.
-    env = filtered(PointWorld(clip=5.0), more=[SlowAlongY()])
-    placed(env, (1.8, -1.0), (0.5, 0.5))
-    for _ in range(40):
-        info = env.step(np.array([1.0, 1.0], np.float32))[4]
-        assert not (info["touched"] or info["cbf/infeasible"] or info["cbf/fallback"])
-    assert env.unwrapped.data.qvel[0] == pytest.approx(0.5, abs=2e-3)
-
-
 # What the constraint itself is asked for ----------------------------------------------------------------------
-
-
-def test_a_plant_of_another_mass_is_read_anew():
-    env = filtered()
-    limit = placed(env, (1.2, -1.2), (2.0, 0.0))
-    before = limit.value()[0]
-    limit.plant.perturb(mass=2.0)
-    env.filter.observe()
-    assert env.filter.bound[0].value()[0] < before - 0.05
 
 
 def test_a_delay_is_predicted():
@@ -343,8 +249,6 @@ def test_a_state_that_is_not_a_number_admits_nothing(at, velocity):
     ("options", "says"),
     [
         ({"margin": -0.1}, "margin.*m, got -0.1"),
-        ({"margin": "wide"}, "margin.*a number"),
-        ({"velocity_clip": 0.0}, "velocity_clip.*m/s, got 0.0"),
         ({"velocity_clip": np.inf}, "velocity_clip.*finite"),
     ],
 )
@@ -368,6 +272,41 @@ def test_other_plants_and_machines_are_refused_with_the_alternative():
         sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.WallClearance()])
 
 
-def test_the_blocks_are_where_the_tests_think():
-    env = filtered()
-    assert len(env.filter.bound[0]._scene[-1]) == len(BLOCKS)
+# WallClearance where a path passes a corner closely: the path fits, the rectangle around it does not
+
+
+def moved(limit, control, axis, asked):
+    """A control moved along one axis towards the one asked for, in small steps, while that is admitted."""
+    found = control
+    for share in np.linspace(0.0, 1.0, 401):
+        tried = np.array(control)
+        tried[axis] += share * (asked[axis] - control[axis])
+        if not limit.admits(tried):
+            break
+        found = tried
+    return found
+
+
+@pytest.mark.parametrize(
+    ("at", "velocity", "asked", "first"),
+    [
+        ((-0.06, 0.05), (4.4, -3.6), (0.6, -0.5), 1),
+        ((-0.35, -0.54), (-3.4, 4.3), (-0.3, 0.7), 1),
+        ((0.43, -0.26), (-4.6, 2.7), (-0.7, 0.4), 0),
+        ((0.21, -0.16), (-2.0, 1.7), (0.0, 0.6), 0),
+    ],
+)
+def test_beside_a_corner_the_nearer_of_both_ways_back_to_the_proposal_is_taken(at, velocity, asked, first):
+    """From braking along x and then along y, and the other way round, by small steps instead of by halving."""
+    env = sw.CBFActionFilter(PointWorld(clip=5.0), [sw.constraints.WallClearance(velocity_clip=5.0)])
+    env.reset(seed=0)
+    env.unwrapped.place(at, velocity)
+    env.plant.observe()
+    limit, asked = Asked(env.constraints[0], env.plant), np.array(asked)
+    assert limit.value()[0] > limit.spec.margin and not limit.admits(asked)
+    ways = [moved(limit, moved(limit, limit.backup(), i, asked), 1 - i, asked) for i in (0, 1)]
+    away = [float(np.linalg.norm(way - asked)) for way in ways]
+    assert away[first] < away[1 - first] - 0.1
+    nearest = limit.candidates(asked)[0]
+    step = np.abs(asked - limit.backup()).sum() / 32  # as finely as it halves, along both
+    assert np.linalg.norm(nearest - asked) <= away[first] + step

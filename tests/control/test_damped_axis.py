@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.backup import damped_axis as of
-from safe_wrappers.control.backup.stopping import held_stop
 
 SPEEDS = st.floats(-7.0, 7.0).map(lambda v: round(v, 6))
 PLACES = st.floats(-3.0, 3.0)
@@ -96,29 +95,9 @@ def test_more_control_never_rests_or_reaches_less_far(axis, x, v, a, b):
     assert low[0] <= high[0] + 1e-12 and low[1] <= high[1] + 1e-12
 
 
-@given(axes(clip=False), PLACES, SPEEDS, st.floats(0.3, 8.0))
-def test_a_clip_never_leads_farther(axis, x, v, clip):
-    clipped = of.damped_axis(axis.decay, axis.gain, axis.timestep, axis.substeps, axis.low, axis.high, clip)
-    free, held = of.rest(axis, x, v), of.rest(clipped, x, v)
-    assert min(x, free) - 1e-12 <= held <= max(x, free) + 1e-12
-
-
-@given(st.floats(0.0, 5.0), st.integers(1, 8))
-def test_without_damping_a_finely_stepped_hold_is_the_held_formula(speed, holds):
-    # A thousand steps a hold: the step's own share of the way, gain * timestep, is below the tolerance.
-    brake, hold, steps = 3.0, 0.1, 1000
-    axis = of.damped_axis(1.0, brake * hold / steps, hold / steps, steps, -1.0, 1.0)
-    assert of.rest(axis, 0.0, speed) == pytest.approx(held_stop(speed, brake, hold), abs=1e-3)
-
-
 def test_faster_than_the_table_knows_never_stops():
     axis = of.damped_axis(1.0, 0.1, 0.01, 1, -1.0, 1.0)
     assert of.rest(axis, 0.0, 400.0) < math.inf
     assert of.rest(axis, 0.0, 500.0) == math.inf
     assert of.rest(axis, 0.0, -500.0) == -math.inf
     assert math.isfinite(of.control_to_rest_at(axis, 0.0, 0.0, 1e12))
-
-
-def test_the_two_directions_have_their_own_brakes():
-    axis = of.damped_axis(1.0, 0.1, 0.01, 1, low=-0.5, high=1.0)
-    assert of.rest(axis, 0.0, 3.0) == pytest.approx(2.0 * -of.rest(axis, 0.0, -3.0), rel=0.02)

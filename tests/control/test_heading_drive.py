@@ -17,7 +17,6 @@ from safe_wrappers.control.backup.heading_drive import (
     end_distance,
     path_distance,
     predict,
-    residual_turn_angle,
     stopping_path,
 )
 from safe_wrappers.plants.queries.planar_robot import heading_drive
@@ -65,33 +64,6 @@ def test_prediction_is_mujocos_own_step():
         place(env, motion)
         env.step(action)
         np.testing.assert_allclose(now(env), predict(drive, motion, *action), atol=1e-9)
-
-
-def test_prediction_stays_mujocos_over_an_episode():
-    env, _, drive = robot()
-    motion = now(env)
-    rng = np.random.default_rng(1)
-    for k in range(300):
-        if k % 8 == 0:
-            action = rng.choice([-1.0, 1.0], 2)
-        env.step(action)
-        motion = predict(drive, motion, *action)
-        np.testing.assert_allclose(now(env), motion, atol=1e-8)
-
-
-@pytest.mark.parametrize("level", [1, 2])
-def test_vases_do_not_change_the_robots_constants(level):
-    assert robot(level)[2] == robot(0)[2]
-
-
-def test_constants_are_read_from_a_perturbed_model():
-    _, plant, right = robot()
-    plant.perturb(mass=1.2, damping=0.8)
-    wrong = heading_drive(plant, "agent")
-    assert wrong.mass == pytest.approx(1.2 * right.mass)
-    assert wrong.yaw_inertia == pytest.approx(1.2 * right.yaw_inertia)
-    assert wrong.damping == pytest.approx(0.8 * right.damping)
-    assert wrong.drive_limit == right.drive_limit
 
 
 def rest(drive, m):
@@ -163,43 +135,6 @@ def test_the_area_holds_every_machine_inside_the_uncertainty(mass, damping):
         assert excursion(robot()[2], truth, speed=0.7) > 2e-2
 
 
-def test_the_area_is_no_larger_than_it_need_be():
-    env, _, drive = robot()
-    motion = Motion(0.0, 0.0, 0.0, 0.6, 0.4, 0.0)
-    place(env, motion)
-    for _ in range(300):
-        env.step(backup(drive, now(env)))
-    path = stopping_path(drive, motion, True)
-    end = np.array(
-        [path.forward * path.ex + path.sideways * path.sx, path.forward * path.ey + path.sideways * path.sy]
-    )
-    assert np.linalg.norm(end - env.data.qpos[:2]) < 2e-3
-    assert end_distance(path, *env.data.qpos[:2]) == pytest.approx(
-        np.linalg.norm(end - env.data.qpos[:2]) - path.wander
-    )
-
-
-def test_braking_control_ends_at_rest_and_does_not_turn_round():
-    env, _, drive = robot()
-    for speed in (-0.9, -0.01, 0.003, 0.5):
-        place(env, Motion(0, 0, 0, speed, 0, 0))
-        for _ in range(60):
-            env.step(backup(drive, now(env)))
-            assert env.data.qvel[0] * speed >= -1e-3
-        assert abs(env.data.qvel[0]) < 1e-3
-
-
-def test_the_turn_that_is_left_is_mujocos():
-    env, _, drive = robot()
-    for rate in (-3.0, -1.0, 0.4, 2.0):
-        place(env, Motion(0, 0, 0, 0, 0, rate))
-        headings = []
-        for _ in range(20):
-            env.step(np.zeros(2))
-            headings.append(env.data.qpos[2])
-        assert residual_turn_angle(drive, rate) == pytest.approx(headings[-1], abs=6e-3)
-
-
 # Distance to the area -----------------------------------------------------------------------------------------
 
 LENGTH = st.floats(0.0, 1.0).map(lambda v: round(v, 3))
@@ -249,33 +184,6 @@ def test_distance_agrees_with_brute_force(forward, sideways, share, spread, angl
         assert path_distance(path, px, py) == pytest.approx(expected, abs=1e-3)
     assert end_distance(path, px, py) == pytest.approx(np.linalg.norm(area[2] - [px, py]))
     assert path.radius >= max(np.linalg.norm(c - start) for c in area) - 1e-12
-
-
-def test_a_body_at_rest_is_a_point():
-    _, _, drive = robot()
-    path = stopping_path(drive, Motion(0.5, 0.25, 1.0, 0.0, 0.0, 0.0), True)
-    assert path_distance(path, 0.5, 1.25) == pytest.approx(1.0)
-    assert path.radius == pytest.approx(0.0, abs=1e-12)
-
-
-@given(st.floats(0, 1.4), st.floats(-1.4, 1.4), st.floats(-3.1, 3.1))
-def test_uncertainty_only_adds_area(ahead, aside, heading):
-    motion = Motion(
-        0.0,
-        0.0,
-        heading,
-        ahead * math.cos(heading) - aside * math.sin(heading),
-        ahead * math.sin(heading) + aside * math.cos(heading),
-        0.0,
-    )
-    small, large = stopping_path(DRIVES[0], motion, True), stopping_path(DRIVES[1], motion, True)
-    p, e, s = np.zeros(2), np.array([small.ex, small.ey]), np.array([small.sx, small.sy])
-    for corner in (p, small.forward * e + small.crossing * s, small.forward * e + small.sideways * s):
-        assert path_distance(large, *corner) <= 5e-5
-    assert large.forward >= small.forward - 5e-5 and large.sideways >= small.sideways
-
-
-DRIVES = (robot()[2], robot(uncertainty=0.2)[2])
 
 
 def test_refusals_name_what_does_not_fit():

@@ -3,14 +3,12 @@
 import math
 
 import numpy as np
-import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.backup import point_among_walls as of
 from safe_wrappers.control.backup.damped_axis import damped_axis
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
-from safe_wrappers.control.numerics.rectangles import apart
 
 WALLS = [(-3.0, 3.0, -3.0, -2.0), (-3.0, 3.0, 2.0, 3.0), (-3.0, -2.0, -2.0, 2.0), (2.0, 3.0, -2.0, 2.0)]
 BLOCK = (-0.5, 0.5, -0.5, 0.4)
@@ -80,17 +78,6 @@ def test_no_physics_step_of_braking_is_closer_than_the_distance(motion, substeps
     assert min(from_walls(point, p) for p in steps) >= distance - 1e-9
 
 
-@given(MOTIONS)
-def test_the_path_is_never_closer_than_its_rectangle_and_as_close_as_its_own_boxes(motion):
-    known, unknown = among(True), among(False)
-    motion = of.clipped(known, motion)
-    by_hand = min(apart(tuple(box), tuple(w)) for box in of.path(known, motion) for w in known.walls)
-    assert of.distance(known, motion) >= of.distance(unknown, motion) - 1e-12
-    assert of.distance(known, motion) == pytest.approx(by_hand, abs=1e-12)
-    assert of.distance(known, motion, by_hand + 0.1) == pytest.approx(by_hand, abs=1e-12)
-    assert of.distance(known, motion, -9.0) == -9.0
-
-
 @given(MOTIONS, st.sampled_from([1, 4]), st.booleans())
 def test_braking_for_one_hold_never_loses_distance_and_is_clear(motion, substeps, clip_known):
     point = among(clip_known, substeps)
@@ -120,30 +107,3 @@ def test_without_the_clip_s_level_every_clip_is_covered(motion, control, clip, r
     end = truth(point, motion, control, clip)[-1]
     assert from_walls(point, end) >= room - 1e-9
     assert of.distance(point, end) >= room - 1e-9
-
-
-@given(MOTIONS, CONTROLS)
-def test_only_reachable_walls_can_be_met(motion, control):
-    point = among(True)
-    motion = of.clipped(point, motion)
-    area = of.reachable(point, motion)
-    alone = among(True, walls=[w for w in point.walls if apart(area, tuple(w)) >= 0.1])
-    assert of.clear(alone, motion, *control, 0.1)
-
-
-def test_the_price_of_not_knowing_the_clip_is_at_corners():
-    # Up and to the left past the block's upper right corner: the path passes it, its rectangle does not.
-    motion = PointMotion(0.7, 0.38, -3.5, 3.5)
-    known, unknown = among(True), among(False)
-    assert of.distance(known, motion) > 0.1 > 0.0 > of.distance(unknown, motion)
-    # Straight ahead there is no difference.
-    straight = PointMotion(1.0, 0.0, 3.0, 0.0)
-    assert of.distance(known, straight) == of.distance(unknown, straight)
-
-
-def test_far_beyond_the_table_nothing_is_clear():
-    point = among(False)
-    motion = PointMotion(1.0, 1.0, 1e6, 0.0)
-    assert not of.clear(point, motion, -1.0, 0.0, 0.1)
-    assert of.distance(point, motion) < 0.0
-    assert np.isfinite(of.distance(point, motion))

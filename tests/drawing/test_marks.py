@@ -28,12 +28,6 @@ def test_a_rod_goes_from_its_start_to_its_end_in_a_right_handed_frame(start, end
     assert np.linalg.det(rod.axes) == pytest.approx(1.0) and rod.size[0] == 0.1
 
 
-@given(points, points)
-def test_an_arrow_ends_where_its_vector_leads(tail, vector):
-    drawn = marks.arrow("executed", tail, vector, 0.1)
-    np.testing.assert_allclose(drawn.tip, tail + (vector if np.linalg.norm(vector) > 1e-12 else 0), atol=1e-9)
-
-
 @given(arrays(float, 2, elements=numbers), sizes)
 def test_a_ring_lies_on_the_floor_around_its_centre(center, radius):
     drawn = marks.ring("limit", center, radius)
@@ -64,15 +58,3 @@ def test_the_edges_of_a_box_are_twelve_and_meet_in_threes():
     assert sorted(2.0 * rod.size[1] for rod in drawn) == pytest.approx([1.0] * 4 + [2.0] * 4 + [3.0] * 4)
     corners = [tuple(np.round(end, 9)) for rod in drawn for end in ends(rod)]
     assert len(set(corners)) == 8 and all(corners.count(corner) == 3 for corner in corners)
-
-
-@given(points, points.filter(lambda n: np.linalg.norm(n) > 0.1))
-def test_a_pad_is_flat_along_its_normal(foot, normal):
-    drawn = marks.pad("keep out", foot, normal, 0.5)
-    assert abs(drawn.axes[:, 2] @ normal) == pytest.approx(np.linalg.norm(normal))
-    assert drawn.size[2] < 0.01 < drawn.size[0] == drawn.size[1] == 0.5
-
-
-def test_what_has_no_height_is_drawn_on_the_floor():
-    np.testing.assert_array_equal(marks.spatial([1.0]), [1.0, 0.0, marks.FLOOR])
-    np.testing.assert_array_equal(marks.spatial([1.0, 2.0, 3.0]), [1.0, 2.0, 3.0])

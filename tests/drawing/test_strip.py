@@ -5,9 +5,7 @@ from hypothesis import strategies as st
 
 from safe_wrappers import info as keys
 from safe_wrappers.drawing import strip
-from safe_wrappers.drawing.strip import STATES, Strip, state_of, words_of
-
-LIGHT = np.full((200, 300, 3), 250, np.uint8)
+from safe_wrappers.drawing.strip import STATES, Strip, state_of
 
 
 def colours(frame, name):
@@ -29,30 +27,6 @@ def colours(frame, name):
 )
 def test_the_worst_of_what_a_step_reports_is_its_state(info, state):
     assert state_of(info) == state
-
-
-def test_what_nobody_reports_is_not_said():
-    assert words_of({}) == []
-    assert words_of({keys.CBF_MARGIN: 0.0}) == []  # written where no constraint has an h
-    info = {
-        keys.CBF_MARGIN: -0.25,
-        keys.LEASE_REMAINING_S: 0.5,
-        keys.TELEOP_ROUND_TRIP_S: 0.125,
-        keys.SLIP_RATIO: np.array([0.1, -0.3]),
-    }
-    assert words_of(info) == ["margin -0.25", "lease 0.50 s", "round trip 0.12 s", "slip 0.30"]
-
-
-def test_only_the_lower_edge_of_a_copy_is_drawn_on():
-    shown = Strip()
-    shown.begin({})
-    before = LIGHT.copy()
-    frame = shown.on(before)
-    np.testing.assert_array_equal(before, LIGHT)
-    assert frame.shape == LIGHT.shape and frame.dtype == np.uint8
-    top = 200 - round(0.14 * 200)
-    np.testing.assert_array_equal(frame[:top], LIGHT[:top])
-    assert (frame[top:] != LIGHT[top:]).any(axis=2).mean() > 0.9
 
 
 @given(st.integers(1, 150), st.integers(1, 400), st.booleans())
@@ -103,13 +77,3 @@ def test_bars_reach_from_zero_to_the_action_proposed_beside_executed():
     (up_y, up_x), (down_y, down_x) = (found[r].mean(axis=0) for r in ("proposed", "executed"))
     assert up_x < down_x and up_y < down_y
     assert found["proposed"][:, 0].max() <= found["executed"][:, 0].min() + 3
-
-
-def test_without_a_filter_the_executed_action_alone_has_a_bar():
-    shown = Strip(np.array([-1.0]), np.array([1.0]))
-    shown.add({keys.EXECUTED_ACTION: np.array([1.0])})
-    frame = shown.on(np.zeros((400, 600, 3), np.uint8)).astype(int)
-    seen = [
-        (np.abs(frame - strip.colour_of(role)) <= 2).all(axis=-1).any() for role in ("proposed", "executed")
-    ]
-    assert seen == [False, True]

@@ -102,7 +102,7 @@ def search(*constraints, fallback="brake", **bounds):
     plant.bind(Still())
     plant.observe()
     low, high = -np.ones(2), np.ones(2)
-    return SafeActionSearch(plant, constraints, Fallback(fallback, constraints), "daqp", low, high)
+    return SafeActionSearch(plant, constraints, Fallback(fallback, constraints), low, high)
 
 
 def decide(proposal, *constraints, **options):

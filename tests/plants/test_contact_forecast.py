@@ -1,7 +1,5 @@
 """Forecasts of contacts against the env's own step, MuJoCo's solver decoded by hand, and Newton's laws."""
 
-import copy
-
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -9,9 +7,7 @@ import pytest
 from asking import bound
 from scenes import Scene
 
-from safe_wrappers.control.numerics.compiled import IS_COMPILED
-from safe_wrappers.plants.mujoco.contact_memory import contact_memory
-from safe_wrappers.plants.mujoco.contacts import ContactReader, can_touch_the_world
+from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
 from safe_wrappers.plants.mujoco.replay import Replay
 
 ROBOTS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5")
@@ -158,83 +154,6 @@ def test_of_every_kind_of_contact_on_floors_steps_and_lifts(integrator, cone, co
         normals += pressing.sum()
         assert (pressing >= 0.0).all()
     assert len(bodies) >= 2 and normals > 0.0
-
-
-def compared_with_python(env, actions):
-    """Number of contacts, of steps that compiled code and Python simulate to the same bits."""
-    plant = bound(env)
-    data, control = plant.data, plant.model.nu
-    one, other = ContactReader(plant.model), ContactReader(plant.model)
-    other._compiles = False
-    count = 0
-    for action in actions:
-        ends = []
-        for reader in (copy.deepcopy(one), one, other):
-            mujoco.mj_setState(plant.model, data, state_of(env), STATE)
-            data.ctrl[:] = np.resize(action, control)
-            found = reader.follow(data, plant.substeps)
-            ends.append([*found, data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy(), data.time])
-        for mine, theirs in zip(ends[0] + ends[1], ends[2] + ends[2], strict=True):
-            np.testing.assert_array_equal(mine, theirs, strict=True)
-        count += len(found.step)
-        env.step(action)
-    return count
-
-
-def state_of(env):
-    raw = env.unwrapped
-    state = np.zeros(mujoco.mj_stateSize(raw.model, STATE))
-    mujoco.mj_getState(raw.model, raw.data, state, STATE)
-    return state
-
-
-@KINDS
-def test_compiled_code_gives_the_same_bits_as_python(integrator, cone, condim):
-    ball = '<body pos="{} 2 .099"><freejoint/><geom type="sphere" size=".1" mass="1"/></body>'
-    balls = "".join(ball.format(0.3 * i - 3.0) for i in range(20))
-    env = Legs(integrator, cone, condim, more=balls)
-    env.reset()
-    actions = np.random.default_rng(2).choice([-1.0, 1.0], (10, 2))
-    assert compared_with_python(env, actions) > 10 * 64  # more than there is room for at first
-
-
-@pytest.mark.parametrize("env_id", ROBOTS)
-def test_compiled_code_gives_the_same_bits_as_python_on_robots(env_id):
-    env = gym.make(env_id)
-    env.reset(seed=4)
-    space = env.action_space
-    actions = np.random.default_rng(4).uniform(space.low, space.high, (60, *space.shape))
-    assert compared_with_python(env, actions) > 20
-
-
-@pytest.mark.skipif(not IS_COMPILED, reason="compiled code is switched off")
-def test_compiled_code_is_used_where_it_can_be():
-    plant = bound(gym.make("HalfCheetah-v5"))
-    reader = ContactReader(plant.model)
-    assert reader._compiles and reader._memory_of(plant.data) is not None
-    assert copy.deepcopy(reader)._memory is None  # of data that the copy does not hold
-    filtered = '<general name="slow" joint="hip" dyntype="filter" dynprm="0.1" ctrlrange="-1 1"/>'
-    assert not ContactReader(Legs(act=filtered).model)._compiles
-
-
-@pytest.mark.skipif(not IS_COMPILED, reason="compiled code is switched off")
-def test_views_that_were_made_without_contacts_show_those_that_come():
-    # MuJoCo 4.0's bindings show an array that is anywhere while there are none.
-    env = Legs()
-    env.reset()
-    env.data.qpos[2::9] += 5.0
-    mujoco.mj_forward(env.model, env.data)
-    assert env.data.ncon == 0
-    memory = contact_memory(env.model, env.data)
-    env.reset()
-    mujoco.mj_step(env.model, env.data, 100)
-    contact, count = env.data.contact, env.data.ncon
-    assert count > 1 and memory.number[0] == count
-    of_contacts = memory.reals[: count * memory.stride].reshape(count, memory.stride)
-    np.testing.assert_array_equal(of_contacts[:, 0], contact.dist)
-    np.testing.assert_array_equal(of_contacts[:, memory.pos : memory.pos + 3], contact.pos)
-    whole = of_contacts.view(np.int32)
-    np.testing.assert_array_equal(whole[:, memory.geom : memory.geom + 2], contact.geom)
 
 
 @pytest.mark.parametrize("env_id", ["Ant-v5", "Humanoid-v5", "HalfCheetah-v5"])

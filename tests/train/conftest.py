@@ -3,8 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.config import parse_experiment, read_config
 
 torch.set_num_threads(1)  # as in the workers; two threads on two busy cores only wait for each other
 

@@ -22,16 +22,16 @@ from safe_wrappers.train.config import EvaluationConfig, FilterConfig
 from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, MASKED, OFF_POLICY, ON_POLICY
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.experiment import training_jobs
-from safe_wrappers.train.hyperparameters import check_task, constructor_arguments
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.policies import load_policy
-from safe_wrappers.train.report.origin import about
+from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.folder import finished_facts
+from safe_wrappers.train.run.model import _constructor_arguments as constructor_arguments
+from safe_wrappers.train.run.model import check_task
 from safe_wrappers.train.run.policy import SpacesEnv
-from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.stack import make_stack, make_vec_env
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.run.vec_envs import make_vec_env
-from safe_wrappers.train.tables import read_rows
 
 SMALL = "policy_kwargs: {net_arch: [8]}"
 REPLAY = f"learning_starts: 32, batch_size: 8, train_freq: 8, {SMALL}"
@@ -132,7 +132,7 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
     experiment = one_arm(fake_experiment, algorithm, arm)
     (arm,) = experiment.arms
     folder = run_killed_after(experiment, 1, monkeypatch, arm=0)
-    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    checkpoint = latest_checkpoint(folder / "checkpoints")
     assert checkpoint.timesteps == 64
     model = checkpoint.load_model(algorithm, make_vec_env(arm), "cpu")
     assert type(model) is ALGORITHMS[algorithm]

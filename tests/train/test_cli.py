@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.files import read_rows
 
 FAKE = Path(__file__).parent / "fake.yaml"
 FILTERED = "arms={filtered: {filter: {factory: 'fake_task:shield'}}}"

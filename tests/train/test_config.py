@@ -3,8 +3,7 @@ from pathlib import Path
 import pytest
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.config import parse_experiment, read_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 MINIMAL = {

@@ -21,9 +21,9 @@ from safe_wrappers.train.enjoy import enjoy_command
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.data_pickles import read_pickle
+from safe_wrappers.train.run.stack import make_vec_env
 from safe_wrappers.train.run.start import policy_of_file
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.run.vec_envs import make_vec_env
 
 
 class Touch:
@@ -104,7 +104,7 @@ def test_a_replay_buffer_that_would_run_something_is_refused(run, tmp_path):
     arm, folder, checkpoint = run
     poison(checkpoint, "replay_buffer.pkl", Touch(tmp_path / "made"))
     with pytest.raises(RunStateError, match=r"replay_buffer\.pkl' is refused"):
-        latest_checkpoint(folder / "checkpoints", pytest.fail).load_model("SAC", make_vec_env(arm), "cpu")
+        latest_checkpoint(folder / "checkpoints").load_model("SAC", make_vec_env(arm), "cpu")
     assert not (tmp_path / "made").exists()
 
 
@@ -137,7 +137,7 @@ def test_what_nobody_judged_is_found(tmp_path):
 
 def test_random_states_go_on_where_they_stood(run):
     arm, folder, checkpoint = run
-    found = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    found = latest_checkpoint(folder / "checkpoints")
     assert json.loads((checkpoint / "random.json").read_text()).keys() == {"python", "numpy", "torch"}
 
     def drawn():

@@ -6,9 +6,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps
-from safe_wrappers.train.evaluation.scene import load_scenes
+from safe_wrappers.train.evaluation.scene import load_scene
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.tables import read_rows
 
 SILENT = Progress(lambda steps: None, pytest.fail)
 
@@ -30,11 +30,11 @@ def test_every_arm_sees_the_same_episodes_with_the_filter_off_and_on(fake_experi
         for condition in ("filter_off", "filter_on"):
             rows = read_rows(folder / f"{condition}.csv")
             assert [row["episode_seed"] for row in rows] == [100, 101, 102]
-            scenes = load_scenes(folder / f"{condition}.npz")
-            starts.append([scenes[seed].agent[0].tolist() for seed in (100, 101, 102)])
+            scenes = [load_scene(folder / f"{condition}.npz", seed) for seed in (100, 101, 102)]
+            starts.append([scene.agent[0].tolist() for scene in scenes])
             assert all(("intervention_rate" in row) == (condition == "filter_on") for row in rows)
             intervened = sum(row.get("intervention_rate", 0) for row in rows)
-            assert sum(scene.intervened.sum() for scene in scenes.values()) == pytest.approx(20 * intervened)
+            assert sum(scene.intervened.sum() for scene in scenes) == pytest.approx(20 * intervened)
             if condition == "filter_off":
                 assert intervened == 0
             else:
@@ -44,7 +44,7 @@ def test_every_arm_sees_the_same_episodes_with_the_filter_off_and_on(fake_experi
 
 
 def test_scenes_hold_what_the_picture_needs(fake_experiment):
-    scene = load_scenes(evaluate(fake_experiment(), 1) / "filter_on.npz")[100]
+    scene = load_scene(evaluate(fake_experiment(), 1) / "filter_on.npz", 100)
     assert scene.agent.shape == (21, 2)
     assert scene.intervened.shape == scene.violated.shape == (20,)
     assert scene.goals.tolist() == [[1.0, 0.0]]
@@ -70,21 +70,10 @@ def test_the_steps_agree_with_the_table(fake_experiment):
             assert log.cost[at].sum() == row["cost"]
             changed += log.intervened[at].sum()
         # Where the steps began is where the scenes were.
-        scenes = load_scenes(folder / f"{condition}.npz")
-        assert log.coordinates[:20, :2] == pytest.approx(scenes[100].agent[:-1], abs=1e-6)
+        scene = load_scene(folder / f"{condition}.npz", 100)
+        assert log.coordinates[:20, :2] == pytest.approx(scene.agent[:-1], abs=1e-6)
     assert list(log.coordinate_names[:2]) == ["x (m)", "y (m)"]
     assert changed > 0
-
-
-def test_an_evaluation_of_an_earlier_version_is_made_anew(fake_experiment):
-    folder = evaluate(fake_experiment(), 1)
-    state = json.loads((folder / "evaluation.json").read_text())
-    del state["recording"]
-    (folder / "evaluation.json").write_text(json.dumps(state))
-    (folder / "filter_on_steps.npz").unlink()
-    assert evaluated_steps(folder.parent, "filter_on") is None
-    evaluate(fake_experiment(), 1)
-    assert len(evaluated_steps(folder.parent, "filter_on")) == 60
 
 
 def test_done_once_and_again_when_its_settings_change(fake_experiment):
@@ -134,8 +123,8 @@ def test_without_any_filter_only_one_condition(fake_experiment):
 
 def test_a_task_that_publishes_no_positions_has_no_scenes(fake_experiment):
     folder = evaluate(fake_experiment("env=InvertedPendulum-v5", "arms={unfiltered: {filter: none}}"), 0)
-    assert load_scenes(folder / "filter_off.npz") == {}
-    assert load_scenes(folder / "never_written.npz") == {}
+    assert load_scene(folder / "filter_off.npz", 100) is None
+    assert load_scene(folder / "never_written.npz", 100) is None
     row = read_rows(folder / "filter_off.csv")[0]
     assert "goals_reached" not in row
     assert np.isfinite(row["return"])

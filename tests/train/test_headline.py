@@ -1,13 +1,18 @@
 """The first sentences of the report must not say more than the numbers do."""
 
 import pytest
-from made_up import episode, fill, steps, write_evaluation, write_training
+from made_up import SILENT, episode, fill, write_evaluation, write_training
 
 from safe_wrappers.train.evaluation.summary import summarize
-from safe_wrappers.train.report.headline import cards
-from safe_wrappers.train.report.verdict import verdict
+from safe_wrappers.train.report.verdict import cards, verdict
 
 # Training: 10 episodes of 100 steps for each of 2 seeds; evaluation 2 episodes each: 2,400 steps a side.
+
+
+def shown(experiment, filter_us=None):
+    """The cards, a line each."""
+    found = cards(experiment, summarize(experiment), filter_us)
+    return [" | ".join([card.title, card.value, *card.lines, card.mood]) for card in found]
 
 
 def told(experiment, **more):
@@ -77,9 +82,8 @@ def test_what_was_infeasible_in_training_alone_is_not_told_of_the_evaluation(fak
         "of the evaluation steps; no step was infeasible and none ran the fallback. In training 1 step was"
         in said
     )
-    assert "where no action was admissible, of training and evaluation" in cards(
-        experiment, summarize(experiment)
-    )
+    nothing = "where no action was admissible, of training and evaluation"
+    assert f"Infeasible steps | 1 | {nothing} | fallback: 0 steps | " in shown(experiment)
 
 
 def four_ways(experiment, spread=0.0):
@@ -109,17 +113,16 @@ def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filte
         "With the filter on, the policy trained without it returned more (2 seeds say little)."
         " In brackets the range over 2 seeds, which is not an interval. Trained for 512 control steps each.",
     ]
-    page = cards(experiment, numbers)
-    for title, value, what, hurt in (
-        ("Trained without the filter, filter off", "21.1", "20.6 to 21.6", "10 of 200 steps in violation"),
-        ("Trained without the filter, filter on", "12.7", "12.2 to 13.2", "no step in violation"),
-        ("Trained through the filter, filter off", "9.4", "8.9 to 9.9", "6 of 200 steps in violation"),
-        ("Trained through the filter, filter on", "5.03", "4.53 to 5.53", "no step in violation"),
-    ):
-        assert (
-            f'<h3>{title}</h3><p class="value ">{value}</p><p>return per episode</p>'
-            f'<p class="other">range {what}</p><p class="other">{hurt}</p>'
-        ) in page
+    assert shown(experiment)[:4] == [
+        "Trained without the filter, filter off | 21.1 | return per episode | range 20.6 to 21.6"
+        " | 10 of 200 steps in violation | ",
+        "Trained without the filter, filter on | 12.7 | return per episode | range 12.2 to 13.2"
+        " | no step in violation | ",
+        "Trained through the filter, filter off | 9.4 | return per episode | range 8.9 to 9.9"
+        " | 6 of 200 steps in violation | ",
+        "Trained through the filter, filter on | 5.03 | return per episode | range 4.53 to 5.53"
+        " | no step in violation | ",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -167,13 +170,14 @@ def test_more_return_through_training_with_the_filter_is_said_too(fake_experimen
 
 def test_a_task_without_a_cost_has_no_violations_to_count(fake_experiment):
     experiment = fake_experiment()
-    silent = steps(cost=steps().cost * float("nan"))
-    said = told(experiment, off={}, on={"unsafe": 3}, log_off=silent, log_on=silent)
+    said = told(experiment, off=SILENT, on=SILENT | {"unsafe": 3})
     assert said.startswith("Violations are not judged: the task reports no cost.")
     assert "By the filter's own measure 72 of 2,400 steps with it began outside the safe set." in said
     assert "in violation" not in said
-    page = cards(experiment, summarize(experiment))
-    assert "in violation" not in page and page.count("violations not judged") == 4
+    assert (
+        "in violation" not in str(shown(experiment))
+        and str(shown(experiment)).count("violations not judged") == 4
+    )
 
 
 def test_without_an_arm_that_has_none_the_filter_is_switched_off(fake_experiment):
@@ -182,9 +186,7 @@ def test_without_an_arm_that_has_none_the_filter_is_switched_off(fake_experiment
     said = told(experiment, off={"violations": 5}, on={})
     # The evaluation only: both sides trained with it. 2 episodes of 100 steps for 2 seeds.
     assert "none of 400 steps was in violation; without it 20 of 400 steps (5 %) were" in said
-    page = cards(experiment, summarize(experiment))
-    assert "The same policies, “a”, with the filter on and off." in page
-    assert "with the filter, of 400 of evaluation" in page
+    assert "with the filter, of 400 of evaluation" in str(shown(experiment))
 
 
 def test_an_arm_of_another_env_is_not_compared_with(fake_experiment):
@@ -192,7 +194,6 @@ def test_an_arm_of_another_env_is_not_compared_with(fake_experiment):
         "arms.unfiltered.env=fake_task:FilmedGoal-v0", "arms.third={filter: none}", "seeds=[0]"
     )
     fill(experiment, off={"violations": 5}, on={})
-    assert "Without: “third”" not in cards(experiment, summarize(experiment))  # nothing of it is there yet
     assert verdict(experiment, summarize(experiment))[0].startswith("There is no filter to compare with yet.")
 
 
@@ -205,7 +206,6 @@ def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_ex
         experiment,
         off={"violations": 5, "return": 20},
         on={"return": 10, "intervention_rate": 0.5},
-        log_on=steps(),
     )
     # The evaluation of both arms: 2 episodes of 100 steps for 2 seeds each.
     assert " ".join(verdict(experiment, summarize(experiment))) == (
@@ -213,27 +213,14 @@ def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_ex
         " The return per episode went: one 20 to 10, two 20 to 10."
         " The filter changed 50 % of the evaluation steps; no step was infeasible and none ran the fallback."
     )
-    page = cards(experiment, summarize(experiment))
-    assert "The same policies, “one”, “two”, with the filter on and off." in page
-    assert "return per episode" not in page  # of two tasks there is no common one
-    assert "50 µs" in page
-
-
-def test_the_filters_time_is_the_evaluations_where_no_training_had_it(fake_experiment):
-    experiment = fake_experiment(
-        "arms={one: {filter: none}}", "evaluation.filter={factory: 'fake_task:shield'}"
-    )
-    for seed in experiment.seeds:
-        write_evaluation(experiment, 0, seed, "filter_off", [episode()])
-        write_evaluation(experiment, 0, seed, "filter_on", [episode()], steps())
-    assert "70 µs" in cards(experiment, summarize(experiment))
+    assert "return per episode" not in str(shown(experiment))  # of two tasks there is no common one
 
 
 def test_without_any_filter_there_is_nothing_to_compare(fake_experiment):
     experiment = fake_experiment("arms={one: {filter: none}, two: {filter: none}}")
     said = told(experiment, off={"violations": 5, "return": 3}, on={})
     assert "one: return 3 in evaluation, 20 of 400 steps in violation." in said
-    assert cards(experiment, summarize(experiment)) == ""
+    assert shown(experiment) == []
 
 
 def test_the_cards(fake_experiment):
@@ -243,17 +230,17 @@ def test_the_cards(fake_experiment):
         off={"violations": 5, "return": 20},
         on={"return": 10, "intervention_rate": 0.125, "infeasible": 1, "fallback": 2},
     )
-    page = cards(experiment, summarize(experiment))
-    for expected in (
-        '<h3>Steps in violation</h3><p class="value good">0</p>',
-        "with the filter, of 2,400 of training and evaluation",
-        "without: 120 of 2,400",
-        '<h3>Trained without the filter, filter off</h3><p class="value ">20</p>',
-        '<h3>Trained through the filter, filter on</h3><p class="value ">10</p>',
-        '<h3>Steps changed</h3><p class="value ">12 %</p>',
-        '<h3>Infeasible steps</h3><p class="value ">24</p>',
-        "fallback: 48 steps",
-        '<h3>Filter time per step</h3><p class="value ">50 µs</p>',
-        "With the filter: “filtered”, trained and evaluated through it.",
-    ):
-        assert expected in page
+    assert shown(experiment, 50.0) == [
+        "Trained without the filter, filter off | 20 | return per episode | range 20 to 20"
+        " | 20 of 400 steps in violation | ",
+        "Trained without the filter, filter on | 10 | return per episode | range 10 to 10 | no step in violation | ",
+        "Trained through the filter, filter off | 20 | return per episode | range 20 to 20"
+        " | 20 of 400 steps in violation | ",
+        "Trained through the filter, filter on | 10 | return per episode | range 10 to 10 | no step in violation | ",
+        "Steps in violation | 0 | with the filter, of 2,400 of training and evaluation"
+        " | without: 120 of 2,400 | good",
+        "Steps changed | 12 % | by the filter, in evaluation | ",
+        "Infeasible steps | 24 | where no action was admissible, of training and evaluation"
+        " | fallback: 48 steps | ",
+        "Filter time per step | 50 µs | mean, on the machine that ran it | ",
+    ]

@@ -14,12 +14,11 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
-from safe_wrappers.train.hyperparameters import check_task
-from safe_wrappers.train.run.checkpoint import latest_checkpoint
-from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
+from safe_wrappers.train.run.model import check_task
+from safe_wrappers.train.run.stack import make_stack, make_vec_env
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.run.vec_envs import make_vec_env
-from safe_wrappers.train.tables import read_rows
 
 HER = (
     "hyperparameters={policy: MultiInputPolicy, learning_starts: 32, batch_size: 16, train_freq: 8,"
@@ -87,7 +86,7 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, re
     (arm,) = experiment.arms
     check_task(arm, make_stack(arm.env, arm.filter, arm.learner))
     folder = run_killed_after(experiment, 1, monkeypatch, arm=0)
-    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    checkpoint = latest_checkpoint(folder / "checkpoints")
     buffer = checkpoint.load_model("SAC", make_vec_env(arm), "cpu").replay_buffer
     assert type(buffer) is (HerReplayBuffer if kind in SB3S_BUFFER else ExecutedActionHerReplayBuffer)
     assert getattr(buffer, "mode", kind) == kind
@@ -193,7 +192,7 @@ def test_sac_with_hindsight_learns_through_protect_on_a_public_task(fake_experim
     train_run(arm, 0, folder, Reports().progress)
     rows = read_rows(folder / "episodes.csv")
     assert [row["length"] for row in rows] == [25.0] * 4
-    model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model("SAC", None, "cpu")
+    model = load_model(latest_checkpoint(folder / "checkpoints").folder, "SAC", "cpu")
     assert model._n_updates > 5 and model.action_space.shape == (nu,)
     evaluate_run(arm, 0, folder, EvaluationConfig(1, 7), FilterConfig(), Reports().progress)
     assert len(read_rows(evaluation_folder(folder) / "filter_on.csv")) == 1

@@ -15,11 +15,10 @@ from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.evaluation.summary import summarize, write_summary
-from safe_wrappers.train.report import verdict, write_report
-from safe_wrappers.train.report.terminal_table import comparison_table
+from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.report import comparison_table, verdict, write_report
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.stack import make_stack
-from safe_wrappers.train.tables import read_rows
 
 SILENT = Progress(lambda steps: None, pytest.fail)
 HERE = __name__

@@ -10,7 +10,7 @@ import pytest
 import torch
 from stable_baselines3 import SAC
 
-from safe_wrappers.train.processes.lock import only_writer
+from safe_wrappers.train.files import only_writer
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, save_checkpoint
 
 OPERATIONS = ("open", "os.", "shutil.")
@@ -73,18 +73,18 @@ def test_a_kill_at_any_file_operation_loses_no_checkpoint(tmp_path, model, befor
         shutil.copytree(whole, run)
         root = run / "checkpoints"
         killed = killed_at(operation, root, lambda root=root: save(model, root, step, final))
-        found = latest_checkpoint(root, pytest.fail)
+        found = latest_checkpoint(root)
         reached = 0 if found is None else found.timesteps
         assert reached in {max(before, default=0), step}
         if killed and operation % 7 == 3:  # the same command goes on, and is killed, too
             killed_at(operation, root, lambda root=root: save(model, root, step, final))
-            found = latest_checkpoint(root, pytest.fail)
+            found = latest_checkpoint(root)
             assert reached <= (0 if found is None else found.timesteps)
         save(model, root, step, final)
         names = sorted(path.name for path in root.iterdir())
         kept = sorted({*(() if final else before), step})[-2:]
         assert names == [f"step_{each:012d}" for each in kept]
-        assert latest_checkpoint(root, pytest.fail).timesteps == step
+        assert latest_checkpoint(root).timesteps == step
         if not killed:
             break
     assert operation > 10

@@ -18,12 +18,12 @@ from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train.config import NAIVE, EvaluationConfig, FilterConfig, LearnerConfig
 from safe_wrappers.train.evaluation.episode_selection import ShownEpisode
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import stack as stack_module
 from safe_wrappers.train.run import training as run_module
-from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
-from safe_wrappers.train.tables import read_rows
 from safe_wrappers.train.videos import record as record_module
 
 WALL = 0.0  # in the middle of where episodes start
@@ -155,7 +155,7 @@ def test_evaluation_never_has_the_penalty(fake_experiment, monkeypatch, algorith
     settings = EvaluationConfig(episodes=3, seed=7)
     monkeypatch.setattr(stack_module, "AdaptionPenalty", pytest.fail)
     evaluate_run(arm, 0, folder, settings, FilterConfig(), Reports().progress)
-    model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model(algorithm, None, "cpu")
+    model = load_model(latest_checkpoint(folder / "checkpoints").folder, algorithm, "cpu")
     changed = 0
     for condition, action_filter in (("filter_off", FilterConfig()), ("filter_on", arm.filter)):
         rows = read_rows(evaluation_folder(folder) / f"{condition}.csv")
@@ -192,7 +192,7 @@ def test_a_map_is_in_training_and_wherever_the_filter_is_on_in_evaluation(
     assert keys.ADAPTION_PENALTY not in infos[0]
 
     evaluate_run(arm, 0, folder, EvaluationConfig(episodes=3, seed=7), FilterConfig(), Reports().progress)
-    model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model(algorithm, None, "cpu")
+    model = load_model(latest_checkpoint(folder / "checkpoints").folder, algorithm, "cpu")
 
     def returns(env):
         for seed in (7, 8, 9):
@@ -242,7 +242,7 @@ def test_a_killed_run_goes_on_with_its_two_transitions(fake_experiment, monkeypa
     experiment = one_arm(fake_experiment, KINDS["both"], "n_envs=1", "checkpoint_every=64")
     (arm,) = experiment.arms
     folder = run_killed_after(experiment, 2, monkeypatch, arm=0)
-    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    checkpoint = latest_checkpoint(folder / "checkpoints")
     envs = DummyVecEnv([lambda: make_stack(arm.env, arm.filter, arm.learner)])
     buffer = checkpoint.load_model("SAC", envs, "cpu").replay_buffer
     assert type(buffer) is ExecutedActionReplayBuffer and buffer.mode == "both"

@@ -15,7 +15,7 @@ from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment, read_config
 from safe_wrappers.train.config.algorithms import ALGORITHMS
 from safe_wrappers.train.experiment import check_training
-from safe_wrappers.train.listing import LISTS
+from safe_wrappers.train.init import _LISTS as LISTS
 from safe_wrappers.train.run.stack import make_stack
 
 

@@ -13,10 +13,10 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import read_config
 from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
-from safe_wrappers.train.processes.job import Job
+from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.processes import Job
 from safe_wrappers.train.processes.parallel import RunsFailedError, run_jobs
 from safe_wrappers.train.sweep import sweep_experiment
-from safe_wrappers.train.tables import read_rows
 
 ray = pytest.importorskip("ray", reason="ray is not installed: pip install 'safe-wrappers[ray]'")
 FAKE = "tests/train/fake.yaml"

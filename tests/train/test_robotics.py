@@ -8,11 +8,11 @@ import sys
 import pytest
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.train.config.env_ids import check_env_id
+from safe_wrappers.train.config import check_env_id
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.run.checkpoint import latest_checkpoint
-from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
 
 SILENT = Progress(lambda _: None, lambda _: None)
 
@@ -33,14 +33,14 @@ def test_fetch_reach_is_trained_and_evaluated_by_its_plain_id(fake_experiment):
     evaluate_run(arm, 0, folder, experiment.evaluation, arm.filter, SILENT)
     (row,) = read_rows(folder / "evaluation" / "filter_on.csv")
     assert row["length"] == 50
-    model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model("PPO", None, "cpu")
+    model = load_model(latest_checkpoint(folder / "checkpoints").folder, "PPO", "cpu")
     assert type(model.policy).__name__ == "MultiInputActorCriticPolicy"
 
 
 def test_a_new_process_registers_them_when_asked():
     pytest.importorskip("gymnasium_robotics")
     code = (
-        "import gymnasium as gym; from safe_wrappers.train.config.env_ids import check_env_id;"
+        "import gymnasium as gym; from safe_wrappers.train.config import check_env_id;"
         "assert 'FetchReach-v4' not in gym.registry; check_env_id('FetchReach-v4');"
         "assert 'FetchReach-v4' in gym.registry"
     )

@@ -20,14 +20,13 @@ from safe_wrappers.train import experiment as experiment_module
 from safe_wrappers.train.config import EnvConfig, FilterConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.experiment import train_experiment
-from safe_wrappers.train.processes.lock import only_writer
+from safe_wrappers.train.files import only_writer, read_rows
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run import checkpoint as checkpoint_module
 from safe_wrappers.train.run.callbacks import CheckpointCallback
-from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
-from safe_wrappers.train.tables import read_rows
 from safe_wrappers.train.videos.record import video_path
 
 OFF = FilterConfig()
@@ -116,7 +115,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypa
     experiment = fake_experiment("total_steps=768")
     folder = run_killed_after(experiment, 2, monkeypatch)
     rows = read_rows(folder / "episodes.csv")
-    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    checkpoint = latest_checkpoint(folder / "checkpoints")
     assert checkpoint.timesteps == 256
     late = [row for row in rows if row["timesteps"] > 256]
     assert late  # steps after the checkpoint, whose rows must not be counted twice
@@ -146,7 +145,7 @@ def test_a_killed_sac_run_keeps_its_replay_buffer(fake_experiment, monkeypatch):
         "n_envs=1",
     )
     folder = run_killed_after(experiment, 2, monkeypatch)
-    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    checkpoint = latest_checkpoint(folder / "checkpoints")
     envs = checkpoint.load_normalize(
         DummyVecEnv([lambda: make_stack(experiment.arms[1].env, FilterConfig())])
     )
@@ -166,12 +165,12 @@ def test_the_normaliser_goes_on_too(fake_experiment, monkeypatch):
     experiment = fake_experiment("total_steps=768", "normalize.reward=true")
     folder = run_killed_after(experiment, 1, monkeypatch)
     envs = DummyVecEnv([lambda: make_stack(experiment.arms[1].env, FilterConfig())] * 2)
-    seen = latest_checkpoint(folder / "checkpoints", pytest.fail).load_normalize(envs)
+    seen = latest_checkpoint(folder / "checkpoints").load_normalize(envs)
     assert isinstance(seen, VecNormalize)
     assert seen.norm_reward
     assert seen.obs_rms.count == pytest.approx(128, abs=3)
     run(experiment)
-    seen = latest_checkpoint(folder / "checkpoints", pytest.fail).load_normalize(envs)
+    seen = latest_checkpoint(folder / "checkpoints").load_normalize(envs)
     assert seen.obs_rms.count == pytest.approx(768, abs=6)
 
 
@@ -262,7 +261,7 @@ def test_a_raised_total_of_an_unfinished_sac_run_moves_its_buffer_into_a_larger_
     fake_experiment, monkeypatch
 ):
     folder = run_killed_after(fake_experiment(*SAC, "total_steps=330"), 2, monkeypatch)
-    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    checkpoint = latest_checkpoint(folder / "checkpoints")
     envs = checkpoint.load_normalize(DummyVecEnv([lambda: make_stack(fake_experiment().arms[0].env, OFF)]))
     kept = checkpoint.load_model("SAC", envs, "cpu").replay_buffer
     moved = checkpoint.load_model("SAC", envs, "cpu", buffer_size=400).replay_buffer
@@ -416,7 +415,7 @@ def test_a_protected_run_on_the_real_task(fake_experiment):
 def test_hyperparameters_and_device_reach_the_model(fake_experiment):
     experiment = fake_experiment("hyperparameters.gamma=0.9", "hyperparameters.policy_kwargs={net_arch: [7]}")
     folder = run(experiment)
-    model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model("PPO", None, "cpu")
+    model = load_model(latest_checkpoint(folder / "checkpoints").folder, "PPO", "cpu")
     assert (model.gamma, model.n_steps, model.device.type) == (0.9, 64, "cpu")
     assert model.policy.mlp_extractor.latent_dim_pi == 7
     assert np.isfinite(model.predict(np.zeros(2))[0]).all()

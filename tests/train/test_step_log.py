@@ -81,16 +81,6 @@ def test_a_filter_that_names_nothing_has_numbered_constraints():
     assert list(log.constraint_names) == ["constraint 1", "constraint 2"]
 
 
-def test_what_another_version_kept_is_not_read(tmp_path):
-    save_steps(tmp_path / "steps.npz", steps())
-    with np.load(tmp_path / "steps.npz") as arrays:
-        kept = {name: arrays[name] for name in arrays.files if name != "margin"}
-    assert load_steps(tmp_path / "steps.npz") is not None
-    np.savez(tmp_path / "steps.npz", **kept)
-    assert load_steps(tmp_path / "steps.npz") is None
-    assert load_steps(tmp_path / "nothing.npz") is None
-
-
 def test_seeds_are_pooled_and_different_tasks_are_not():
     one, two = steps(10), steps(20, left_out=5)
     both = pool([one, two])

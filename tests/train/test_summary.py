@@ -4,18 +4,18 @@ import json
 import numpy as np
 import pytest
 
-from safe_wrappers.train.evaluation.curves import learning_curve
 from safe_wrappers.train.evaluation.evaluate import EVALUATION_COLUMNS
 from safe_wrappers.train.evaluation.summary import (
     Estimate,
     estimate,
     interquartile_mean,
+    learning_curve,
     number,
     summarize,
     write_summary,
 )
+from safe_wrappers.train.files import write_rows
 from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
-from safe_wrappers.train.tables import write_rows
 
 
 def episode(**values):

@@ -8,13 +8,12 @@ import safe_wrappers as sw
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig, parse_experiment
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
-from safe_wrappers.train.report.origin import about
+from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.policy import TrainedPolicy
-from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.stack import make_stack, make_vec_env
 from safe_wrappers.train.run.training import finished_checkpoint
-from safe_wrappers.train.run.vec_envs import make_vec_env
-from safe_wrappers.train.tables import read_rows
 
 SILENT = Progress(lambda steps: None, pytest.fail)
 PROTECTED = FilterConfig(protect={})

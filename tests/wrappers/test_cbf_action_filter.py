@@ -177,7 +177,6 @@ def test_a_wrong_shape_is_refused_and_the_env_not_stepped(action):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"solver": "gurobbi"}, UnknownNameError, "'gurobbi' is not installed; installed: .*clarabel.*daqp"),
         ({"fallback": "stop"}, UnknownNameError, "no fallback 'stop'; choose brake, hold, zero"),
         ({"margin": -0.1}, ConfigurationError, "margin must be a finite number >= 0 .* got -0.1"),
         ({"margin": np.nan}, ConfigurationError, "margin must be a finite number"),

@@ -59,7 +59,6 @@ def test_it_is_these_constraints():
         ({"bodies": ["hand"]}, UnknownNameError, "no body 'hand'"),
         ({"bodies": "foot"}, ConfigurationError, "list of names"),
         ({"fallback": "sleep"}, UnknownNameError, "sleep"),
-        ({"solver": "none"}, sw.SafeWrappersError, "none"),
         ({"plant": sw.MujocoPlant}, ConfigurationError, "plant"),
     ],
 )

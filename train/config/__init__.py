@@ -1,17 +1,20 @@
 """An experiment's settings: a YAML file and overrides, checked and turned into frozen dataclasses."""
 
-from .experiment import parse_experiment
-from .file import read_config
-from .learner import NAIVE, LearnerConfig
+from .load import parse_experiment, read_config, set_value
 from .models import (
+    NAIVE,
     ArmConfig,
     EnvConfig,
     EvaluationConfig,
     ExperimentConfig,
     FilterConfig,
+    LearnerConfig,
     NormalizeConfig,
+    ParameterConfig,
+    SweepConfig,
+    check_env_id,
+    stored_arm,
 )
-from .sweep import ParameterConfig, SweepConfig
 
 __all__ = [
     "NAIVE",
@@ -24,6 +27,9 @@ __all__ = [
     "NormalizeConfig",
     "ParameterConfig",
     "SweepConfig",
+    "check_env_id",
     "parse_experiment",
     "read_config",
+    "set_value",
+    "stored_arm",
 ]

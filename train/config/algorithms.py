@@ -1,14 +1,17 @@
-"""Which algorithms a config can name. Each is imported when it is used: torch takes seconds."""
+"""Which algorithms a config can name, and their hyperparameters. Imported when used: torch takes seconds."""
 
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from pydantic import Field, StrictBool
 
 from safe_wrappers.errors import ConfigurationError
 
-from .names import check_name
+from .types import Count, Integer, NonNegative, Number, check_name, matching, validate
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -30,11 +33,27 @@ RECURRENT: Final = ("RecurrentPPO",)
 """Their policies have a memory, which is carried from step to step of an episode."""
 DETERMINISTIC: Final = ("TD3", "DDPG")
 """Of `OFF_POLICY` those whose policy tries nothing out by itself."""
-
-_NOT_OFFERED: Final = {
-    "ARS": "it shows no steps to callbacks, and the episodes and interventions of a run are counted there",
+HER: Final = "HerReplayBuffer"
+LINEAR: Final = "linear_"
+SCHEDULED: Final = ("learning_rate", "clip_range", "clip_range_vf")
+"""What may fall in the course of a run: a number, or a text such as `linear_3e-4`."""
+# What the run itself decides; the rest of the constructor's arguments are hyperparameters.
+_NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tensorboard_log"} | {
+    "_init_setup_model",
+    "stats_window_size",
 }
-"""Algorithms of sb3-contrib that do not work with the rest of a run, and why."""
+_OF_DEFAULT: Final[Mapping[type, Any]] = {bool: StrictBool, int: Integer, float: Number}
+_TYPES: Final[Mapping[str, Any]] = {
+    "learning_rate": Annotated[Number, Field(gt=0)],
+    "action_noise": Literal["none"] | dict[Literal["normal", "ornstein_uhlenbeck"], Number] | None,
+    "replay_buffer_class": Literal["HerReplayBuffer"],
+    "train_freq": Any,  # may be [4, "episode"]
+    **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "buffer_size"), Count),
+    **dict.fromkeys(("learning_starts", "sde_sample_freq"), NonNegative),
+}
+"""Of those whose default does not tell."""
+_FALLS: Final = "a number, or linear_<number> for one that falls to 0 over total_steps, such as linear_3e-4"
+_LINEAR_NUMBER: Final = Annotated[str, matching(LINEAR + r"(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,2})?", _FALLS)]
 
 
 class _Algorithms(Mapping[str, "type[BaseAlgorithm]"]):
@@ -49,7 +68,7 @@ class _Algorithms(Mapping[str, "type[BaseAlgorithm]"]):
                 raise
             raise ConfigurationError(
                 f"algorithm: {name} is one of sb3-contrib's, which is not installed: pip install"
-                " 'sb3-contrib>=2.6,<3' (the extra `contrib` of safe-wrappers)."
+                " 'safe-wrappers[contrib]'"
             ) from None
         return algorithm
 
@@ -64,15 +83,23 @@ ALGORITHMS: Final[Mapping[str, type[BaseAlgorithm]]] = _Algorithms()
 """Name -> class, Stable-Baselines3's and sb3-contrib's. `ConfigurationError` where the package is missing."""
 
 
-def check_algorithm(name: str) -> str:
-    """Returns the name if a config may use it.
+def check_hyperparameters(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the hyperparameters with the types that the algorithm's constructor takes.
 
     Raises:
-        ConfigurationError: It exists, but does not work with the rest of a run.
-        UnknownNameError: It does not exist.
+        ConfigurationError: Unknown names, values of the wrong type or outside their range.
     """
-    if name in _NOT_OFFERED:
-        raise ConfigurationError(
-            f"{name} is not offered: {_NOT_OFFERED[name]}. Valid names: {', '.join(sorted(ALGORITHMS))}."
-        )
-    return check_name(name, ALGORITHMS)
+    signature = inspect.signature(ALGORITHMS[algorithm])
+    parameters = {k: v for k, v in signature.parameters.items() if k not in _NOT_HYPERPARAMETERS}
+    checked = {}
+    for key, value in given.items():
+        check_name(key, parameters, f"hyperparameters of {algorithm}")
+        kind = _TYPES.get(key, _OF_DEFAULT.get(type(parameters[key].default), Any))
+        falls = key in SCHEDULED and isinstance(value, str)
+        checked[key] = validate(_LINEAR_NUMBER if falls else kind, value, f"hyperparameters.{key}")
+    return checked
+
+
+def default_of(algorithm: str, argument: str) -> Any:
+    """The default of an argument of the algorithm's constructor."""
+    return inspect.signature(ALGORITHMS[algorithm]).parameters[argument].default

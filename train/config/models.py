@@ -5,32 +5,160 @@ The tables of `docs/config.md` are made of them.
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, model_validator
+import gymnasium as gym
+from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictInt, model_validator
 from pydantic.dataclasses import dataclass
 
+from safe_wrappers import LeaseExpiry, OcclusionPenalty, StuckEscape
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
-from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
-from safe_wrappers.wrappers.replaced_actions import StuckEscape
+from safe_wrappers.wrappers.faults import FAULTS
 
-from .algorithm_settings import HER
-from .algorithms import check_algorithm
-from .arguments import arguments, check_faults, check_lease, with_keys
-from .env_ids import check_env_id
-from .learner import NAIVE, LearnerConfig
-from .learner import MarginCurriculumConfig as MarginCurriculumConfig  # for the docs: all sections are here
-from .names import check_name
-from .section import Section
-from .sweep import ParameterConfig as ParameterConfig
-from .sweep import SweepConfig
-from .types import Count, FolderName, FunctionName, NonNegative
+from .algorithms import ALGORITHMS, HER
+from .types import (
+    Count,
+    FolderName,
+    FunctionName,
+    NonNegative,
+    Number,
+    Options,
+    Section,
+    arguments,
+    check_name,
+    validate,
+    with_keys,
+)
 
-Options = dict[str, Any]
+
+def check_env_id(env_id: str) -> str:
+    """Returns the id; refuses one that no installed package registers.
+
+    Imports gymnasium-robotics if it may be one of its ids. An id of the form `module:Id-v0` is left to
+    `gymnasium.make`, which imports the module.
+
+    Raises:
+        UnknownNameError: An id that nobody registers; holds the nearest one.
+    """
+    if ":" in env_id or _registered(env_id):
+        return env_id
+    if importlib.util.find_spec("gymnasium_robotics") is not None:
+        gym.register_envs(importlib.import_module("gymnasium_robotics"))  # its import registers them
+    return env_id if _registered(env_id) else check_name(env_id, gym.registry)
+
+
+def _registered(env_id: str) -> bool:
+    try:
+        gym.spec(env_id)
+    except gym.error.Error:
+        return False
+    return True
+
+
+def _check_algorithm(name: str) -> str:
+    return check_name(name, ALGORITHMS)
+
+
+def _check_faults(given: dict[str, Options]) -> dict[str, Options]:
+    for fault in given:
+        check_name(fault, FAULTS)
+        for name in given[fault]:
+            check_name(name, arguments(FAULTS[fault]), fault)
+    return given
+
+
+@dataclass(frozen=True)
+class MarginCurriculumConfig(Section):
+    """How the margin of an arm's filter changes in training, in hundredths of the way."""
+
+    start: Annotated[Number, Field(ge=0)]
+    """Added margin at the first step, in the constraints' own unit; never below 0, so that constraints keep at least
+    their own."""
+    end: Annotated[Number, Field(ge=0)] = 0.0
+    """Added margin from `until` on; linear between."""
+    until: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    """Share of `total_steps`."""
+
+
+@dataclass(frozen=True)
+class LearnerConfig(Section):
+    """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
+
+    text_is: ClassVar[str] = "kind"
+    _PENALISED: ClassVar = ("adaption_penalty", "both")
+    _PENALTIES: ClassVar = ("penalty", "per_correction")
+
+    kind: Literal["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"] = "naive"
+    """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ. `safe_set_map` is a
+    [SafeActionMap](wrappers/learner.md#safeactionmap) around the filter, in training and evaluation."""
+    penalty: Annotated[Number, Field(ge=0)] = 0.0
+    """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
+    per_correction: Annotated[Number, Field(ge=0)] = 0.0
+    """For the same: taken off per unit of correction."""
+    margin_curriculum: MarginCurriculumConfig | None = None
+    """A margin that the arm's filter adds in training and that changes; see [its
+    keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
+    cost_limit: Annotated[Number, Field(ge=0)] | None = None
+    """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-margin-that-changes-and-a-price-on-cost)
+    puts a price on cost, in training; with PPO this is PPO-Lagrangian. For any algorithm and arm, also without a
+    filter."""
+    multiplier_rate: Annotated[Number, Field(gt=0)] = 1e-3
+    """Of that multiplier: by how much it rises after an episode, for each unit of cost above the limit."""
+
+    @model_validator(mode="after")
+    def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
+        given = bool(self.penalty or self.per_correction)
+        if self.penalised and not given:
+            raise ConfigurationError(
+                f"{self.kind} needs a penalty in units of the task's reward, per changed step or by the size of the"
+                f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction."
+            )
+        if given and not self.penalised:
+            raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
+        if self.multiplier_rate != LearnerConfig.multiplier_rate and self.cost_limit is None:
+            raise ConfigurationError(
+                "multiplier_rate belongs to cost_limit: {cost_limit: 25, multiplier_rate: 0.001}."
+            )
+        return self
+
+    @property
+    def penalties(self) -> dict[str, float]:
+        """The arguments of the AdaptionPenalty."""
+        return {name: getattr(self, name) for name in self._PENALTIES}
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the reward is reduced where the action was changed."""
+        return self.kind in self._PENALISED
+
+    @property
+    def of_filter(self) -> bool:
+        """Whether it needs a filter: all but a price on cost does."""
+        return replace(self, cost_limit=None, multiplier_rate=NAIVE.multiplier_rate) != NAIVE
+
+    @property
+    def maps(self) -> bool:
+        """Whether the policy's actions are mapped onto the admitted ones."""
+        return self.kind == "safe_set_map"
+
+    @property
+    def in_evaluation(self) -> LearnerConfig:
+        """What is left of it in evaluation: a map, which is part of the policy's interface, and nothing else."""
+        return self if self.maps else NAIVE
+
+    @property
+    def stores_executed(self) -> bool:
+        """Whether the replay buffer holds executed actions."""
+        return self.kind in ("safe_action", "both")
+
+
+NAIVE: Final = LearnerConfig()
 
 
 @dataclass(frozen=True)
@@ -43,10 +171,10 @@ class FilterConfig(Section):
     """`module:function`: called with the env, returns it filtered."""
     kwargs: Options = Field(default_factory=dict)
     """Further arguments of the factory."""
-    lease: Annotated[Options | None, AfterValidator(check_lease)] = None
-    """Arguments of a [LeaseExpiry](wrappers/lease-expiry.md) around the filter."""
+    lease: Annotated[Options | None, with_keys(arguments(LeaseExpiry, "plant", "measured"))] = None
+    """Arguments of a [LeaseExpiry](wrappers/late-commands.md#leaseexpiry) around the filter."""
     escape: Annotated[Options | None, with_keys(arguments(StuckEscape))] = None
-    """Arguments of a [StuckEscape](wrappers/stuck-escape.md) around the filter."""
+    """Arguments of a [StuckEscape](wrappers/learner.md#stuckescape) around the filter."""
 
     @model_validator(mode="before")
     @classmethod
@@ -76,19 +204,13 @@ class FilterConfig(Section):
             return "protect"
         return "none" if self.factory is None else "factory"
 
-    def plain(self) -> dict[str, Any]:
-        """As run folders have it."""
-        arguments = self.kwargs if self.protect is None else self.protect
-        found = {"kind": self.kind, "kwargs": arguments, "factory": self.factory or "", "lease": self.lease}
-        return found if self.escape is None else {**found, "escape": self.escape}
-
 
 def _of_all_arms(given: Any) -> Any:
     """`constraints`, those of the evaluation's filter, the same for all arms."""
-    if isinstance(given, FilterConfig | None):
-        return given
-    check_name(given, ("constraints",))
-    return FilterConfig()  # whose constraints they are is known when all arms are
+    if isinstance(given, str):
+        check_name(given, ("constraints",))
+        return FilterConfig()  # whose constraints they are is known when all arms are
+    return given
 
 
 @dataclass(frozen=True)
@@ -103,19 +225,20 @@ class EnvConfig(Section):
     register the id."""
     kwargs: Options = Field(default_factory=dict)
     """Passed to `gymnasium.make`."""
-    faults: Annotated[dict[str, Options], AfterValidator(check_faults)] = Field(default_factory=dict)
-    """[Faults](wrappers/faults.md) between policy and robot, in training and evaluation: a wrapper's name and its
-    arguments, the innermost first."""
+    faults: Annotated[dict[str, Options], AfterValidator(_check_faults)] = Field(default_factory=dict)
+    """[Faults](wrappers/recording.md#faults) between policy and robot, in training and evaluation: a wrapper's
+    name and its arguments, the innermost first."""
     occlusion: Annotated[Options | None, with_keys(arguments(OcclusionPenalty))] = None
     """Arguments of an [OcclusionPenalty](wrappers/occlusion-penalty.md) around the task, inside the filter."""
     cost: FunctionName | None = None
-    """`module:function` that judges a task without a cost of its own: [CostFunction](wrappers/cost-function.md), in
-    all arms, in training and evaluation."""
+    """`module:function` that judges a task without a cost of its own:
+    [CostFunction](wrappers/recording.md#costfunction), in all arms, in training and evaluation."""
     judge: Annotated[FilterConfig | None, BeforeValidator(_of_all_arms)] = None
     """`constraints`: the evaluation filter's own limits judge such a task, read from its true state, in all arms."""
     observation: Annotated[FilterConfig | None, BeforeValidator(_of_all_arms)] = None
     """`constraints`: policies observe what the filter decides by, in training and evaluation
-    ([FilterObservation](wrappers/filter-observation.md)); without a filter, what the evaluation's filter would."""
+    ([FilterObservation](wrappers/learner.md#filterobservation)); without a filter, what the evaluation's filter
+    would."""
     reset_options: Options = Field(default_factory=dict)
     """Options of every reset in training, such as `{layout: {hazards: []}}` of the goal tasks. Evaluation resets
     without them: every arm is judged on the task itself."""
@@ -159,10 +282,10 @@ class ArmConfig(Section):
     name: FolderName
     env: EnvConfig
     """The env: an id, or the keys of [`env`](#env)."""
-    algorithm: Annotated[str, AfterValidator(check_algorithm)]
+    algorithm: Annotated[str, AfterValidator(_check_algorithm)]
     """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.6,<3'` also `TQC`, `CrossQ`,
     `TRPO`, `RecurrentPPO`, `QRDQN`, `MaskablePPO`. The last two and `DQN` are for discrete actions; filtered, those
-    have an [ActionShield](wrappers/action-shield.md), and `MaskablePPO` learns from its masks."""
+    have an [ActionShield](wrappers/filter.md#actionshield), and `MaskablePPO` learns from its masks."""
     total_steps: Count
     """Steps of all envs together, rounded up to whole rollouts: PPO with its default of `n_steps: 2048` and four
     envs trains 8,192 steps if 4,000 are asked for. Progress and report say how many were trained. May be [raised
@@ -183,7 +306,7 @@ class ArmConfig(Section):
     normalize: NormalizeConfig = NormalizeConfig()
     action_repeat: Count = 1
     """Control steps for which an action of the policy is held, in training and evaluation
-    ([ActionRepeat](wrappers/action-repeat.md)). The filter checks each, and `total_steps` counts the policy's
+    ([ActionRepeat](wrappers/learner.md#actionrepeat)). The filter checks each, and `total_steps` counts the policy's
     actions."""
     n_envs: Count = 1
     """Envs of a run."""
@@ -195,7 +318,7 @@ class ArmConfig(Section):
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Torch's. May be changed later."""
     trackers: list[Literal["wandb", "mlflow"]] = Field(default_factory=list)
-    """[Where curves and films go](cli.md#trackers) beside TensorBoard. May be changed later."""
+    """[Where curves and films go](cli.md#where-everything-lies) beside TensorBoard. May be changed later."""
 
     @property
     def replays_goals(self) -> bool:
@@ -204,28 +327,89 @@ class ArmConfig(Section):
 
     def fingerprint(self) -> dict[str, Any]:
         """What a run folder must agree on to be continued: all that changes what is learned."""
-        values = asdict(self) | {"filter": self.filter.plain()}
-        for harmless in ("name", "checkpoint_every", "device", "vec_env", "trackers"):
-            del values[harmless]
-        without_default_buffer_size(values)
-        # What is as by default is left out: a setting that is added later does not change the folders of today.
-        if self.learner == NAIVE:
-            del values["learner"]
-        else:
-            values["learner"] = self.learner.plain()
-        if self.start_from is None:
-            del values["start_from"]
-        if self.filter.lease is None:
-            del values["filter"]["lease"]
-        if self.action_repeat == 1:
-            del values["action_repeat"]
-        for key in ("judge", "observation"):
-            if (of := getattr(self.env, key)) is not None:
-                values["env"][key] = of.plain()
-        values["env"] = {
-            key: value for key, value in values["env"].items() if value or key in ("id", "kwargs")
-        }
-        return values
+        harmless = ("name", "checkpoint_every", "device", "vec_env", "trackers")
+        return {key: value for key, value in self.plain().items() if key not in harmless}
+
+
+def stored_arm(name: str, fingerprint: Mapping[str, Any]) -> ArmConfig:
+    """The arm of a name whose `ArmConfig.fingerprint` this is; what that leaves out has its default.
+
+    Raises:
+        ConfigurationError: It is no fingerprint, or one of a later version.
+    """
+    arm: ArmConfig = validate(ArmConfig, {**fingerprint, "name": name}, f"arms.{name}")
+    return arm
+
+
+Bound = Number | StrictInt
+
+
+@dataclass(frozen=True)
+class ParameterConfig(Section):
+    """What one setting may be: a range, `{low: 1e-5, high: 1e-3, log: true}`, or `{choices: [...]}`."""
+
+    low: Bound | None = None
+    """Smallest value. Two integers give integers."""
+    high: Bound | None = None
+    """Largest value, itself included."""
+    log: StrictBool = False
+    """Drawn by its logarithm."""
+    step: Annotated[Number, Field(gt=0)] | None = None
+    """Only `low` plus multiples of it."""
+    choices: list[Any] | None = None
+    """Instead of a range: the values that it may have, in YAML of any type."""
+
+    @model_validator(mode="after")
+    def _is_a_range_or_a_list(self) -> ParameterConfig:
+        if self.choices is not None:
+            if (self.low, self.high, self.step, self.log) != (None, None, None, False):
+                raise ConfigurationError("expected low and high, or choices; got both.")
+            if len(self.choices) < 2 or any(self.choices.count(value) > 1 for value in self.choices):
+                raise ConfigurationError(
+                    f"choices: expected two or more different values, got {self.choices}."
+                )
+            return self
+        if self.low is None or self.high is None:
+            raise ConfigurationError("expected low and high ({low: 0.1, high: 0.5}), or choices.")
+        if not self.low < self.high:
+            raise ConfigurationError(
+                f"the range is empty: low is {self.low}, high is {self.high}; low must be below high."
+            )
+        if self.log and (self.low <= 0 or self.step is not None):
+            raise ConfigurationError(
+                f"log needs low above 0 and no step; low is {self.low}, step is {self.step}."
+            )
+        if self.step is not None and self.integer and not float(self.step).is_integer():
+            raise ConfigurationError(
+                f"step: low and high are integers, so that step must be one, got {self.step}."
+            )
+        return self
+
+    @property
+    def integer(self) -> bool:
+        """Whether whole numbers are drawn."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+
+@dataclass(frozen=True)
+class SweepConfig(Section):
+    """What `safe-wrappers sweep` searches; other commands leave it alone."""
+
+    parameters: Annotated[dict[str, ParameterConfig], Field(min_length=1)]
+    """The settings that are searched, by the keys of the command line (`hyperparameters.learning_rate`,
+    `arms.filtered.filter.protect.margin`), each with its range or its choices."""
+    trials: Count = 20
+    """How many are tried. May be raised later: the same command goes on."""
+    at_once: Count = 1
+    """Trials that are drawn together and run at the same time. More use more cores or nodes, and know less of each
+    other. With `seed` it decides what is drawn, on any machine."""
+    arm: str | None = None
+    """The arm that is trained and ranked, after those that it begins with; by default the first one with a filter."""
+    seed: NonNegative = 0
+    """Of the search."""
+    storage: str | None = None
+    """URL of the database that keeps the study, as SQLAlchemy has it (`postgresql://...`, `sqlite:///...`); by
+    default `sweep/study.db` in the experiment's folder."""
 
 
 @dataclass(frozen=True)
@@ -265,15 +449,3 @@ class ExperimentConfig(Section):
         if self.evaluation.filter is not None:
             return self.evaluation.filter
         return next((arm.filter for arm in self.arms if arm.filter.kind != "none"), FilterConfig())
-
-
-def default_buffer_size(total_steps: int) -> int:
-    """Transitions: SB3's default of a million would be saved with every checkpoint, mostly empty."""
-    return min(1_000_000, total_steps)
-
-
-def without_default_buffer_size(fingerprint: dict[str, Any]) -> None:
-    """Takes the default size of the replay buffer out of a fingerprint: it grows with `total_steps`."""
-    hyperparameters = fingerprint.get("hyperparameters", {})
-    if hyperparameters.get("buffer_size") == default_buffer_size(fingerprint.get("total_steps", 0)):
-        del hyperparameters["buffer_size"]

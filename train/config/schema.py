@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 
 from . import models
 from .algorithms import ALGORITHMS
-from .experiment import COMMON_KEYS
+from .load import COMMON_KEYS
 
 _STANDARD: Final = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum"}
 _WHOLE: Final = [{"type": "integer"}, {"type": "string", "pattern": r"^\d[\d_]*$"}]

@@ -3,33 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from ..config import ArmConfig, ExperimentConfig
-from ..tables import read_rows
+from ..files import read_rows
 from .evaluate import evaluation_folder
 
 
-@dataclass(frozen=True)
-class Pair:
-    """A comparison: one arm and condition without the filter, one with it.
-
-    Attributes:
-        bare: Without the filter; the filtered arm itself where the experiment has no arm without one.
-        filtered: With the filter.
-    """
+class Pair(NamedTuple):
+    """A comparison: an arm without the filter (the filtered one itself where there is no other), and one with it."""
 
     bare: ArmConfig
     filtered: ArmConfig
 
-    @property
-    def same_policy(self) -> bool:
-        """The two differ only in the filter at evaluation."""
-        return self.bare == self.filtered
 
-
-@dataclass(frozen=True)
-class ShownEpisode:
+class ShownEpisode(NamedTuple):
     """The evaluation episode that is looked at in every arm and condition, and the worst one beside it on film."""
 
     seed: int

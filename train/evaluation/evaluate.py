@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
+import gymnasium as gym
+
 from safe_wrappers import info as keys
-from safe_wrappers.errors import RunStateError
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
-from ..atomic import write_json
-from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EvaluationConfig, FilterConfig
-from ..processes.job import Progress
-from ..processes.lock import only_writer
-from ..processes.storage import telling_of_storage
+from ..files import only_writer, read_json, write_json, write_rows
+from ..processes import Progress, RunStoppedError
 from ..run.folder import EVALUATION, check_finished
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger
 from ..run.training import finished_checkpoint
-from ..tables import write_rows
 from .scene import Scene, SceneRecorder, save_scenes
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
 
 EVALUATION_COLUMNS: Final = ("episode_seed", *COLUMNS)
 STATE_FILE: Final = "evaluation.json"
-_RECORDING: Final = 1
-"""What is kept of an evaluation; a folder that another version filled is evaluated anew when asked to."""
 
 
 def evaluation_folder(run_folder: Path) -> Path:
@@ -42,7 +38,7 @@ def evaluation_folder(run_folder: Path) -> Path:
 
 
 def evaluated_steps(run_folder: Path, condition: str) -> StepLog | None:
-    """The steps of a run's evaluation; None if it was not evaluated, or by a version that kept none."""
+    """The steps of a run's evaluation; None if it was not evaluated."""
     return load_steps(evaluation_folder(run_folder) / f"{condition}_steps.npz")
 
 
@@ -78,8 +74,8 @@ def evaluate_run(
             it.
     """
     check_finished(arm, folder)
-    with telling_of_storage(folder), only_writer(folder):
-        _evaluate(arm, seed, folder, settings, default_filter, progress)
+    with only_writer(folder):
+        _evaluate(arm, seed, folder, settings, conditions(arm, default_filter), progress)
 
 
 def _evaluate(
@@ -87,81 +83,60 @@ def _evaluate(
     seed: int,
     folder: Path,
     settings: EvaluationConfig,
-    default_filter: FilterConfig,
+    filters: Mapping[str, FilterConfig],
     progress: Progress,
 ) -> None:
     checkpoint = finished_checkpoint(arm, seed, folder)
-    filters = conditions(arm, default_filter)
     out = evaluation_folder(folder)
     state = {
         "settings": {"episodes": settings.episodes, "seed": settings.seed},
         "filter": filters.get("filter_on", FilterConfig()).plain(),
         "timesteps": checkpoint.timesteps,
-        "recording": _RECORDING,
     }
-    if _is_done(out, state):
+    if read_json(out / STATE_FILE) == state:
         return
     (out / STATE_FILE).unlink(missing_ok=True)
     shutil.rmtree(out, ignore_errors=True)  # or after a kill there would be rows of two settings
-    policy = TrainedPolicy(arm, checkpoint)
+    policy = TrainedPolicy(arm, checkpoint.folder)
     logger = run_logger(arm, seed, folder)
     for at, (condition, used) in enumerate(filters.items()):
-        evaluation = _Evaluation(arm, used)
         rows: list[dict[str, Any]] = []
         scenes: dict[int, Scene] = {}
-        for row, scene in evaluation.episodes(policy, settings):
-            rows.append(row)
-            if scene is not None:
-                scenes[int(row["episode_seed"])] = scene
-            for key, value in row.items():
-                if key != "episode_seed":
+        with closing(make_stack(arm.env, used, arm.learner.in_evaluation)) as env:
+            steps = StepRecorder(env)
+            for episode_seed in range(settings.seed, settings.seed + settings.episodes):
+                figures, scene = _episode(env, policy, episode_seed, steps)
+                rows.append({"episode_seed": episode_seed, **figures})
+                if scene is not None:
+                    scenes[episode_seed] = scene
+                for key, value in figures.items():
                     logger.record_mean(f"evaluation_{condition}/{key}", float(value))
-            progress.steps(at * settings.episodes + len(rows))
+                progress.steps(at * settings.episodes + len(rows))
+                if progress.stopping():
+                    raise RunStoppedError("stopped; this evaluation begins again")
+            log = steps.finish()
         logger.dump(checkpoint.timesteps)
         write_rows(out / f"{condition}.csv", EVALUATION_COLUMNS, rows)
         save_scenes(out / f"{condition}.npz", scenes)
-        save_steps(out / f"{condition}_steps.npz", evaluation.steps.finish())
+        save_steps(out / f"{condition}_steps.npz", log)
     logger.close()
-    write_json(out / STATE_FILE, state | {"files": checksums(sorted(out.iterdir()))})
+    write_json(out / STATE_FILE, state)
 
 
-def _is_done(out: Path, state: Mapping[str, Any]) -> bool:
-    """Whether an evaluation like this one is there, whole."""
-    try:
-        found = read_facts(out / STATE_FILE, "")
-    except RunStateError:
-        return False
-    files = found.pop("files", {})
-    return found == state and damage(out, files) is None
-
-
-class _Evaluation:
-    """The episodes of one condition, and the steps recorded on the way."""
-
-    def __init__(self, arm: ArmConfig, used: FilterConfig) -> None:
-        self._env = make_stack(arm.env, used, arm.learner.in_evaluation)
-        self.steps = StepRecorder(self._env)
-
-    def episodes(
-        self, policy: TrainedPolicy, settings: EvaluationConfig
-    ) -> Iterator[tuple[dict[str, Any], Scene | None]]:
-        try:
-            for episode_seed in range(settings.seed, settings.seed + settings.episodes):
-                yield self._episode(policy, episode_seed)
-        finally:
-            self._env.close()
-
-    def _episode(self, policy: TrainedPolicy, episode_seed: int) -> tuple[dict[str, Any], Scene | None]:
-        observation, _ = self._env.reset(seed=episode_seed)
-        policy.begin(self._env)
-        self.steps.begin(episode_seed)
-        scene = SceneRecorder(self._env)
-        done = False
-        while not done:
-            self.steps.before(observation)
-            action = policy(observation)
-            observation, _, terminated, truncated, info = self._env.step(action)
-            self.steps.after(action, info)
-            scene.step(info)
-            done = terminated or truncated
-        return {"episode_seed": episode_seed, **info[keys.EPISODE_SUMMARY]}, scene.finish()
+def _episode(
+    env: gym.Env[Any, Any], policy: TrainedPolicy, episode_seed: int, steps: StepRecorder
+) -> tuple[dict[str, Any], Scene | None]:
+    """Runs an episode, and records its steps; its figures as `RecordInterventions` has them."""
+    observation, _ = env.reset(seed=episode_seed)
+    policy.begin(env)
+    steps.begin(episode_seed)
+    scene = SceneRecorder(env)
+    done = False
+    while not done:
+        steps.before(observation)
+        action = policy(observation)
+        observation, _, terminated, truncated, info = env.step(action)
+        steps.after(action, info)
+        scene.step(info)
+        done = terminated or truncated
+    return info[keys.EPISODE_SUMMARY], scene.finish()

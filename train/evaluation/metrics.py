@@ -1,155 +1,93 @@
-"""The registry of the reported numbers: label, what each counts, its unit, and when it is absent."""
+"""The registry of the reported numbers: label, what each counts, and its unit."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from safe_wrappers.info import COST, EPISODE
 
 
-@dataclass(frozen=True)
-class Metric:
-    """One number of the tables.
-
-    Attributes:
-        label: Its heading.
-        counts: What it counts, in whole sentences.
-        unit: "" for a plain count.
-        absent: When there is none, where no info key that it is made from says so.
-    """
+class Metric(NamedTuple):
+    """One number of the tables: its heading, what it counts, and its unit ("" for a plain count)."""
 
     label: str
     counts: str
     unit: str = ""
-    absent: str = ""
 
 
-_TOTAL: Final = "Over all episodes of the condition."
-_MEAN: Final = "Mean over the condition's episodes."
-_OF_CONDITION: Final = {
-    "return": Metric("Return / episode", f"The task's own reward summed over an episode. {_MEAN}", "reward"),
-    "length": Metric("Steps / episode", f"Control steps of an episode. {_MEAN}", "steps"),
+REGISTRY: Final[dict[str, Metric]] = {
+    "return": Metric("Return / episode", "The task's own reward, summed over an episode", "reward"),
+    "length": Metric("Steps / episode", "Control steps of an episode", "steps"),
     "cost": Metric(
-        "Cost / episode",
-        f"The task's cost at the ends of control steps, summed over an episode. {_MEAN}",
-        "cost",
+        "Cost / episode", "The task's cost at the ends of control steps, summed over an episode", "cost"
     ),
     "cost_substep": Metric(
         "Cost in substeps / episode",
-        f"Steps of an episode with a cost at any physics substep, also between their ends. {_MEAN}",
+        "Steps of an episode with a cost at any physics substep, also between their ends",
         "steps",
     ),
     "violations": Metric(
         "Steps in violation, total",
-        "Control steps in which the task itself reports a cost, at their end or at any physics substep. The"
-        f" filter's opinion does not count. {_TOTAL}",
+        "Control steps in which the task itself reports a cost, at their end or at any physics substep; the"
+        " filter's opinion does not count",
         "steps",
     ),
-    "violations_per_1000": Metric(
-        "Steps in violation / 1000", "Steps in violation per 1000 control steps.", "per 1000 steps"
-    ),
+    "violations_per_1000": Metric("Steps in violation / 1000", "Steps in violation", "per 1000 steps"),
     "intervention_rate": Metric(
         "Share of steps changed",
-        f"Steps whose executed action is not the proposed one, per steps of an episode. {_MEAN}",
-        "0 to 1",
+        "Steps whose executed action is not the proposed one, per steps of an episode",
     ),
     "correction_mean": Metric(
         "Correction, mean",
-        "L2 norm of executed minus proposed action, over all steps of an episode, also those left alone."
-        f" {_MEAN}",
+        "L2 norm of executed minus proposed action, over all steps of an episode, also those left alone",
         "action units",
     ),
     "correction_p95": Metric(
-        "Correction, 95th pct.",
-        f"The size of correction that 95 % of an episode's steps stay below. {_MEAN}",
-        "action units",
+        "Correction, 95th pct.", "The correction that 95 % of an episode's steps stay below", "action units"
     ),
     "infeasible": Metric(
         "Infeasible steps, total",
-        f"Steps at which no admissible action satisfied every constraint of the filter. {_TOTAL}",
+        "Steps at which no admissible action satisfied every constraint of the filter",
         "steps",
     ),
-    "infeasible_per_1000": Metric(
-        "Infeasible steps / 1000", "Infeasible steps per 1000 control steps.", "per 1000 steps"
-    ),
+    "infeasible_per_1000": Metric("Infeasible steps / 1000", "Infeasible steps", "per 1000 steps"),
     "fallback": Metric(
-        "Fallback steps, total",
-        f"Steps at which the filter's last resort chose the action. {_TOTAL}",
-        "steps",
+        "Fallback steps, total", "Steps at which the filter's last resort chose the action", "steps"
     ),
     "unsafe": Metric(
-        "Steps begun with h < 0, total",
-        f"Steps that began outside of the filter's own safe set. {_TOTAL}",
-        "steps",
+        "Steps begun with h < 0, total", "Steps that began outside of the filter's own safe set", "steps"
     ),
     "stuck": Metric(
         "Stuck steps, total",
-        f"Steps at which the filter had changed most of the last actions, and the reward stood still. {_TOTAL}",
+        "Steps at which the filter had changed most of the last actions, and the reward stood still",
         "steps",
     ),
     "lease_braking": Metric(
         "Steps braked by the lease, total",
-        f"Steps at which the fallback acted because the lease had run out. {_TOTAL}",
+        "Steps at which the fallback acted because the lease had run out",
         "steps",
     ),
     "lease_expired": Metric(
-        "Leases run out, total", f"Leases that ran out before the next action came. {_TOTAL}", "leases"
+        "Leases run out, total", "Leases that ran out before the next action came", "leases"
     ),
-    "goals_reached": Metric("Goals / episode", f"Goals reached in an episode. {_MEAN}", "goals"),
+    "goals_reached": Metric("Goals / episode", "Goals reached in an episode", "goals"),
     "spin_outs": Metric(
-        "Steps in spin-out, total",
-        f"Steps in which a loaded wheel spun or locked (slip above 0.5). {_TOTAL}",
-        "steps",
+        "Steps in spin-out, total", "Steps in which a loaded wheel spun or locked (slip above 0.5)", "steps"
     ),
-    "spin_outs_per_million": Metric(
-        "Steps in spin-out / million", "Steps in spin-out per million control steps.", "per million steps"
-    ),
-    "collisions": Metric("Collisions, total", f"Collisions begun. {_TOTAL}", "collisions"),
-    "collisions_per_million": Metric(
-        "Collisions / million steps", "Collisions begun per million control steps.", "per million steps"
-    ),
+    "spin_outs_per_million": Metric("Steps in spin-out / million", "Steps in spin-out", "per million steps"),
+    "collisions": Metric("Collisions, total", "Collisions begun", "collisions"),
+    "collisions_per_million": Metric("Collisions / million steps", "Collisions begun", "per million steps"),
     "seen": Metric(
         "Share of time that a track is seen",
-        f"Share of steps and tracks with a measurement at the end of the step. {_MEAN}",
-        "0 to 1",
+        "Share of steps and tracks with a measurement at the end of the step",
     ),
     "expiries": Metric(
         "Permissions to rely on a track run out, total",
-        f"Times that a track's uncertainty grew beyond its tolerance. {_TOTAL}",
+        "Times that a track's uncertainty grew beyond its tolerance",
     ),
-    "expiries_per_1000": Metric(
-        "Permissions run out / 1000 steps", "Permissions run out per 1000 control steps.", "per 1000 steps"
-    ),
+    "expiries_per_1000": Metric("Permissions run out / 1000 steps", "Permissions run out", "per 1000 steps"),
 }
-_OF_A_RUN: Final = {
-    "arm": Metric("Arm", "The arm's name in the config."),
-    "seed": Metric("Seed", "The seed of the training run."),
-    "condition": Metric("Condition", "Training, or evaluation with the filter off or on."),
-    "episodes": Metric("Episodes", "Episodes that were finished."),
-    "steps": Metric("Steps", "Control steps of the finished episodes; one that was cut off is not in."),
-    "elapsed_s": Metric(
-        "Training time",
-        "Wall clock of the training of one run, all its parts if it was stopped in between, on the machine that"
-        " ran it and beside what else ran there.",
-        "h:mm:ss",
-        "The run is not finished.",
-    ),
-    "steps_per_s": Metric(
-        "Steps/s",
-        "The policy's steps per second of training time; with an action repeat each is several control steps.",
-        absent="The run is not finished.",
-    ),
-    "filter_time_us": Metric(
-        "Filter call in µs",
-        "Mean time of a filter call in training, on the machine that ran it.",
-        "microseconds",
-        "No filter is on, or the run is not finished.",
-    ),
-}
-REGISTRY: Final[dict[str, Metric]] = _OF_A_RUN | _OF_CONDITION
-"""Column or metric -> what it is."""
-METRICS: Final = {name: metric.label for name, metric in _OF_CONDITION.items()}
+METRICS: Final = {name: metric.label for name, metric in REGISTRY.items()}
 """What is reported of a condition. Totals and rates are over its episodes; all else is the mean over its episodes of
 the episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
 TOTALS: Final = tuple(figure.name for figure in EPISODE if figure.how in ("count", "onsets"))
@@ -164,15 +102,10 @@ RATES: Final = {
 whatever the episodes."""
 
 
-def _made_from(*names: str) -> tuple[str, ...]:
-    """The metrics that are made from info keys whose names begin with one of these."""
-    return tuple(metric for metric in METRICS if (of := sources(metric)) and of[0].startswith(names))
-
-
-def sources(metric: str) -> tuple[str, ...]:
-    """The info keys that a metric is made from; none for what needs no key."""
-    figures = {figure.name: figure.of for figure in EPISODE}
-    return figures.get(RATES.get(metric, (metric,))[0], ())
+def _made_from(prefix: str) -> tuple[str, ...]:
+    """The metrics that are made from info keys that begin so."""
+    of = {figure.name: figure.of[0] for figure in EPISODE}
+    return tuple(m for m in METRICS if of.get(RATES.get(m, (m,))[0], "").startswith(prefix))
 
 
 OF_THE_FILTER: Final = _made_from("cbf/")
@@ -182,17 +115,3 @@ OF_THE_LEASE: Final = _made_from("lease/")
 OF_THE_JUDGE: Final = _made_from(COST)
 """Left out where nobody judged: a zero there would be a lie."""
 NOT_JUDGED: Final = "not judged"
-
-
-def absent(metric: str) -> str:
-    """When there is no such number, as a sentence; "" for one that is always there."""
-    if not sources(metric):
-        return REGISTRY[metric].absent
-    keys = " or ".join(f"`{key}`" for key in sources(metric))
-    if metric in OF_THE_JUDGE:
-        return f"The task reports no {keys}: it is “{NOT_JUDGED}”."
-    why = {OF_THE_FILTER: "No filter is on", OF_THE_LEASE: "There is no lease"}
-    for group, reason in why.items():
-        if metric in group:
-            return f"{reason}: nothing reports {keys}."
-    return f"Nothing reports {keys}."

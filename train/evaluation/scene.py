@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array
 
-from ..atomic import write_bytes
+from ..files import write_bytes
 from .step_log import is_violation
-
-_STATIC = ("hazard_positions", "hazard_radius", "goal_radius", "vase_positions")
 
 
 @dataclass(frozen=True)
@@ -33,11 +31,11 @@ class Scene:
     goals: Array
     """(n, 2): each place that the goal was at."""
     hazards: Array
+    """(n, 2): at the episode's start, as the vases."""
+    vases: Array
     """(n, 2)."""
     hazard_radius: float
     goal_radius: float
-    vases: Array
-    """(n, 2): at the episode's start."""
 
 
 class SceneRecorder:
@@ -45,67 +43,54 @@ class SceneRecorder:
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._task = env.unwrapped
-        self._static = {name: np.array(getattr(self._task, name, []), dtype=float) for name in _STATIC}
-        self._agent = [self._place("agent_position")]
-        self._goals = [self._place("goal_position")]
-        self._intervened: list[bool] = []
-        self._violated: list[bool] = []
+        self._hazards, self._vases = self._places("hazard_positions"), self._places("vase_positions")
+        self._agent = [self._places("agent_position")]
+        self._goals = [self._places("goal_position")]
+        self._flags: list[tuple[bool, bool]] = []
 
     def step(self, info: dict[str, Any]) -> None:
         """Takes down the state after a step."""
-        self._agent.append(self._place("agent_position"))
-        goal = self._place("goal_position")
+        self._agent.append(self._places("agent_position"))
+        goal = self._places("goal_position")
         if not np.array_equal(goal, self._goals[-1]):
             self._goals.append(goal)
-        self._intervened.append(bool(info.get(keys.CBF_INTERVENED, False)))
-        self._violated.append(is_violation(info))
+        self._flags.append((bool(info.get(keys.CBF_INTERVENED, False)), is_violation(info)))
 
     def finish(self) -> Scene | None:
         """The episode's scene."""
         if not self._agent[0].size:
             return None
-        return Scene(
-            agent=np.array(self._agent),
-            intervened=np.array(self._intervened, dtype=bool),
-            violated=np.array(self._violated, dtype=bool),
-            goals=np.array([goal for goal in self._goals if goal.size]).reshape(-1, 2),
-            hazards=_plane(self._static["hazard_positions"]),
-            hazard_radius=self._radius("hazard_radius"),
-            goal_radius=self._radius("goal_radius"),
-            vases=_plane(self._static["vase_positions"]),
-        )
+        radii = [float(np.max(getattr(self._task, f"{what}_radius", 0.0))) for what in ("hazard", "goal")]
+        intervened, violated = np.array(self._flags, dtype=bool).reshape(-1, 2).T
+        agent, goals = np.concatenate(self._agent), np.concatenate(self._goals)
+        return Scene(agent, intervened, violated, goals, self._hazards, self._vases, *radii)
 
-    def _radius(self, name: str) -> float:
-        return float(self._static[name].max()) if self._static[name].size else 0.0
-
-    def _place(self, name: str) -> Array:
-        # The task may hand out a view of its own state, which the next step overwrites.
-        return np.array(getattr(self._task, name, []), dtype=float).reshape(-1)[:2]
+    def _places(self, name: str) -> Array:
+        """Shape (n, 2); a copy, since the task may hand out a view of its own state."""
+        places = np.array(getattr(self._task, name, []), dtype=float)
+        return np.atleast_2d(places)[:, :2] if places.size else np.zeros((0, 2))
 
 
 def save_scenes(path: Path, scenes: dict[int, Scene]) -> None:
     """Writes scenes by episode seed, atomically."""
-    arrays = {
-        f"{seed}/{name}": value for seed, scene in scenes.items() for name, value in vars(scene).items()
-    }
     data = io.BytesIO()
-    np.savez_compressed(data, **arrays)
+    np.savez_compressed(
+        data,
+        **{f"{seed}/{name}": value for seed, scene in scenes.items() for name, value in vars(scene).items()},
+    )
     write_bytes(path, data.getvalue())
 
 
-def load_scenes(path: Path) -> dict[int, Scene]:
-    """Reads scenes by episode seed; empty when there are none."""
+def load_scene(path: Path, episode_seed: int) -> Scene | None:
+    """An episode's scene; None where there is none."""
     if not path.exists():
-        return {}
-    fields: dict[int, dict[str, Any]] = {}
+        return None
     with np.load(path) as arrays:
-        for key in arrays.files:
-            seed, _, name = key.partition("/")
-            fields.setdefault(int(seed), {})[name] = arrays[key]
-    for values in fields.values():
-        values |= {name: float(values[name]) for name in ("hazard_radius", "goal_radius")}
-    return {seed: Scene(**values) for seed, values in fields.items()}
-
-
-def _plane(points: Array) -> Array:
-    return points.reshape(len(points), -1)[:, :2] if points.size else np.zeros((0, 2))
+        prefix = f"{episode_seed}/"
+        values: dict[str, Any] = {
+            key.removeprefix(prefix): arrays[key] for key in arrays.files if key.startswith(prefix)
+        }
+    if not values:
+        return None
+    radii = {name: float(values[name]) for name in ("hazard_radius", "goal_radius")}
+    return Scene(**(values | radii))

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import Array
 
-from ..atomic import write_bytes
-from .coordinates import CoordinateReader
+from ..files import write_bytes
 
 MOST_STEPS: Final = 10_000
 """Steps kept of one run under one condition: the first ones. Ten episodes of 1000 steps; 0.1 to 4 MB."""
@@ -64,16 +66,80 @@ class StepLog:
         return len(self.step)
 
 
-_PER_STEP: Final = tuple(
-    field.name
-    for field in fields(StepLog)
-    if field.name not in ("constraint_names", "coordinate_names", "left_out", "filter_time_us")
-)
+_NOT_PER_STEP: Final = ("constraint_names", "coordinate_names", "left_out", "filter_time_us")
+_PER_STEP: Final = tuple(field.name for field in fields(StepLog) if field.name not in _NOT_PER_STEP)
 
 
 def is_violation(info: Mapping[str, Any]) -> bool:
     """Whether a step's info has a cost, at the step's end or at any substep."""
     return bool(info.get(keys.COST, 0) > 0 or info.get(keys.COST_SUBSTEP, 0) > 0)
+
+
+def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], Array]]:
+    """A few named numbers that say where in state space a task is.
+
+    - A task that publishes `agent_position` (seen from above): its place, and where the nearest hazard is, ahead and
+      to the left if it publishes `agent_heading`, else its distance;
+    - any other MuJoCo env: every joint's position and speed by name, angles of hinges without limits in [-pi, pi];
+    - any other env: its observation, if that is a flat Box.
+
+    Args:
+        env: The task in its wrappers, reset.
+
+    Returns:
+        Names with units, and a function of the last observation that reads them, shape (names,).
+    """
+    task: Any = env.unwrapped
+    if np.size(getattr(task, "agent_position", ())) >= 2:
+        heading, hazards = hasattr(task, "agent_heading"), np.size(getattr(task, "hazard_positions", ())) > 0
+        sides = ["ahead", "to the left"] if heading else ["distance"]
+        nearest = [f"nearest hazard, {side} (m)" for side in sides] if hazards else []
+        return ["x (m)", "y (m)", *nearest], lambda _: _from_above(task, bool(nearest), heading)
+    if hasattr(task, "model") and hasattr(task, "data"):
+        model = task.model
+        hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+        turning = model.jnt_qposadr[hinge & (model.jnt_limited == 0)]
+
+        def joints(_: Any) -> Array:
+            qpos = np.array(task.data.qpos, dtype=float)
+            qpos[turning] = (qpos[turning] + math.pi) % math.tau - math.pi
+            return np.concatenate([qpos, task.data.qvel])
+
+        return _joint_names(model), joints
+    space = env.observation_space
+    if isinstance(space, gym.spaces.Box) and len(space.shape) == 1:
+        names = [f"observation {at}" for at in range(space.shape[0])]
+        return names, lambda observation: np.array(observation, dtype=float)
+    return [], lambda _: np.zeros(0)
+
+
+def _from_above(task: Any, hazards: bool, heading: bool) -> Array:
+    at = np.array(task.agent_position, dtype=float)[:2]
+    if not hazards:
+        return at
+    ways = np.atleast_2d(np.array(task.hazard_positions, dtype=float))[:, :2] - at
+    way = ways[np.argmin(np.linalg.norm(ways, axis=1))]
+    if not heading:
+        return np.array([*at, np.linalg.norm(way)])
+    ahead = np.array([math.cos(task.agent_heading), math.sin(task.agent_heading)])
+    return np.array([*at, ahead @ way, ahead[0] * way[1] - ahead[1] * way[0]])
+
+
+def _joint_names(model: Any) -> list[str]:
+    """Of positions, then of speeds; those of ball and free joints are numbered."""
+    kinds = mujoco.mjtJoint
+    sizes = {int(kinds.mjJNT_FREE): (7, 6), int(kinds.mjJNT_BALL): (4, 3)}
+    units = {int(kinds.mjJNT_HINGE): (" (rad)", " (rad/s)"), int(kinds.mjJNT_SLIDE): (" (m)", " (m/s)")}
+    names: list[str] = []
+    for at, what in enumerate(("position", "speed")):
+        for j in range(model.njnt):
+            kind = int(model.jnt_type[j])
+            name = f"{model.joint(j).name or f'joint {j}'}, {what}"
+            if kind in units:
+                names.append(name + units[kind][at])
+            else:
+                names += [f"{name} {part}" for part in range(sizes[kind][at])]
+    return names
 
 
 class StepRecorder:
@@ -85,21 +151,18 @@ class StepRecorder:
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env = env
-        named = env.has_wrapper_attr("constraint_names")
-        self._constraints = list(env.get_wrapper_attr("constraint_names")) if named else []
         self._rows: dict[str, list[Any]] = {name: [] for name in _PER_STEP}
         self._left_out = 0
 
     def begin(self, episode_seed: int) -> None:
         """An episode has been reset."""
         # Only now: some tasks do not know where they are before their first reset.
-        self._reader = CoordinateReader(self._env)
-        self._episode_seed = episode_seed
-        self._step = 0
+        self._names, self._read = coordinates_of(self._env)
+        self._episode_seed, self._step = episode_seed, 0
 
     def before(self, observation: Any) -> None:
         """Takes down the state in which the next step begins."""
-        self._coordinates = self._reader.read(observation)
+        self._coordinates = self._read(observation)
 
     def after(self, action: Any, info: dict[str, Any]) -> None:
         """Takes down what the step did.
@@ -112,7 +175,6 @@ class StepRecorder:
         if len(self._rows["step"]) >= MOST_STEPS:
             self._left_out += 1
             return
-        refused = np.asarray(info.get(keys.CBF_REFUSED, np.zeros(0)), dtype=bool)
         values = {
             "episode_seed": self._episode_seed,
             "step": step,
@@ -125,7 +187,7 @@ class StepRecorder:
             "cost": info.get(keys.COST, np.nan),
             "proposed": np.ravel(info.get(keys.PROPOSED_ACTION, action)),
             "executed": np.ravel(info.get(keys.EXECUTED_ACTION, action)),
-            "refused": refused,
+            "refused": np.asarray(info.get(keys.CBF_REFUSED, np.zeros(0)), dtype=bool),
             "coordinates": self._coordinates,
         }
         for name, value in values.items():
@@ -133,20 +195,21 @@ class StepRecorder:
 
     def finish(self) -> StepLog:
         """All steps so far; there must have been one."""
-        kinds = {"episode_seed": np.int64, "step": np.int32} | dict.fromkeys(
-            ("intervened", "infeasible", "fallback", "violated", "refused"), np.bool_
-        )
+        flags = ("intervened", "infeasible", "fallback", "violated", "refused")
+        kinds = {"episode_seed": np.int64, "step": np.int32} | dict.fromkeys(flags, np.bool_)
         columns: dict[str, Any] = {
             name: np.array(values, dtype=kinds.get(name, np.float32)) for name, values in self._rows.items()
         }
-        count = columns["refused"].shape[-1]
-        timed = self._env.has_wrapper_attr("filter_time_us")
-        time_us = self._env.get_wrapper_attr("filter_time_us") if timed else None
-        names = self._constraints if len(self._constraints) == count else _numbered(count)
+        names, time_us = (
+            self._env.get_wrapper_attr(name) if self._env.has_wrapper_attr(name) else None
+            for name in ("constraint_names", "filter_time_us")
+        )
+        if names is None:
+            names = [f"constraint {number + 1}" for number in range(columns["refused"].shape[-1])]
         return StepLog(
             **columns,
             constraint_names=np.array(names, dtype=np.str_),
-            coordinate_names=np.array(self._reader.names, dtype=np.str_),
+            coordinate_names=np.array(self._names, dtype=np.str_),
             left_out=self._left_out,
             filter_time_us=np.nan if time_us is None else float(time_us),
         )
@@ -160,34 +223,24 @@ def save_steps(path: Path, log: StepLog) -> None:
 
 
 def load_steps(path: Path) -> StepLog | None:
-    """Reads the steps back; None where an evaluation of another version kept none, or kept something else."""
+    """Reads the steps back; None where there are none."""
     if not path.exists():
         return None
     with np.load(path) as arrays:
-        if set(arrays.files) != {field.name for field in fields(StepLog)}:
-            return None
-        values = {name: arrays[name] for name in arrays.files}
+        values: dict[str, Any] = {name: arrays[name] for name in arrays.files}
     scalars = {"left_out": int(values["left_out"]), "filter_time_us": float(values["filter_time_us"])}
-    return StepLog(**{**values, **scalars})
+    return StepLog(**(values | scalars))
 
 
 def pool(logs: Sequence[StepLog]) -> StepLog | None:
     """Several runs' steps as one; None without any, or if they are of different tasks or filters."""
-    if not logs:
-        return None
-    first = logs[0]
-    for log in logs[1:]:
-        for names in ("constraint_names", "coordinate_names"):
-            if not np.array_equal(getattr(log, names), getattr(first, names)):
-                return None
+    for names in ("constraint_names", "coordinate_names"):
+        if len({tuple(getattr(log, names)) for log in logs}) != 1:
+            return None
     return StepLog(
         **{name: np.concatenate([getattr(log, name) for log in logs]) for name in _PER_STEP},
-        constraint_names=first.constraint_names,
-        coordinate_names=first.coordinate_names,
+        constraint_names=logs[0].constraint_names,
+        coordinate_names=logs[0].coordinate_names,
         left_out=sum(log.left_out for log in logs),
         filter_time_us=float(np.mean([log.filter_time_us for log in logs])),
     )
-
-
-def _numbered(count: int) -> list[str]:
-    return [f"constraint {number}" for number in range(1, count + 1)]

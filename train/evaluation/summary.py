@@ -1,4 +1,4 @@
-"""An experiment's numbers: a row per arm, seed and condition, and interquartile means with intervals."""
+"""An experiment's numbers: a row per arm, seed and condition, and interquartile means with intervals; its curves."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from ..atomic import write_json
-from ..config import ExperimentConfig, FilterConfig
-from ..tables import read_rows, write_rows
+from safe_wrappers.checks import Array
+
+from ..config import ArmConfig, ExperimentConfig, FilterConfig
+from ..files import read_rows, write_json, write_rows
 from .evaluate import conditions, evaluation_folder
-from .has_cost import evaluated_without_cost
-from .intact import check_results
-from .metrics import METRICS, OF_THE_FILTER, OF_THE_JUDGE, OF_THE_LEASE, RATES, TOTALS
+from .metrics import METRICS, OF_THE_FILTER, OF_THE_LEASE, RATES, TOTALS
 
 CONDITIONS: Final = {
     "training": "Training, all episodes",
@@ -26,6 +25,7 @@ CONDITIONS: Final = {
 }
 SEEDS_FOR_AN_INTERVAL: Final = 3
 """Fewer say nothing about others: their range is given, and called so."""
+_MOST_BINS: Final = 40
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,6 @@ class Estimate:
     low: float | None
     high: float | None
     seeds: int
-
-    @property
-    def spread(self) -> str:
-        """What `low` and `high` are."""
-        return spread(self.seeds)
 
     def __str__(self) -> str:
         if self.low is None or self.high is None:
@@ -117,47 +112,39 @@ def estimate(values: Sequence[float]) -> Estimate:
         return Estimate(iqm, None, None, len(values))
     if len(values) < SEEDS_FOR_AN_INTERVAL or np.ptp(values) == 0:
         return Estimate(iqm, float(np.min(values)), float(np.max(values)), len(values))
+    low, high = _bootstrap(np.asarray(values, dtype=float), 9999)
+    return Estimate(iqm, float(low), float(high), len(values))
+
+
+def _bootstrap(values: Array, resamples: int) -> tuple[Array, Array]:
+    """The percentile interval over the first axis; the same values always give the same one."""
+    generator = np.random.default_rng(0)
     interval = stats.bootstrap(
-        (np.asarray(values, dtype=float),),
-        interquartile_mean,
-        method="percentile",
-        n_resamples=9999,
-        rng=np.random.default_rng(0),  # the same rows always give the same interval
+        (values,), interquartile_mean, axis=0, method="percentile", n_resamples=resamples, rng=generator
     ).confidence_interval
-    return Estimate(iqm, float(interval.low), float(interval.high), len(values))
+    return interval.low, interval.high
 
 
 def summarize(experiment: ExperimentConfig) -> Summary:
     """Reads every run's rows and sums them up.
 
     Raises:
-        RunStateError: A table is not as its run left it.
+        RunStateError: A table is unreadable.
     """
-    check_results(experiment)
     per_seed: list[dict[str, Any]] = []
     table: Table = {}
     for arm in experiment.arms:
         table[arm.name] = {}
         filters = {"training": arm.filter} | conditions(arm, experiment.evaluation_filter)
-        unjudged = OF_THE_JUDGE if evaluated_without_cost(experiment, arm) else ()
         for condition in CONDITIONS:
             used = filters.get(condition, FilterConfig())
-            left_out = (OF_THE_FILTER if used.kind == "none" else ()) + (
-                OF_THE_LEASE if used.lease is None else ()
-            )
-            metrics = [metric for metric in METRICS if metric not in (*left_out, *unjudged)]
-            rows = []
-            for seed in experiment.seeds:
-                episodes = read_rows(episode_file(experiment.run_folder(arm, seed), condition))
-                if episodes:
-                    rows.append(
-                        {
-                            "arm": arm.name,
-                            "seed": seed,
-                            "condition": condition,
-                            **seed_row(episodes, metrics),
-                        }
-                    )
+            left_out = (*OF_THE_FILTER * (used.kind == "none"), *OF_THE_LEASE * (used.lease is None))
+            metrics = [metric for metric in METRICS if metric not in left_out]
+            rows = [
+                {"arm": arm.name, "seed": seed, "condition": condition, **seed_row(episodes, metrics)}
+                for seed in experiment.seeds
+                if (episodes := read_rows(episode_file(experiment.run_folder(arm, seed), condition)))
+            ]
             per_seed += rows
             table[arm.name][condition] = {
                 metric: estimate([row[metric] for row in rows])
@@ -176,30 +163,26 @@ def write_summary(summary: Summary, folder: Path) -> None:
     write_rows(
         folder / "per_seed.csv", ("arm", "seed", "condition", "episodes", "steps", *METRICS), summary.per_seed
     )
+    plain = {
+        arm: {
+            condition: {
+                metric: asdict(result) | {"spread": spread(result.seeds)}
+                for metric, result in metrics.items()
+            }
+            for condition, metrics in conditions.items()
+        }
+        for arm, conditions in summary.table.items()
+    }
     rows = [
         {"arm": arm, "condition": condition, "metric": metric}
-        | {key: "" if value is None else value for key, value in _plain(result).items()}
-        for arm, conditions in summary.table.items()
+        | {key: "" if value is None else value for key, value in result.items()}
+        for arm, conditions in plain.items()
         for condition, metrics in conditions.items()
         for metric, result in metrics.items()
     ]
-    write_rows(
-        folder / "summary.csv", ("arm", "condition", "metric", "iqm", "low", "high", "seeds", "spread"), rows
-    )
-    write_json(
-        folder / "summary.json",
-        {
-            arm: {
-                condition: {metric: _plain(result) for metric, result in metrics.items()}
-                for condition, metrics in conditions.items()
-            }
-            for arm, conditions in summary.table.items()
-        },
-    )
-
-
-def _plain(result: Estimate) -> dict[str, Any]:
-    return asdict(result) | {"spread": result.spread}
+    columns = ("arm", "condition", "metric", "iqm", "low", "high", "seeds", "spread")
+    write_rows(folder / "summary.csv", columns, rows)
+    write_json(folder / "summary.json", plain)
 
 
 def number(value: float) -> str:
@@ -229,3 +212,85 @@ def seed_row(episodes: Sequence[Mapping[str, float]], metrics: Sequence[str]) ->
             else:
                 row[metric] = float(np.sum(values) if metric in TOTALS else np.mean(values))
     return row
+
+
+def judged_by(experiment: ExperimentConfig, judged: bool) -> str:
+    """Who judges, in a sentence for tables and pages; empty where it is the task itself.
+
+    Args:
+        experiment: The experiment.
+        judged: Whether a cost was reported at all; without one nothing can be counted as a violation.
+    """
+    if not judged:
+        return (
+            "Violations are not judged: the task reports no cost. A judge for it is env.cost (module:function) or"
+            " env.judge (constraints) in the config, under another name of the experiment."
+        )
+    functions = list(dict.fromkeys(arm.env.cost for arm in experiment.arms if arm.env.cost is not None))
+    if functions:
+        return f"Violations are judged by {' and '.join(functions)} at the end of each step, not by the task."
+    if any(arm.env.judge is not None for arm in experiment.arms):
+        return (
+            "Violations are judged by the filter's own limits (a constraint's h below 0 in the true state at the end"
+            " of a step), with the filter on and off; the task itself reports no cost."
+        )
+    return ""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One arm's metric over B bins of steps; of two seeds their range, of one none."""
+
+    steps: Array
+    """(B,)"""
+    iqm: Array
+    """(B,): over seeds."""
+    low: Array | None
+    """(B,)"""
+    high: Array | None
+    """(B,)"""
+    seeds: Array
+    """(seeds, B): each seed's own."""
+
+
+def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) -> Curve | None:
+    """Means over equal bins of steps, as many as leave no seed without an episode in one (at most 40).
+
+    Args:
+        experiment: Where the runs lie.
+        arm: Which arm.
+        metric: A column of the runs' `episodes.csv`.
+
+    Returns:
+        The curve, or None when some seed has no episode with that metric.
+    """
+    runs = []
+    for seed in experiment.seeds:
+        rows = read_rows(experiment.run_folder(arm, seed) / "episodes.csv")
+        points = [(row["timesteps"], row[metric]) for row in rows if metric in row]
+        runs.append(np.array(points).reshape(-1, 2))
+    if not all(len(run) for run in runs):
+        return None
+    end = max(run[-1, 0] for run in runs)
+    for bins in range(_MOST_BINS, 0, -1):
+        edges = np.linspace(0, end, bins + 1)
+        means = np.array([_bin_means(edges, *run.T) for run in runs])
+        if np.isfinite(means).all():
+            break
+    low = high = None
+    if len(means) >= SEEDS_FOR_AN_INTERVAL:
+        low, high = _bootstrap(means, 2000)
+    elif len(means) > 1:
+        low, high = means.min(axis=0), means.max(axis=0)
+    return Curve((edges[:-1] + edges[1:]) / 2, interquartile_mean(means, axis=0), low, high, means)
+
+
+def _bin_means(edges: Array, at: Array, values: Array) -> Array:
+    """Means of the values in each bin; NaN in an empty one."""
+    bins = np.searchsorted(edges[1:-1], at)
+    sums, counts = (
+        np.bincount(bins, weights=w, minlength=len(edges) - 1) for w in (values, np.ones(len(at)))
+    )
+    means = np.full(len(counts), np.nan)
+    np.divide(sums, counts, out=means, where=counts > 0)
+    return means

@@ -5,26 +5,18 @@ from __future__ import annotations
 import importlib.util
 import os
 import pickle
-import signal
 import socket
 import sys
-import threading
 import time
-import traceback
 from collections.abc import Iterator
-from types import FrameType
 from typing import Any, Final
 
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError
+from safe_wrappers.errors import ConfigurationError
 
-from .job import Job, Message, Progress
-from .lock import FolderHeldError
-from .stopping import RunStoppedError
+from . import Job, Message, work
 
 RETRIES: Final = 10
 """Nodes that one job may lose."""
-_HELD_S: Final = 120.0
-"""How long a folder may still be held by the process of a node that was lost."""
 _ASK_S: Final = 1.0
 
 
@@ -78,7 +70,6 @@ class RayWorkers:
         # A fresh process for each, as on one machine: nothing of one run is left for the next.
         self._task = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_work)
         self._running: dict[Any, str] = {}
-        self._places: dict[str, str] = {}
 
     def start(self, job: Job) -> None:
         """Begins a job."""
@@ -91,22 +82,17 @@ class RayWorkers:
         if not self._running:
             return
         ready, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=timeout_s)
-        for name, message in self._ray.get(self._post.take.remote()):
-            yield from self._moved(name, message[1]) if message[0] == "begun" else [(name, message)]
+        yield from self._ray.get(self._post.take.remote())
         for reference in ready:
-            name = self._running.pop(reference)
             try:
                 told = self._ray.get(reference)
             except self._ray.exceptions.RayError as error:
                 told = f"its process was lost: {error} The same command goes on from its last checkpoint."
-            yield name, ("end", told)
+            yield self._running.pop(reference), ("end", told)
 
     def stop(self, name: str) -> None:
-        """Asks a job to save and end."""
+        """Asks a job to save and end; one that still waits for a CPU does so when it begins."""
         self._post.stop.remote(name)
-        for reference, other in self._running.items():
-            if other == name and name not in self._places:  # it still waits for a CPU
-                self._ray.cancel(reference)
 
     def kill(self) -> None:
         """Ends all jobs at once."""
@@ -116,11 +102,6 @@ class RayWorkers:
         if self._mine:
             self._ray.shutdown()
 
-    def _moved(self, name: str, place: str) -> Iterator[tuple[str, Message]]:
-        if name in self._places:
-            yield name, ("say", f"was lost on {self._places[name]}; begun again on {place}")
-        self._places[name] = place
-
 
 class _Post:
     """What jobs say, until it is taken; and which of them are to stop. An actor."""
@@ -128,9 +109,15 @@ class _Post:
     def __init__(self) -> None:
         self._said: list[tuple[str, Message]] = []
         self._stopped: set[str] = set()
+        self._places: dict[str, str] = {}
 
     def put(self, name: str, message: Message) -> None:
         self._said.append((name, message))
+
+    def begun(self, name: str, place: str) -> None:
+        if name in self._places:
+            self.put(name, ("say", f"was lost on {self._places[name]}; begun again on {place}"))
+        self._places[name] = place
 
     def take(self) -> list[tuple[str, Message]]:
         taken, self._said = self._said, []
@@ -151,59 +138,16 @@ def _work(pickled: bytes, name: str, path: list[str], folder: str, post: Any) ->
     os.chdir(folder)
     # For processes that it starts; Ray gave this one its own.
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-    import torch
+    place = f"{socket.gethostname()} ({ray.get_runtime_context().get_node_id()[:8]})"
+    ray.get(post.begun.remote(name, place))
+    asked, stopped = 0.0, False
 
-    torch.set_num_threads(1)
+    def stopping() -> bool:
+        nonlocal asked, stopped
+        if not stopped and time.monotonic() - asked > _ASK_S:
+            stopped = ray.get(post.is_stopped.remote(name))
+            asked = time.monotonic()
+        return stopped
 
-    def say(kind: str, what: Any) -> None:
-        ray.get(post.put.remote(name, (kind, what)))  # in their order, and before the end
-
-    say("begun", f"{socket.gethostname()} ({ray.get_runtime_context().get_node_id()[:8]})")
-    progress = Progress(
-        steps=lambda steps: say("steps", steps),
-        say=lambda text: say("say", text),
-        figures=lambda figures: say("figures", dict(figures)),
-    )
-    before = signal.signal(signal.SIGTERM, _stopped)
-    ended = threading.Event()
-    threading.Thread(target=_heed, args=(post, name, ended), daemon=True).start()
-    try:
-        _do(pickle.loads(pickled), progress)
-    except RunStoppedError as stop:
-        progress.say(str(stop))
-        return "stopped"
-    except SafeWrappersError as error:
-        say("failed", str(error))
-    except Exception:  # whatever a task or a hyperparameter can do wrong: shown, and the other runs go on
-        say("failed", traceback.format_exc())
-    finally:
-        ended.set()
-        signal.signal(signal.SIGTERM, before)
-    return ""
-
-
-def _do(job: Job, progress: Progress) -> None:
-    """Does a job, if need be when the process of a lost node has let go of its folder."""
-    end = time.monotonic() + _HELD_S
-    while True:
-        try:
-            return job.call(*job.arguments, progress)
-        except FolderHeldError:
-            if time.monotonic() > end:
-                raise
-            time.sleep(_ASK_S)
-
-
-def _stopped(signum: int, frame: FrameType | None) -> None:
-    """What nobody saves is stopped at once; training has an answer of its own while it lasts."""
-    raise RunStoppedError("stopped")
-
-
-def _heed(post: Any, name: str, ended: threading.Event) -> None:
-    """Sends this process SIGTERM, as on one machine, when its job is to stop."""
-    import ray
-
-    while not ended.wait(_ASK_S):
-        if ray.get(post.is_stopped.remote(name)):
-            os.kill(os.getpid(), signal.SIGTERM)
-            return
+    # In their order, and before the end.
+    return work(pickle.loads(pickled), lambda message: ray.get(post.put.remote(name, message)), stopping)

@@ -1,37 +1,24 @@
-"""Runs in parallel processes; none of them outlives this one."""
+"""run_jobs: jobs side by side, what they tell, and their end at a signal."""
 
 from __future__ import annotations
 
-import os
+import signal
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Final
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, Final
 
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from safe_wrappers.errors import SafeWrappersError
-
-from .job import Job, Workers
+from . import STOPPED, Interrupted, Job, RunsFailedError, environment
 from .local import LocalWorkers
-from .progress_display import ProgressDisplay
-from .stopping import Interrupted, stop_request
 
 _POLL_S: Final = 0.2
+_LINES_S: Final = 30.0
 _SAVE_S: Final = 60.0
 """How long stopped jobs may take: a rollout, its update and a checkpoint with a large replay buffer."""
-
-
-class RunsFailedError(SafeWrappersError):
-    """Some runs of an experiment failed; the others were brought to their end.
-
-    Attributes:
-        names: Of the jobs that failed.
-    """
-
-    def __init__(self, message: str, names: Iterable[str] = ()) -> None:
-        super().__init__(message)
-        self.names = frozenset(names)
 
 
 def run_jobs(
@@ -39,24 +26,20 @@ def run_jobs(
     workers: int | None,
     console: Console,
     title: str,
-    before: int = 0,
-    later: int = 0,
     unwanted: Callable[[str], bool] = lambda _: False,
     on: str | None = None,
 ) -> None:
     """Runs jobs in parallel, each in a process of its own with one BLAS and torch thread.
 
-    A job that fails does not stop the others. If this process is killed, the jobs' processes end by
-    themselves: nobody goes on writing into the folders. SIGINT, SIGTERM and SIGHUP, where they are not ignored, stop
-    the jobs by SIGTERM and wait for at most a minute, in which runs save checkpoints; a second one does not wait.
+    A job that fails does not stop the others. If this process is killed, the jobs' processes end by themselves.
+    SIGINT, SIGTERM and SIGHUP, where they are not ignored, ask the jobs to stop and wait for at most a minute, in
+    which runs save checkpoints; a second one does not wait.
 
     Args:
         jobs: The work.
         workers: Processes at a time; None for one per core that this process may use, or that the cluster has.
         console: Where progress, messages and failures are shown.
         title: What is going on.
-        before: Units of jobs that went before, which count as done.
-        later: Units of jobs that will come after these, which are still to do.
         unwanted: Asked often, by a job's name, whether nobody needs it any more: it is stopped like by a signal,
             or not begun, and that is no failure.
         on: Where: None for this machine, or `ray` or `ray:ADDRESS`.
@@ -68,90 +51,131 @@ def run_jobs(
     waiting = list(jobs)
     running: set[str] = set()
     failures: dict[str, str] = {}
-    given_up: set[str] = set()
-    stopped_at: float | None = None
-    totals = {job.name: job.total for job in jobs}
-    unit = jobs[0].unit if jobs else ""
-    with (
-        stop_request() as request,
-        ProgressDisplay(title, unit, totals, console, before=before, later=later) as display,
+    asked: set[str] = set()
+    wait_until = float("inf")
+    with ExitStack() as stack:
+        signals = stack.enter_context(_noted_signals())
         # Read by the BLAS libraries when the spawned process loads them; more threads would only fight for cores.
-        environment(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")),
-        _workers(on, workers) as place,
-    ):
-        while running or (waiting and not request.signum):
-            while waiting and len(running) < place.at_once and not request.signum:
+        one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        stack.enter_context(environment(one))
+        place = _workers(on, workers)
+        stack.callback(place.kill)
+        shown = stack.enter_context(_Shown(title, console))
+        while running or (waiting and not signals):
+            while waiting and len(running) < place.at_once and not signals:
                 job = waiting.pop(0)
-                if unwanted(job.name):
-                    display.end(job.name, "stopped")
-                    continue
-                place.start(job)
-                running.add(job.name)
-                display.start(job.name)
+                if not unwanted(job.name):
+                    place.start(job)
+                    running.add(job.name)
+                    shown.start(job)
             for name, (kind, told) in place.messages(_POLL_S):
                 if kind == "end":
                     running.remove(name)
-                    how = "failed" if name in failures else "done"
-                    if told and how == "done":
-                        how = "stopped" if request.signum or name in given_up else "failed"
-                    if how == "failed":
-                        failures.setdefault(name, told)
-                    display.end(name, how)
-                elif kind == "steps":
-                    display.steps(name, told)
-                elif kind == "figures":
-                    display.figures(name, told)
+                    if told not in ("", STOPPED):
+                        failures[name] = told
+                    shown.end(name, "failed" if name in failures else told or "done")
                 elif kind == "say":
-                    display.say(f"{name}: {told}")
+                    shown.say(f"{name}: {told}")
                 else:
-                    failures[name] = told
-            display.tick()
-            for name in running - given_up:
-                if unwanted(name):
-                    given_up.add(name)
-                    place.stop(name)
-            if request.signum and stopped_at is None:
-                stopped_at = time.monotonic()
-                display.say(f"Stopping, for at most {_SAVE_S:.0f} s; another signal stops at once.")
-                for name in running:
-                    place.stop(name)
-            if stopped_at is not None and (request.at_once or time.monotonic() - stopped_at > _SAVE_S):
+                    shown.update(name, kind, told)
+            shown.tick()
+            if signals and wait_until == float("inf"):
+                wait_until = time.monotonic() + _SAVE_S
+                shown.say(f"Stopping, for at most {_SAVE_S:.0f} s; another signal stops at once.")
+            for name in {name for name in running - asked if signals or unwanted(name)}:
+                asked.add(name)
+                place.stop(name)
+            if len(signals) > 1 or time.monotonic() > wait_until:
                 break
     texts = "\n".join(f"{name}: {text}" for name, text in failures.items())
-    if request.signum:
-        if failures:
-            console.print(texts, highlight=False, markup=False, soft_wrap=True)
-        raise Interrupted(request.signum)
+    if signals:
+        console.print(texts, highlight=False, markup=False, soft_wrap=True)
+        raise Interrupted(signals[0])
     if failures:
         raise RunsFailedError(f"{title}: {len(failures)} of {len(jobs)} failed.\n{texts}", failures)
 
 
-@contextmanager
-def _workers(on: str | None, at_once: int | None) -> Iterator[Workers]:
-    """Where jobs run; none of them is left afterwards."""
-    place: Workers
+def _workers(on: str | None, at_once: int | None) -> Any:
     if on is None:
-        place = LocalWorkers(at_once)
-    else:
-        from .on_ray import RayWorkers
+        return LocalWorkers(at_once)
+    from .on_ray import RayWorkers
 
-        place = RayWorkers(on, at_once)
-    try:
-        yield place
-    finally:
-        place.kill()
+    return RayWorkers(on, at_once)
 
 
 @contextmanager
-def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Environment variables for the processes that are started inside."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
+def _noted_signals() -> Iterator[list[int]]:
+    """In this block signals that would end the process are noted instead; those that it ignores stay ignored."""
+    noted: list[int] = []
+    ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
+        ending = ()
+    first = 0.0
+
+    def note(signum: int, _: object) -> None:
+        nonlocal first
+        # `timeout` and many a launcher send to a process and to its group: together they are one.
+        if not noted or time.monotonic() - first > 0.5:
+            noted.append(signum)
+        first = first or time.monotonic()
+
+    heeded = [which for which in ending if signal.getsignal(which) is not signal.SIG_IGN]
+    before = {which: signal.signal(which, note) for which in heeded}
     try:
-        yield
+        yield noted
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for which, handler in before.items():
+            signal.signal(which, signal.SIG_DFL if handler is None else handler)
+
+
+class _Shown:
+    """A bar for each running job on a terminal; now and then a line for each in a file or a pipe."""
+
+    def __init__(self, title: str, console: Console) -> None:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(10),
+            TaskProgressColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[figures]}"),
+        )
+        self._bars = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._console = console
+        self._title = title
+        self._tasks: dict[str, Any] = {}
+        self._said_at = time.monotonic()
+
+    def __enter__(self) -> _Shown:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def start(self, job: Job) -> None:
+        self._tasks[job.name] = self._bars.add_task(job.name, total=job.total, figures="")
+        if not self._console.is_terminal:
+            self.say(f"{job.name}: started ({job.total:,} {job.unit})")
+
+    def update(self, name: str, kind: str, told: Any) -> None:
+        """A job's `steps` or `figures`."""
+        if kind == "steps":
+            self._bars.update(self._tasks[name], completed=told)
+        else:
+            text = ", ".join(f"{key} {value}" for key, value in told.items())
+            self._bars.update(self._tasks[name], figures=text)
+
+    def end(self, name: str, how: str) -> None:
+        self._bars.remove_task(self._tasks.pop(name))
+        self.say(f"{name}: {how}")
+
+    def say(self, text: str) -> None:
+        self._bars.console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+    def tick(self) -> None:
+        """To be called often."""
+        if self._console.is_terminal or time.monotonic() - self._said_at < _LINES_S:
+            return
+        self._said_at = time.monotonic()
+        for task in self._bars.tasks:
+            self.say(f"  {task.description}: {task.percentage:.0f} % {task.fields['figures']}".rstrip())

@@ -1,7 +1,7 @@
-"""The HTML pages: one per experiment, and one that puts several side by side; and the verdict in words."""
+"""The HTML page of an experiment, its table on the terminal, and the verdict in words."""
 
-from .experiment_page import write_report
-from .overview_page import write_overview
+from .page import write_report
+from .tables import comparison_table
 from .verdict import verdict
 
-__all__ = ["verdict", "write_overview", "write_report"]
+__all__ = ["comparison_table", "verdict", "write_report"]

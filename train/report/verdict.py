@@ -1,13 +1,111 @@
-"""The verdict in words; it must not say more than the numbers do."""
+"""The verdict in words, and the big numbers; they must not say more than the numbers do."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
-from ..config import ExperimentConfig
-from ..evaluation.has_cost import judged_by
-from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, number, spread
-from .comparison import Comparison, Outcome, Side, compare, side
+import numpy as np
+
+from ..config import ArmConfig, ExperimentConfig
+from ..evaluation.episode_selection import Pair, compared_pairs
+from ..evaluation.metrics import NOT_JUDGED
+from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, judged_by, number, spread
+
+
+class Side(NamedTuple):
+    """What some arms did under a condition, with or without their training; totals over all seeds."""
+
+    steps: int
+    violations: int | None  # None: not judged
+    infeasible: int
+    fallback: int
+    unsafe: int
+    collisions: int  # 0 where the task reports none, too
+    returns: list[Estimate]  # of evaluation, one per arm; empty if one is missing
+    changed: float | None  # share of evaluation steps that the filter changed
+
+    @property
+    def share(self) -> float:
+        """Of steps in violation."""
+        return (self.violations or 0) / self.steps if self.steps else 0.0
+
+
+class Comparison(NamedTuple):
+    """Without the filter and with it, and what they are of."""
+
+    pairs: list[Pair]
+    off: Side
+    on: Side
+    evaluated: Side  # of the side with the filter, evaluation alone
+    outcomes: dict[
+        tuple[str, str], Side
+    ]  # (arm, "filter_off" or "filter_on") of a single pair, as far as it is there
+
+    @property
+    def judged(self) -> bool:
+        """Violations were judged on both sides."""
+        return self.off.violations is not None and self.on.violations is not None
+
+    @property
+    def same_policies(self) -> bool:
+        """The two sides differ only in the filter at evaluation."""
+        return self.pairs[0].bare == self.pairs[0].filtered
+
+
+class Card(NamedTuple):
+    """A big number with what it counts, and what it is to be compared with; its mood is "", "good" or "bad"."""
+
+    title: str
+    value: str
+    lines: Sequence[str]
+    mood: str = ""
+
+
+def _side(summary: Summary, arms: Sequence[ArmConfig], condition: str, training: bool = False) -> Side:
+    names = [arm.name for arm in arms]
+    wanted = (condition, "training") if training else (condition,)
+    rows = [row for row in summary.per_seed if row["arm"] in names and row["condition"] in wanted]
+    totals = {
+        key: int(sum(row.get(key, 0) for row in rows))
+        for key in ("steps", "infeasible", "fallback", "unsafe", "collisions")
+    }
+    judged = all("violations" in row for row in rows)
+    cells = [summary.table[name][condition] for name in names]
+    rates = [cell["intervention_rate"].iqm for cell in cells if "intervention_rate" in cell]
+    return Side(
+        **totals,
+        violations=int(sum(row["violations"] for row in rows)) if judged else None,
+        returns=[cell["return"] for cell in cells] if all("return" in cell for cell in cells) else [],
+        changed=float(np.mean(rates)) if rates else None,
+    )
+
+
+def compare(experiment: ExperimentConfig, summary: Summary) -> Comparison | None:
+    """The headline's comparison; None where the experiment has no filter, or nothing of a side is there.
+
+    An arm without a filter and one with it count with all their training and the evaluation that is theirs
+    (filter off, filter on). Where the policies are the same, only their evaluation is compared.
+    """
+    pairs = compared_pairs(experiment)
+    if not pairs:
+        return None
+    training = pairs[0].bare != pairs[0].filtered
+    filtered = [pair.filtered for pair in pairs]
+    off = _side(summary, [pair.bare for pair in pairs], "filter_off", training)
+    on = _side(summary, filtered, "filter_on", training)
+    if not off.steps or not on.steps:
+        return None
+    arms = (
+        {arm.name: arm for arm in pairs[0]} if len(pairs) == 1 else {}
+    )  # of several tasks there is no common return
+    each = {
+        (name, condition): _side(summary, [arm], condition)
+        for name, arm in arms.items()
+        for condition in ("filter_off", "filter_on")
+    }
+    outcomes = {key: side for key, side in each.items() if side.steps and side.returns}
+    return Comparison(pairs, off, on, _side(summary, filtered, "filter_on"), outcomes)
 
 
 def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
@@ -20,13 +118,11 @@ def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
     if found is None:
         return _without_comparison(experiment, summary)
     judge = judged_by(experiment, found.judged)
-    parts = (
-        *((_safety(found.off, found.on), judge) if found.judged else (judge, _own_measure(found.on))),
-        _collisions(found.off, found.on),
-        *_price(found),
-        _work(found.on, found.evaluated),
-    )
-    return [part for part in parts if part]
+    first = [_safety(found.off, found.on), judge] if found.judged else [judge, _own_measure(found.on)]
+    collisions = ""
+    if found.off.collisions or found.on.collisions:
+        collisions = f"Collisions begun: {found.on.collisions:,} with it, {found.off.collisions:,} without."
+    return [part for part in (*first, collisions, *_price(found), _work(found.on, found.evaluated)) if part]
 
 
 def percent(share: float) -> str:
@@ -43,18 +139,11 @@ def _safety(off: Side, on: Side) -> str:
         return f"With the filter none of {on.steps:,} steps was in violation; without it {without} were."
     if not on.violations:
         return "No violation with the filter, and none without it: the task did not put it to the test."
-    with_filter = f"{on.violations:,} of {on.steps:,} steps ({percent(on.share)})"
-    if on.share < off.share:
-        return (
-            f"The filter lowered violations without removing them: {with_filter} with it, {without} without."
-        )
-    return f"The filter did not lower violations: {with_filter} with it, {without} without."
-
-
-def _collisions(off: Side, on: Side) -> str:
-    if not off.collisions and not on.collisions:
-        return ""
-    return f"Collisions begun: {on.collisions:,} with it, {off.collisions:,} without."
+    through = f"{on.violations:,} of {on.steps:,} steps ({percent(on.share)}) with it, {without} without."
+    lowered = (
+        "lowered violations without removing them" if on.share < off.share else "did not lower violations"
+    )
+    return f"The filter {lowered}: {through}"
 
 
 def _own_measure(on: Side) -> str:
@@ -64,18 +153,15 @@ def _own_measure(on: Side) -> str:
 
 def _price(found: Comparison) -> list[str]:
     if len(found.pairs) > 1:
-        if not found.off.returns or not found.on.returns:
-            return []
-        # Returns of different tasks have no common mean.
-        went = (
+        went = [
             f"{pair.filtered.name} {number(off.iqm)} to {number(on.iqm)}"
-            for pair, off, on in zip(found.pairs, found.off.returns, found.on.returns, strict=True)
-        )
-        return [f"The return per episode went: {', '.join(went)}."]
+            for pair, off, on in zip(found.pairs, found.off.returns, found.on.returns, strict=False)
+        ]
+        return [f"The return per episode went: {', '.join(went)}."] if went else []
     if not found.outcomes:
         return []
-    told = [_policy(found, arm) for arm in dict.fromkeys(outcome.arm.name for outcome in found.outcomes)]
-    return [*told, " ".join(filter(None, (_choice(found), _brackets(found.outcomes), _training(found))))]
+    told = [_policy(found, arm) for arm in dict.fromkeys(arm for arm, _ in found.outcomes)]
+    return [*told, " ".join(filter(None, (_choice(found), _brackets(found), _training(found))))]
 
 
 def _policy(found: Comparison, name: str) -> str:
@@ -86,33 +172,30 @@ def _policy(found: Comparison, name: str) -> str:
         who, phrases = "Trained through the filter, the policy", ("with it taken off", "with it")
     else:
         who, phrases = "Trained without the filter, the policy", ("without it", "with it added afterwards")
-    parts = [
-        f"{_with_spread(outcome.returns)} {phrases[outcome.filter_on]}{_violations(outcome)}"
-        for outcome in found.outcomes
-        if outcome.arm.name == name
-    ]
+    parts = []
+    for condition, phrase in zip(("filter_off", "filter_on"), phrases, strict=True):
+        side = found.outcomes.get((name, condition))
+        if side is not None:
+            returns = side.returns[0]
+            told = number(returns.iqm) if returns.low is None else str(returns)
+            parts.append(f"{told} {phrase}{_in_brackets(side)}")
     return f"{who} returned per evaluation episode {' and '.join(parts)}."
 
 
-def _with_spread(returns: Estimate) -> str:
-    return number(returns.iqm) if returns.low is None else str(returns)
-
-
-def _violations(outcome: Outcome) -> str:
-    if outcome.violations is None:
+def _in_brackets(side: Side) -> str:
+    if side.violations is None:
         return ""
-    if not outcome.violations:
+    if not side.violations:
         return " (no step in violation)"
-    share = percent(outcome.violations / outcome.steps)
-    return f" ({outcome.violations:,} of {outcome.steps:,} steps in violation, {share})"
+    return f" ({side.violations:,} of {side.steps:,} steps in violation, {percent(side.share)})"
 
 
 def _choice(found: Comparison) -> str:
     """Whether it paid to train through the filter that is on afterwards; nothing where that was not tried."""
-    acting = [outcome for outcome in found.outcomes if outcome.filter_on]
+    acting = [side.returns[0] for (_, condition), side in found.outcomes.items() if condition == "filter_on"]
     if len(acting) < 2:
         return ""
-    added, through = (outcome.returns for outcome in acting)
+    added, through = acting
     if added.iqm == through.iqm:
         return "With the filter on, both returned the same."
     better = "trained without it" if added.iqm > through.iqm else "trained through it"
@@ -121,15 +204,15 @@ def _choice(found: Comparison) -> str:
 
 def _how_surely(one: Estimate, other: Estimate) -> str:
     seeds = min(one.seeds, other.seeds)
-    if spread(seeds) != "95 % interval":
+    if seeds < SEEDS_FOR_AN_INTERVAL:
         return "one seed says little" if seeds < 2 else f"{seeds} seeds say little"
     assert one.low is not None and one.high is not None and other.low is not None and other.high is not None
     apart = one.low > other.high or other.low > one.high
     return f"the intervals over {seeds} seeds {'lie apart' if apart else 'overlap'}"
 
 
-def _brackets(outcomes: Sequence[Outcome]) -> str:
-    counts = [outcome.returns.seeds for outcome in outcomes]
+def _brackets(found: Comparison) -> str:
+    counts = [side.returns[0].seeds for side in found.outcomes.values()]
     if max(counts) < 2:
         return "One seed: no interval."
     if max(counts) < SEEDS_FOR_AN_INTERVAL:
@@ -140,7 +223,7 @@ def _brackets(outcomes: Sequence[Outcome]) -> str:
 
 def _training(found: Comparison) -> str:
     """For how long the compared policies were trained."""
-    arms = {arm.name: arm for pair in found.pairs for arm in (pair.bare, pair.filtered)}
+    arms = {arm.name: arm for arm in found.pairs[0]}
     lengths = [f"{arm.total_steps * arm.action_repeat:,}" for arm in arms.values()]
     if len(set(lengths)) == 1:
         return f"Trained for {lengths[0]} control steps{' each' if len(lengths) > 1 else ''}."
@@ -149,20 +232,17 @@ def _training(found: Comparison) -> str:
 
 def _work(on: Side, evaluated: Side) -> str:
     """What the filter did in evaluation, and then, where it was on in training and failed there, how often."""
+    rest = "no step was infeasible and none ran the fallback"
     if evaluated.infeasible or evaluated.fallback:
         rest = _failed(evaluated.infeasible, evaluated.fallback)
-    else:
-        rest = "no step was infeasible and none ran the fallback"
-    if evaluated.changed is None:
-        in_evaluation = f"In evaluation {rest}."
-    else:
+    said = f"In evaluation {rest}."
+    if evaluated.changed is not None:
         changed = percent(evaluated.changed) if evaluated.changed else "none"
-        in_evaluation = f"The filter changed {changed} of the evaluation steps; {rest}."
+        said = f"The filter changed {changed} of the evaluation steps; {rest}."
     infeasible, fallback = on.infeasible - evaluated.infeasible, on.fallback - evaluated.fallback
-    if not infeasible and not fallback:
-        return in_evaluation
-    steps = on.steps - evaluated.steps
-    return f"{in_evaluation} In training {_failed(infeasible, fallback)}, of {steps:,}."
+    if infeasible or fallback:
+        said += f" In training {_failed(infeasible, fallback)}, of {on.steps - evaluated.steps:,}."
+    return said
 
 
 def _failed(infeasible: int, fallback: int) -> str:
@@ -174,13 +254,64 @@ def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> list[
     parts = ["There is no filter to compare with yet."]
     for arm in experiment.arms:
         for condition, words in (("filter_off", "in evaluation"), ("training", "while training")):
-            alone = side(summary, [arm], condition, training=False)
+            alone = _side(summary, [arm], condition)
             if alone.steps and alone.returns:
-                judged = (
-                    ""
-                    if alone.violations is None
-                    else f", {alone.violations:,} of {alone.steps:,} steps in violation"
-                )
-                parts.append(f"{arm.name}: return {number(alone.returns[0].iqm)} {words}{judged}.")
+                said = f"{arm.name}: return {number(alone.returns[0].iqm)} {words}"
+                if alone.violations is not None:
+                    said += f", {alone.violations:,} of {alone.steps:,} steps in violation"
+                parts.append(f"{said}.")
                 break
     return [part for part in (*parts, judged_by(experiment, summary.judged)) if part]
+
+
+def cards(experiment: ExperimentConfig, summary: Summary, filter_us: float | None) -> list[Card]:
+    """The numbers that a reader should know after ten seconds; none where there is no filter to compare with.
+
+    Args:
+        experiment: The experiment.
+        summary: Its numbers.
+        filter_us: Mean time of a filter call.
+    """
+    found = compare(experiment, summary)
+    if found is None:
+        return []
+    off, on = found.off, found.on
+    scope = "of evaluation" if found.same_policies else "of training and evaluation"
+    parts = [_return(found, arm, condition) for arm, condition in found.outcomes]
+    if found.judged:
+        mood = "good" if not on.violations and off.violations else "bad" if on.share > off.share else ""
+        of = [f"with the filter, of {on.steps:,} {scope}", f"without: {off.violations:,} of {off.steps:,}"]
+        parts.append(Card("Steps in violation", f"{on.violations:,}", of, mood))
+    else:
+        what = f"by the filter's own measure (h < 0), of {on.steps:,} {scope}"
+        parts.append(Card("Unsafe steps", f"{on.unsafe:,}", [what, f"violations: {NOT_JUDGED}"]))
+    if on.changed is not None:
+        parts.append(Card("Steps changed", percent(on.changed), ["by the filter, in evaluation"]))
+    nothing = f"where no action was admissible, {scope}"
+    parts.append(
+        Card("Infeasible steps", f"{on.infeasible:,}", [nothing, f"fallback: {on.fallback:,} steps"])
+    )
+    if filter_us is not None:
+        parts.append(
+            Card("Filter time per step", f"{filter_us:,.0f} µs", ["mean, on the machine that ran it"])
+        )
+    return parts
+
+
+def _return(found: Comparison, arm: str, condition: str) -> Card:
+    """What one arm's policies returned in evaluation with the filter off or on."""
+    filtered = arm == found.pairs[0].filtered.name
+    trained = "Trained through the filter" if filtered else "Trained without the filter"
+    side = found.outcomes[arm, condition]
+    returns = side.returns[0]
+    lines = ["return per episode"]
+    if returns.low is not None and returns.high is not None:
+        lines.append(f"{spread(returns.seeds)} {number(returns.low)} to {number(returns.high)}")
+    hurt = (
+        f"{side.violations:,} of {side.steps:,} steps in violation"
+        if side.violations
+        else "no step in violation"
+    )
+    lines.append(f"violations {NOT_JUDGED}" if side.violations is None else hurt)
+    title = f"{arm if found.same_policies else trained}, {condition.replace('_', ' ')}"
+    return Card(title, number(returns.iqm), lines)

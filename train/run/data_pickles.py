@@ -1,7 +1,7 @@
-"""Pickles that Stable-Baselines3 writes, read without running what they say.
+"""What Stable-Baselines3 has pickled, read without running what it says.
 
-A pickle may name any function of any module and have it called. What checkpoints hold is data: arrays, spaces,
-buffers, statistics, settings. So this reader knows the names of these, and refuses a pickle that has any other.
+A pickle may name any function of any module and have it called. What models hold is data: arrays, spaces, buffers,
+statistics, settings. So this reader knows the names of these, and refuses a pickle that has any other.
 """
 
 from __future__ import annotations
@@ -19,42 +19,26 @@ from typing import Any, Final
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common import utils
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
-from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import GoalSelectionStrategy
 
 from safe_wrappers.errors import RunStateError
 
-from ..hyperparameters import LinearFall
-
-_PACKAGES: Final = (
-    "collections",
-    "numpy",
-    "torch",
-    "gymnasium",
-    "stable_baselines3",
-    "sb3_contrib",
-    "safe_wrappers",
+_PACKAGES: Final = frozenset(
+    ("collections", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib", "safe_wrappers")
 )
 """Nothing else is imported to see what a name is."""
 _KINDS: Final = (
     *(OrderedDict, deque, np.ndarray, np.dtype, np.generic, np.random.BitGenerator, np.random.SeedSequence),
     *(torch.device, torch.optim.Optimizer, spaces.Space, BaseBuffer, ActionNoise, BasePolicy, RunningMeanStd),
-    *(
-        VecNormalize,
-        TrainFreq,
-        TrainFrequencyUnit,
-        ConstantSchedule,
-        FloatSchedule,
-        LinearSchedule,
-        LinearFall,
-    ),
-    GoalSelectionStrategy,
+    *(utils.ConstantSchedule, utils.FloatSchedule, utils.LinearSchedule, TrainFreq, TrainFrequencyUnit),
+    *(VecNormalize, GoalSelectionStrategy),
 )
 """Classes that are data, and their subclasses."""
 _OTHERS: Final = {
@@ -112,8 +96,8 @@ def pickles_of_model(path: Path) -> dict[str, Any]:
             data = json.loads(archive.read("data"))
     except zipfile.BadZipFile as error:
         raise ValueError(str(error)) from None
-    found = {}
-    for name, value in data.items():
-        if isinstance(value, dict) and ":serialized:" in value:
-            found[name] = _Reader(io.BytesIO(base64.b64decode(value[":serialized:"])), path).load()
-    return found
+    return {
+        name: _Reader(io.BytesIO(base64.b64decode(value[":serialized:"])), path).load()
+        for name, value in data.items()
+        if isinstance(value, dict) and ":serialized:" in value
+    }

@@ -8,36 +8,34 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from safe_wrappers.errors import RunStateError
+from safe_wrappers.errors import ConfigurationError, RunStateError
 
-from ..atomic import json_bytes, write_json
-from ..checksums import read_facts
-from ..config import ArmConfig
-from .start import START_FILE
-from .trackers import IDS_FILE, TENSORBOARD
+from ..config import ArmConfig, stored_arm
+from ..files import read_json, write_json
 
 RUN_FILE: Final = "run.json"
 FINISHED_FILE: Final = "finished.json"
+START_FILE: Final = "start.json"
+"""Whose policy the run began with."""
 CHECKPOINTS: Final = "checkpoints"
 EVALUATION: Final = "evaluation"
+POLICY: Final = "policy"
 EPISODES: Final = "episodes.csv"
+TENSORBOARD: Final = "tensorboard"
 
 
 def finished_facts(folder: Path) -> dict[str, Any]:
-    """What a run noted when it was finished: `timesteps`, times, and checksums of `files`; empty before that.
+    """What a run noted when it was finished: `timesteps` and times; empty before that.
 
     Raises:
         RunStateError: The note is unreadable.
     """
-    return read_facts(folder / FINISHED_FILE, "`safe-wrappers train` (or `compare`) writes it again.")
+    return read_json(folder / FINISHED_FILE)
 
 
 def is_finished(arm: ArmConfig, folder: Path) -> bool:
-    """Whether the run has made its steps; one whose note of it is damaged has to find out."""
-    try:
-        return int(finished_facts(folder).get("timesteps", -1)) >= arm.total_steps
-    except RunStateError:
-        return False
+    """Whether the run has made its steps."""
+    return int(finished_facts(folder).get("timesteps", -1)) >= arm.total_steps
 
 
 def check_finished(arm: ArmConfig, folder: Path) -> None:
@@ -47,7 +45,6 @@ def check_finished(arm: ArmConfig, folder: Path) -> None:
         RunStateError: It is not.
     """
     if not is_finished(arm, folder):
-        finished_facts(folder)
         raise RunStateError(
             f"The run in {str(folder)!r} is not trained to its end; run `safe-wrappers train` (or `compare`)."
         )
@@ -55,10 +52,21 @@ def check_finished(arm: ArmConfig, folder: Path) -> None:
 
 def is_outgrown(arm: ArmConfig, folder: Path) -> bool:
     """Whether the run was finished with fewer steps than it should have now: what shows its policy is out of date."""
+    return int(finished_facts(folder).get("timesteps", arm.total_steps)) < arm.total_steps
+
+
+def stored_run(folder: Path) -> ArmConfig:
+    """The arm of a run, as its folder has it.
+
+    Raises:
+        RunStateError: There is no run, or it does not say what it is of.
+    """
+    path = folder / RUN_FILE
     try:
-        return int(finished_facts(folder).get("timesteps", arm.total_steps)) < arm.total_steps
-    except RunStateError:  # nobody knows of how many; its evaluation does
-        return False
+        stored = read_json(path)
+        return stored_arm(stored["arm"], stored["config"])
+    except (KeyError, TypeError, ConfigurationError) as error:
+        raise RunStateError(f"{str(path)!r} does not say what the run is of: {error!r}") from error
 
 
 def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
@@ -70,21 +78,13 @@ def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
     Raises:
         RunStateError: Another config's; shows the settings that differ.
     """
-    path = folder / RUN_FILE
     if not _is_begun(folder):
         return
-    if not path.exists():
-        raise RunStateError(
-            f"{str(folder)!r} has checkpoints but no {RUN_FILE} that says what they are of; delete it, or"
-            " choose another `name` or `output`."
-        )
-    try:
-        theirs = json.loads(path.read_text())
-        there, here = _flat(theirs), _flat(json.loads(json.dumps(_identity(arm, seed))))
-    except (ValueError, AttributeError):
-        raise RunStateError(f"{str(path)!r} is unreadable; delete {str(folder)!r} to train again.") from None
+    theirs = stored_run(folder)
+    there = _flat({"seed": read_json(folder / RUN_FILE).get("seed"), **theirs.fingerprint()})
+    here = _flat(json.loads(json.dumps({"seed": seed, **arm.fingerprint()})))
     differ = {key for key in there.keys() | here.keys() if there.get(key, "unset") != here.get(key, "unset")}
-    if there.get("total_steps", 0) <= arm.total_steps:
+    if theirs.total_steps <= arm.total_steps:
         differ.discard("total_steps")
     if differ:
         lines = [
@@ -100,31 +100,19 @@ def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
 
 def claim_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
     """Marks a folder that `check_folder` let through as this run's, or as one whose total was raised."""
-    path, ours = folder / RUN_FILE, _identity(arm, seed)
-    if _is_begun(folder):
-        if json.loads(path.read_text())["config"].get("total_steps") == arm.total_steps:
-            return
-    elif path.exists() and path.read_bytes() != json_bytes(ours):
-        shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)  # of another config, which came to nothing
-        for name in (EPISODES, START_FILE, IDS_FILE):
+    if not _is_begun(folder):  # of another config, which came to nothing
+        shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)
+        for name in (EPISODES, START_FILE):
             (folder / name).unlink(missing_ok=True)
-    write_json(path, ours)
+    write_json(folder / RUN_FILE, {"arm": arm.name, "seed": seed, "config": arm.fingerprint()})
 
 
 def _is_begun(folder: Path) -> bool:
     return (folder / FINISHED_FILE).exists() or any((folder / CHECKPOINTS).glob("step_*"))
 
 
-def _identity(arm: ArmConfig, seed: int) -> dict[str, Any]:
-    return {"arm": arm.name, "seed": seed, "config": arm.fingerprint()}
-
-
-def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
-    for key, item in value.items():
-        name = key if not prefix and key != "config" else f"{prefix}.{key}".lstrip(".")
-        if isinstance(item, dict) and item:
-            flat.update(_flat(item, "" if name == "config" else name))
-        else:
-            flat[name] = item
+    for key, value in values.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat

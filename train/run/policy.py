@@ -1,27 +1,31 @@
-"""A trained policy as it acts outside training: deterministic, with frozen observation scaling."""
+"""A trained policy as it acts outside training, and as a folder for others."""
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+import re
+import shutil
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from safe_wrappers.plants.env_checks import wrappers_of
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
 from ..config import ArmConfig, FilterConfig
 from ..config.algorithms import MASKED
+from ..files import write_json
+from .checkpoint import load_model, load_normalize, save_policy
+from .folder import POLICY
 from .stack import make_stack
 
-
-class SavedPolicy(Protocol):
-    """Where a policy is loaded from: a checkpoint, or a policy's folder."""
-
-    def load_model(self, algorithm: str, env: None, device: str) -> BaseAlgorithm:
-        """The model, to act only."""
-
-    def load_normalize(self, env: VecEnv) -> VecEnv:
-        """The running statistics around an env; the env itself if the run had none."""
+CONFIG: Final = "config.json"
+_PACKAGES: Final = ("safe-wrappers", "stable-baselines3", "gymnasium", "mujoco")
+_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
 
 
 class SpacesEnv(gym.Env[Any, Any]):
@@ -37,7 +41,7 @@ class TrainedPolicy:
 
     Args:
         arm: The arm that was trained.
-        saved: Its policy.
+        folder: A checkpoint, or a policy's folder.
 
     Attributes:
         arm: The arm.
@@ -47,13 +51,12 @@ class TrainedPolicy:
 
     deterministic: bool = True
 
-    def __init__(self, arm: ArmConfig, saved: SavedPolicy) -> None:
+    def __init__(self, arm: ArmConfig, folder: Path) -> None:
         self.arm = arm
-        self.model = saved.load_model(arm.algorithm, None, arm.device)
+        self.model = load_model(folder, arm.algorithm, arm.device)
         spaces = SpacesEnv(self.model.observation_space, self.model.action_space)
-        scaled = saved.load_normalize(DummyVecEnv([lambda: spaces]))
+        scaled = load_normalize(folder, DummyVecEnv([lambda: spaces]))
         self._normalize = scaled if isinstance(scaled, VecNormalize) else None
-        self._repeat = arm.action_repeat
         self.begin()
 
     def make_env(
@@ -83,7 +86,7 @@ class TrainedPolicy:
     def __call__(self, observation: Any) -> Any:
         """The action of a control step, for an observation as the env gives it."""
         if self._left == 0:
-            self._held, self._left = self._decide(observation), self._repeat
+            self._held, self._left = self._decide(observation), self.arm.action_repeat
         self._left -= 1
         return self._held
 
@@ -99,3 +102,46 @@ class TrainedPolicy:
             **masks,
         )
         return action
+
+
+def write_policy(arm: ArmConfig, seed: int, run: Path, model: BaseAlgorithm) -> Path:
+    """Writes the policy of a finished run into `RUN/policy/`: SB3's files, and what it was trained in as JSON.
+
+    Returns:
+        The folder; there is no half one.
+    """
+    folder, temporary = run / POLICY, run / f".{POLICY}"
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    save_policy(temporary, model)
+    config = {
+        "arm": arm.name,
+        "seed": seed,
+        "config": arm.fingerprint(),
+        "constraints": constraints_of_arm(arm),
+        "timesteps": model.num_timesteps,
+        "versions": {name: version(name) for name in _PACKAGES},
+    }
+    write_json(temporary / CONFIG, config)
+    shutil.rmtree(folder, ignore_errors=True)
+    temporary.rename(folder)
+    return folder
+
+
+def constraints_of_arm(arm: ArmConfig) -> list[str]:
+    """The constraints of an arm's filter in words, as this version of the library makes them."""
+    env = make_stack(arm.env, arm.filter)
+    try:
+        return constraints_of(env)
+    finally:
+        env.close()
+
+
+def constraints_of(env: gym.Env[Any, Any]) -> list[str]:
+    """The constraints of the filter in an env's stack, in words; without a `CBFActionFilter` others' wrappers."""
+    found = filter_inside(env)
+    if found is not None:
+        return [_ADDRESS.sub("", repr(constraint)) for constraint in found.constraints]
+    packages = ("gymnasium", "stable_baselines3", "safe_wrappers")
+    kinds = [type(wrapper) for wrapper in wrappers_of(env)]
+    return [kind.__name__ for kind in kinds if kind.__module__.partition(".")[0] not in packages]

@@ -1,32 +1,80 @@
-"""The whole stack of one env, from the task to SB3's Monitor, with the learner's map inside or its penalty around."""
+"""The envs of one run, each a whole stack: from the task to SB3's Monitor, with the learner's map or penalty."""
 
 from __future__ import annotations
 
+import functools
 import importlib
-from collections.abc import Mapping
+import signal
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-import safe_wrappers
-from safe_wrappers.errors import ConfigurationError
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.learner import AdaptionPenalty, FilterObservation
-from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
-from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
-from safe_wrappers.wrappers.record_interventions import RecordInterventions
-from safe_wrappers.wrappers.replaced_actions import SafeActionMap, StuckEscape
 
-from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
-from ..config.env_ids import make_env
-from ..config.names import check_name
-from ..filter_module import refuse_without_recipe
-from ..local_imports import own_folders
+from ..config import NAIVE, ArmConfig, EnvConfig, FilterConfig, LearnerConfig, check_env_id
+from ..config.types import check_name
 from .judge import ConstraintJudge
+
+
+def make_vec_env(arm: ArmConfig) -> VecEnv:
+    """Makes `arm.n_envs` envs, as `arm.vec_env` says."""
+    if arm.vec_env == "dummy":
+        return DummyVecEnv([functools.partial(make_training_env, arm)] * arm.n_envs)
+    return SubprocVecEnv([functools.partial(_in_process, arm)] * arm.n_envs, "spawn")
+
+
+def make_training_env(arm: ArmConfig) -> gym.Env[Any, Any]:
+    """One env as the arm trains in it."""
+    env = make_stack(arm.env, arm.filter, arm.learner)
+    if arm.env.reset_options:
+        env = ResetOptions(env, arm.env.reset_options)
+    return env if arm.action_repeat == 1 else sw.ActionRepeat(env, arm.action_repeat)
+
+
+class ResetOptions(gym.Wrapper[Any, Any, Any, Any]):
+    """Gives options to every reset; a reset's own come on top."""
+
+    def __init__(self, env: gym.Env[Any, Any], options: Mapping[str, Any]) -> None:
+        super().__init__(env)
+        self._options = options
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Resets the env."""
+        return self.env.reset(seed=seed, options={**self._options, **(options or {})})
+
+
+def _in_process(arm: ArmConfig) -> gym.Env[Any, Any]:
+    # Signals to the whole command (Ctrl-C, `timeout`) are for the run, which decides what becomes of its envs.
+    for which in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(which, signal.SIG_IGN)
+    return make_training_env(arm)
+
+
+def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    """Makes an env by the id and the arguments of a config.
+
+    Raises:
+        ConfigurationError: It cannot be made; whatever its own constructor says of its arguments.
+    """
+    check_env_id(env_id)  # a spawned process has not yet registered what the first one did
+    try:
+        return gym.make(env_id, **kwargs)
+    except SafeWrappersError:
+        raise
+    except Exception as error:
+        of = f" with kwargs {dict(kwargs)}" if kwargs else ""
+        raise ConfigurationError(
+            f"env: {env_id}{of} cannot be made: {type(error).__name__}: {error}"
+        ) from error
 
 
 def make_stack(
@@ -53,90 +101,91 @@ def make_stack(
     kwargs = env.kwargs if render_mode is None else {**env.kwargs, "render_mode": render_mode}
     task = make_env(env.id, kwargs)
     if env.cost is not None:
-        task = CostFunction(task, _function(env.cost, "env.cost"))
+        task = sw.CostFunction(task, env.cost)
     if env.judge is not None:
         task = ConstraintJudge(task, _filtered(task, env.judge))
     if env.occlusion is not None:
-        try:
-            task = OcclusionPenalty(task, **env.occlusion)
-        except TypeError as error:
-            raise ConfigurationError(f"env.occlusion: {error}") from None
+        task = _called("env.occlusion", sw.OcclusionPenalty, task, env.occlusion)
     observed = None if env.observation is None else _filtered(task, env.observation)
     task = _filtered(task, action_filter)
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
     if learner.maps and action_filter.kind != "none":
-        task = SafeActionMap(task)
+        task = sw.SafeActionMap(task)
     if observed is not None:
         task = _with_features(task, observed)
     if action_filter.escape is not None:
-        task = StuckEscape(task, **action_filter.escape)
-    recorded: gym.Env[Any, Any] = RecordInterventions(task)
+        task = sw.StuckEscape(task, **action_filter.escape)
+    recorded: gym.Env[Any, Any] = sw.RecordInterventions(task)
     for name, arguments in env.faults.items():
-        try:
-            recorded = FAULTS[name](recorded, **arguments)
-        except TypeError as error:
-            raise ConfigurationError(f"env.faults.{name}: {error}") from None
+        recorded = _called(f"env.faults.{name}", FAULTS[name], recorded, arguments)
     monitored = Monitor(recorded)
-    if not learner.penalised:
-        return monitored
-    return AdaptionPenalty(monitored, **learner.penalties)
+    return sw.AdaptionPenalty(monitored, **learner.penalties) if learner.penalised else monitored
+
+
+def _called(where: str, make: Callable[..., Any], env: gym.Env[Any, Any], given: Mapping[str, Any]) -> Any:
+    """What is made around an env; arguments that are missing or unknown are refused."""
+    try:
+        return make(env, **given)
+    except TypeError as error:
+        raise ConfigurationError(f"{where}: {error}") from error
 
 
 def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[Any, Any]:
     """The task in its filter; as it is if there is none."""
     if action_filter.protect is not None:
-        refuse_without_recipe(task)
-        return safe_wrappers.protect(task, **action_filter.protect)
-    if action_filter.factory is not None:
-        factory = _function(action_filter.factory, "filter.factory")
         try:
-            filtered: gym.Env[Any, Any] = factory(task, **action_filter.kwargs)
-        except TypeError as error:
+            return sw.protect(task, **action_filter.protect)
+        except UnsupportedEnvError as error:
             raise ConfigurationError(
-                f"filter: {action_filter.factory} refuses its kwargs: {error}"
-            ) from error
+                f"filter: {error}\n`safe-wrappers init FILE.yaml env=ID` writes these lines as a module with a"
+                ' function, for filter: {factory: "module:function"}.'
+            ) from None
+    if action_filter.factory is not None:
+        factory = _factory(action_filter.factory)
+        filtered: gym.Env[Any, Any] = _called("filter.kwargs", factory, task, action_filter.kwargs)
         return filtered
     return task
 
 
-def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> FilterObservation:
+def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     """The task with what its filter decides by; without one, what a filter around it, which is not stepped, would."""
     if filter_inside(task) is not None:
-        return FilterObservation(task)
+        return sw.FilterObservation(task)
     observer = filter_inside(observed)
     if observer is None:
         raise ConfigurationError(
             "env.observation: the filter has no constraints to observe (a CBFActionFilter has)"
         )
     plant = None if isinstance(observer.plant, MujocoPlant) else observer.plant
-    return FilterObservation(task, observer.constraints, plant)
+    return sw.FilterObservation(task, observer.constraints, plant)
 
 
-def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:
+def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """The lease around a filter; its clearance, if none is given, is what the filter keeps."""
     budget = arguments.get("budget") or {}
-    if "clearance" in budget:
-        return LeaseExpiry(task, **arguments)
-    constraints = getattr(task, "constraints", [])
-    if len(constraints) != 1:
-        raise ConfigurationError(
-            f"lease: the filter has {len(constraints)} constraints; say which one the lease is made from with "
-            "budget: {clearance: {kind: ..., ...}, ...}"
-        )
-    return LeaseExpiry(task, **{**arguments, "budget": {"clearance": constraints[0], **budget}})
+    if "clearance" not in budget:
+        constraints = getattr(task, "constraints", [])
+        if len(constraints) != 1:
+            raise ConfigurationError(
+                f"lease: the filter has {len(constraints)} constraints; say which one the lease is made from with "
+                "budget: {clearance: {kind: ..., ...}, ...}"
+            )
+        budget = {"clearance": constraints[0], **budget}
+    leased: gym.Env[Any, Any] = _called("filter.lease", sw.LeaseExpiry, task, {**arguments, "budget": budget})
+    return leased
 
 
-def _function(name: str, where: str) -> Any:
+def _factory(name: str) -> Any:
     """What a config calls `module:function`."""
     module_name, _, function = name.partition(":")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ConfigurationError(
-            f"{where}: cannot import {module_name!r}: {error}. Looked among the installed packages and in"
-            f" {', '.join(own_folders())}."
+            f"filter.factory: cannot import {module_name!r}: {error}. Modules beside the config and in the working"
+            " folder are found, too."
         ) from None
-    of = f"{module_name} ({getattr(module, '__file__', 'built in')})"
-    check_name(function, [name for name in dir(module) if not name.startswith("_")], of)
+    valid = [name for name in dir(module) if not name.startswith("_")]
+    check_name(function, valid, f"filter.factory: {module_name}")
     return getattr(module, function)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any
 
-from gymnasium import spaces
+from gymnasium import Space
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
@@ -20,19 +18,12 @@ from ..config import ArmConfig
 from .checkpoint import NORMALIZE
 from .data_pickles import pickles_of_model, read_pickle
 
-START_FILE: Final = "start.json"
-"""In a run's folder: whose policy it began with."""
-_SHOWN: Final = 3
-
 
 @dataclass(frozen=True)
 class Start:
-    """Whose policy a run begins with.
+    """Whose policy a run begins with: of the file `path`; or, with an `arm`, of the run of that arm in that folder.
 
-    Attributes:
-        name: As the config has it.
-        path: The file; or the folder of the arm's run with the same seed.
-        arm: The arm; None: a file.
+    `name` is as the config has it.
     """
 
     name: str
@@ -40,28 +31,23 @@ class Start:
     arm: ArmConfig | None = None
 
 
-class Policy(NamedTuple):
+@dataclass(frozen=True)
+class Policy:
     """What has to be the same for a policy to go on in another run."""
 
-    kind: str
-    observation_space: spaces.Space[Any]
-    action_space: spaces.Space[Any]
-    weights: Mapping[str, Any]
+    observation_space: Space[Any]
+    action_space: Space[Any]
+    weights: dict[str, Any]
     """Name -> tensor."""
-    statistics: Mapping[str, Any]
+    statistics: dict[str, Any]
     """What VecNormalize knows: `ret_rms`, and `obs_rms` if observations are scaled; empty without one."""
     timesteps: int = 0
 
 
 def policy_of_model(model: BaseAlgorithm) -> Policy:
     """Of a model that is there."""
-    return Policy(
-        type(model.policy).__name__,
-        model.observation_space,
-        model.action_space,
-        model.policy.state_dict(),
-        _statistics(model.get_vec_normalize_env()),
-    )
+    statistics = _statistics(model.get_vec_normalize_env())
+    return Policy(model.observation_space, model.action_space, model.policy.state_dict(), statistics)
 
 
 def policy_of_file(path: Path) -> Policy:
@@ -71,22 +57,18 @@ def policy_of_file(path: Path) -> Policy:
         ConfigurationError: There is none, or it is no SB3 model.
         RunStateError: A pickle in it names what is no data.
     """
-    if not path.is_file():
-        raise ConfigurationError(f"start_from: there is no file {str(path)!r}.")
     beside = path.parent / NORMALIZE
     try:
         data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=pickles_of_model(path))
         assert data is not None
-        weights: Any = parameters["policy"]
         return Policy(
-            data["policy_class"].__name__,
             data["observation_space"],
             data["action_space"],
-            weights,
+            parameters["policy"],
             _statistics(read_pickle(beside) if beside.exists() else None),
             int(data["num_timesteps"]),
         )
-    except (zipfile.BadZipFile, ValueError, AssertionError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, AssertionError, KeyError) as error:
         raise ConfigurationError(
             f"start_from: {str(path)!r} is no model that Stable-Baselines3 has saved ({error})."
         ) from None
@@ -104,33 +86,20 @@ def refuse_misfit(where: str, name: str, theirs: Policy, ours: Policy) -> None:
     Raises:
         ConfigurationError: Other spaces, another policy, or other scaling of observations.
     """
-    for what in ("observation_space", "action_space"):
-        there, here = getattr(theirs, what), getattr(ours, what)
-        if there != here:
-            raise ConfigurationError(
-                f"{where}: the policy of {name} is for another {what.replace('_', ' ')}: {there}; the arm's env has"
-                f" {here}."
-            )
     there, here = (
-        {key: tuple(tensor.shape) for key, tensor in policy.weights.items()} for policy in (theirs, ours)
+        {
+            "observation space": policy.observation_space,
+            "action space": policy.action_space,
+            f"scaling of observations (normalize.observation; of a file in {NORMALIZE})": "obs_rms"
+            in policy.statistics,
+        }
+        | {f"shape of {key}": tuple(tensor.shape) for key, tensor in policy.weights.items()}
+        for policy in (theirs, ours)
     )
-    differ = sorted(key for key in there.keys() | here.keys() if there.get(key) != here.get(key))
+    differ = [key for key in there | here if there.get(key) != here.get(key)]
     if differ:
-        shown = "; ".join(
-            f"{key} {there.get(key, 'missing')} there, {here.get(key, 'missing')} here"
-            for key in differ[:_SHOWN]
-        )
-        raise ConfigurationError(
-            f"{where}: the policy of {name}, a {theirs.kind}, has other weights than the arm's {ours.kind}: {shown}"
-            + (f"; and {len(differ) - _SHOWN} more" if len(differ) > _SHOWN else "")
-            + ". Give both the same algorithm, policy and policy_kwargs."
-        )
-    has, wants = ("scaled" if "obs_rms" in p.statistics else "as they are" for p in (theirs, ours))
-    if has != wants:
-        raise ConfigurationError(
-            f"{where}: the policy of {name} has learned from observations {has}, and the arm has them {wants}"
-            f" (normalize.observation). The statistics of a file are looked for in {NORMALIZE} beside it."
-        )
+        lines = (f"  {key}: {there.get(key)} there, {here.get(key)} here" for key in differ[:3])
+        raise ConfigurationError(f"{where}: the policy of {name} does not fit:\n" + "\n".join(lines))
 
 
 def begin_with(model: BaseAlgorithm, where: str, name: str, path: Path) -> dict[str, Any]:

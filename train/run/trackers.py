@@ -5,74 +5,51 @@ All are writers of SB3's logger, so that what algorithms and callbacks log of in
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import importlib.util
+import json
 import math
-import tempfile
-import time
-import uuid
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from PIL import Image
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
-from safe_wrappers.errors import ConfigurationError, RunStateError
+from safe_wrappers.errors import ConfigurationError
 
-from ..atomic import write_json
-from ..checksums import read_facts
 from ..config import ArmConfig
-
-TENSORBOARD: Final = "tensorboard"
-IDS_FILE: Final = "trackers.json"
-"""In a run's folder: by which ids its trackers know it, so that a run that goes on is still one run there."""
+from .folder import TENSORBOARD
 
 
 class Tracker(KVWriter):
-    """A run in one tracker.
+    """A run in one tracker; a run that goes on is still one run there.
+
+    What fails later is told in a warning, and training goes on.
 
     Args:
         arm: The run's arm; its settings are the tracker's.
         seed: Its seed.
         folder: The run's folder, `EXPERIMENT/ARM/seed_N`.
-
-    Raises:
-        RunStateError: The tracker refuses it. What fails later is told in a warning, and training goes on.
     """
 
     def __init__(self, arm: ArmConfig, seed: int, folder: Path) -> None:
-        path, kind, self._lost = folder / IDS_FILE, type(self).__name__, False
-        ids = read_facts(path, "delete it, and the run is a new one there.")
-        known = ids.get(kind)
-        try:
-            found = self._open(folder.resolve().parents[1].name, arm, seed, folder, known)
-        except Exception as error:
-            raise RunStateError(
-                f"{kind} does not take the run: {error}. Log in there, or work offline (WANDB_MODE=offline,"
-                " MLFLOW_TRACKING_URI=sqlite:///mlflow.db), or leave it out of `trackers`."
-            ) from error
-        if found != known:
-            write_json(path, {**ids, kind: found})
+        settings = {**arm.fingerprint(), "seed": seed}
+        settings.pop("total_steps")  # it may be raised
+        known = hashlib.sha256(f"{folder.resolve()} {json.dumps(settings, sort_keys=True)}".encode())
+        self._lost = False
+        self._open(folder, arm, f"{arm.name} seed {seed}", known.hexdigest()[:16], settings)
 
     @abstractmethod
-    def _open(self, experiment: str, arm: ArmConfig, seed: int, folder: Path, known: str | None) -> str:
-        """Begins or goes on with a run; returns its id."""
+    def _open(self, folder: Path, arm: ArmConfig, name: str, known: str, settings: dict[str, Any]) -> None:
+        """Begins a run, or goes on with the one that is known by this text."""
 
     @abstractmethod
     def _log(self, numbers: Mapping[str, float], step: int) -> None:
         """Takes numbers by their names."""
-
-    @abstractmethod
-    def _film(self, name: str, path: Path, step: int) -> None:
-        """Takes a film."""
-
-    @abstractmethod
-    def _close(self) -> None:
-        """Ends the run."""
 
     def write(
         self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
@@ -85,88 +62,60 @@ class Tracker(KVWriter):
             and TENSORBOARD not in (key_excluded.get(key) or ())
             and math.isfinite(value)
         }
-        if numbers:
-            self._unless_lost(self._log, numbers, step)
-
-    def film(self, name: str, path: Path, step: int) -> None:
-        """Takes a film (animated WebP) of the policy at this step."""
-        self._unless_lost(self._film, name, path, step)
-
-    def close(self) -> None:
-        """Ends the run there, until it goes on."""
-        self._unless_lost(self._close)
-
-    def _unless_lost(self, call: Callable[..., None], *arguments: Any) -> None:
-        if self._lost:
+        if self._lost or not numbers:
             return
         try:
-            call(*arguments)
+            self._log(numbers, step)
         except Exception as error:  # whatever a network does: the training is worth more than its curve
             self._lost = True
-            warnings.warn(f"{type(self).__name__}: what follows is not tracked: {error}", stacklevel=3)
+            warnings.warn(f"{type(self).__name__}: what follows is not tracked: {error}", stacklevel=2)
 
 
 class Wandb(Tracker):
     """Weights & Biases; `WANDB_MODE=offline` and the like are read by itself."""
 
-    def _open(self, experiment: str, arm: ArmConfig, seed: int, folder: Path, known: str | None) -> str:
-        self._wandb = importlib.import_module("wandb")
-        chosen = known or uuid.uuid4().hex[:12]
-        self._run = self._wandb.init(
-            project=experiment,
+    def _open(self, folder: Path, arm: ArmConfig, name: str, known: str, settings: dict[str, Any]) -> None:
+        self._run = importlib.import_module("wandb").init(
+            project=folder.resolve().parents[1].name,
             group=arm.name,
-            name=f"{arm.name} seed {seed}",
-            id=chosen,
+            name=name,
+            id=known,
             resume="allow",
             dir=str(folder),
-            config={**arm.fingerprint(), "seed": seed},
+            config=settings,
         )
         # By their own count: a run that goes on from a checkpoint makes some steps again.
         self._run.define_metric("timesteps")
         self._run.define_metric("*", step_metric="timesteps")
-        return chosen
 
     def _log(self, numbers: Mapping[str, float], step: int) -> None:
         self._run.log({**numbers, "timesteps": step})
 
-    def _film(self, name: str, path: Path, step: int) -> None:
-        # As a GIF: it shows no WebP.
-        with tempfile.TemporaryDirectory() as folder, Image.open(path) as animation:
-            picture = Path(folder) / f"{name}.gif"
-            animation.save(picture, save_all=True)
-            self._run.log({f"films/{name}": self._wandb.Video(str(picture), format="gif"), "timesteps": step})
-
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Ends the run there, until it goes on."""
         self._run.finish()
 
 
 class Mlflow(Tracker):
     """MLflow; `MLFLOW_TRACKING_URI` is read by itself."""
 
-    def _open(self, experiment: str, arm: ArmConfig, seed: int, folder: Path, known: str | None) -> str:
-        self._mlflow = importlib.import_module("mlflow")
-        self._client = self._mlflow.MlflowClient()
-        if known is not None:
-            self._client.update_run(known, status="RUNNING")
-            self._id = known
-            return known
-        there = self._client.get_experiment_by_name(experiment)
-        of = self._client.create_experiment(experiment) if there is None else there.experiment_id
-        run = self._client.create_run(of, run_name=f"{arm.name} seed {seed}", tags={"arm": arm.name})
-        self._id = str(run.info.run_id)
-        for key, value in {**arm.fingerprint(), "seed": seed}.items():
+    def _open(self, folder: Path, arm: ArmConfig, name: str, known: str, settings: dict[str, Any]) -> None:
+        mlflow = importlib.import_module("mlflow")
+        mlflow.set_experiment(folder.resolve().parents[1].name)
+        self._client = mlflow.MlflowClient()
+        of = mlflow.get_experiment_by_name(folder.resolve().parents[1].name).experiment_id
+        found = self._client.search_runs([of], f"tags.known = '{known}'")
+        run = found[0] if found else self._client.create_run(of, tags={"known": known}, run_name=name)
+        self._id = run.info.run_id
+        for key, value in {} if found else settings.items():
             self._client.log_param(self._id, key, value)
-        return self._id
 
     def _log(self, numbers: Mapping[str, float], step: int) -> None:
-        metric, now_ms = self._mlflow.entities.Metric, int(1000 * time.time())
-        found = [metric(name, value, now_ms, step) for name, value in numbers.items()]
-        self._client.log_batch(self._id, metrics=found)
+        for key, value in numbers.items():
+            self._client.log_metric(self._id, key, value, step=step, synchronous=False)
 
-    def _film(self, name: str, path: Path, step: int) -> None:
-        self._client.log_artifact(self._id, str(path), "films")
-
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Ends the run there, until it goes on."""
         self._client.set_terminated(self._id)
 
 
@@ -175,17 +124,10 @@ _TRACKERS: Final[Mapping[str, type[Tracker]]] = {"wandb": Wandb, "mlflow": Mlflo
 
 def run_logger(arm: ArmConfig, seed: int, folder: Path) -> Logger:
     """SB3's logger of a run: TensorBoard, and the arm's trackers."""
-    where = folder / TENSORBOARD
-    where.mkdir(parents=True, exist_ok=True)
-    writers: list[KVWriter] = [TensorBoardOutputFormat(str(where))]
-    return Logger(str(where), [*writers, *_open(arm, seed, folder)])
-
-
-def track_film(arm: ArmConfig, seed: int, folder: Path, name: str, path: Path, step: int) -> None:
-    """Gives a film of a run's policy to the arm's trackers."""
-    for tracker in _open(arm, seed, folder):
-        tracker.film(name, path, step)
-        tracker.close()
+    where = str(folder / TENSORBOARD)
+    (folder / TENSORBOARD).mkdir(parents=True, exist_ok=True)
+    trackers = [_TRACKERS[name](arm, seed, folder) for name in arm.trackers]
+    return Logger(where, [TensorBoardOutputFormat(where), *trackers])
 
 
 def check_trackers(arm: ArmConfig) -> None:
@@ -199,7 +141,3 @@ def check_trackers(arm: ArmConfig) -> None:
             raise ConfigurationError(
                 f"arms.{arm.name}.trackers: {name} is not installed: pip install 'safe-wrappers[{name}]'"
             )
-
-
-def _open(arm: ArmConfig, seed: int, folder: Path) -> list[Tracker]:
-    return [_TRACKERS[name](arm, seed, folder) for name in arm.trackers]

@@ -8,18 +8,19 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.scene import set_size
+from safe_wrappers.checks import Array
+from safe_wrappers.drawing.scene import find_renderer, set_size
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
 
 from ..evaluation.step_log import is_violation
 from ..run.policy import TrainedPolicy
-from .sight import InSight
 
 WIDTH: Final = 480
 HEIGHT: Final = 360
@@ -27,7 +28,7 @@ HEIGHT: Final = 360
 STRIP: Final = 16
 """Below it, px."""
 TITLE: Final = 24
-"""Above it, px; a film without a title has none."""
+"""Above it, px."""
 MOST_FRAMES: Final = 100
 MOST_BYTES: Final = 2_000_000
 _LONGEST_S: Final = 10.0
@@ -42,6 +43,8 @@ _COLORS: Final = {
     "now": (255, 255, 255),
     "title": (29, 35, 43),
 }
+_SEEN: Final = 0.6
+"""Share of the picture, about its middle, in which a robot is kept: words and strips are near the edges."""
 
 
 def for_film(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
@@ -50,20 +53,73 @@ def for_film(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     return InSight(env if filter_inside(env) is None else SafetyOverlay(env))
 
 
-@dataclass
-class Film:
-    """Collects frames and what happened at each step; thins itself out where the episode is longer than thought.
+class InSight(gym.Wrapper[Any, Any, Any, Any]):
+    """Frames in which the robot stays in sight: the free camera moves sideways by as little as that takes.
 
-    Ask `wants_frame` before each step and give it one if so; tell it of every step.
+    Fixed cameras stay where they are, and so does the picture of an env that MuJoCo does not draw.
+
+    Args:
+        env: Makes frames (render mode "rgb_array").
     """
 
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._home: Array | None = None
+
+    def render(self) -> Any:
+        """The env's frame."""
+        renderer = find_renderer(self.env)
+        if renderer is not None and renderer.camera_id in (None, -1):
+            viewer = renderer._get_viewer(str(self.render_mode))
+            # Half of what a frame costs without a graphics card.
+            viewer.scn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+            camera = viewer.cam
+            if self._home is None:
+                self._home = camera.lookat.copy()
+            root = robot_root(renderer.model)
+            if root is not None:
+                robot, aspect = renderer.data.subtree_com[root], renderer.width / renderer.height
+                camera.lookat[:] = self._home + _aside(renderer.model, camera, self._home, robot, aspect)
+        return self.env.render()
+
+
+def robot_root(model: mujoco.MjModel) -> int | None:
+    """The root body of what the first actuator moves; None where it moves no joint, site or body."""
+    kinds = mujoco.mjtTrn
+    for kind, at in zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True):
+        if kind in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
+            return int(model.body_rootid[model.jnt_bodyid[at]])
+        if kind == kinds.mjTRN_SITE:
+            return int(model.body_rootid[model.site_bodyid[at]])
+        if kind == kinds.mjTRN_BODY:
+            return int(model.body_rootid[at])
+    return None
+
+
+def _aside(model: mujoco.MjModel, camera: Any, home: Array, robot: Array, aspect: float) -> Array:
+    """By how much, m, a camera has to look beside a point so that the robot is inside the picture's middle."""
+    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
+    flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    ahead = np.cos(elevation) * flat + np.array([0.0, 0.0, np.sin(elevation)])
+    right = np.array([flat[1], -flat[0], 0.0])
+    offset = robot - (home - camera.distance * ahead)
+    half = max(offset @ ahead, 0.0) * np.tan(np.radians(model.vis.global_.fovy) / 2.0)
+    aside = np.zeros(3)
+    for axis, reach in ((right, half * aspect), (np.cross(right, ahead), half)):
+        place = offset @ axis
+        aside += (place - np.clip(place, -_SEEN * reach, _SEEN * reach)) * axis
+    return aside
+
+
+@dataclass
+class Film:
+    """An episode's frames, every `stride` steps, and what happened at each step."""
+
+    stride: int
     frames: list[Image.Image] = field(default_factory=list)
-    stride: int = 1
     changed: list[bool] = field(default_factory=list)
     violated: list[bool] = field(default_factory=list)
     title: str = ""
-    figures: dict[str, Any] = field(default_factory=dict)
-    """The episode's, as `RecordInterventions` has them."""
 
     @property
     def wants_frame(self) -> bool:
@@ -71,36 +127,16 @@ class Film:
         return len(self.changed) % self.stride == 0
 
     def add_frame(self, pixels: NDArray[np.uint8]) -> None:
-        """Takes the frame before the coming step, shape (height, width, 3)."""
+        """Takes the frame before the coming step, shape (height, width, 3).
+
+        Every other frame goes where the episode is longer than thought.
+        """
         if len(self.frames) == MOST_FRAMES:
-            self.frames = self.frames[::2]
-            self.stride *= 2
-            if not self.wants_frame:
-                return
-        picture = Image.fromarray(np.ascontiguousarray(pixels[..., :3], dtype=np.uint8))
-        width = round(picture.width * HEIGHT / picture.height)
-        self.frames.append(picture.resize((width, HEIGHT), Image.Resampling.LANCZOS))
-
-    def add_step(self, changed: bool, violated: bool) -> None:
-        """Takes what the step did."""
-        self.changed.append(changed)
-        self.violated.append(violated)
-
-
-def stride_of(steps: int) -> int:
-    """Every which step is filmed, so that an episode of that many needs no thinning."""
-    return -(-steps // MOST_FRAMES)
-
-
-def speed_of(steps: int, fps: float) -> float:
-    """Times real time at which an episode is shown, so that it takes 4 to 10 seconds.
-
-    Args:
-        steps: Of the longest episode.
-        fps: Control steps per second of the task.
-    """
-    real_s = steps / fps
-    return real_s / min(max(real_s, _SHORTEST_S), _LONGEST_S)
+            self.frames, self.stride = self.frames[::2], 2 * self.stride
+        if self.wants_frame:
+            picture = Image.fromarray(np.ascontiguousarray(pixels[..., :3], dtype=np.uint8))
+            width = round(picture.width * HEIGHT / picture.height)
+            self.frames.append(picture.resize((width, HEIGHT), Image.Resampling.LANCZOS))
 
 
 def film_episodes(
@@ -117,15 +153,17 @@ def film_episodes(
         The animated WebP, times real time at which it shows them, and each episode.
     """
     longest = (env.spec.max_episode_steps if env.spec is not None else None) or 1
-    films = [_film_episode(policy, env, title, seed, stride_of(longest)) for title, seed in seeds.items()]
+    stride = -(-longest // MOST_FRAMES)
+    films = [_film_episode(policy, env, title, seed, stride) for title, seed in seeds.items()]
     fps = float(env.metadata.get("render_fps") or 30.0)
-    # One speed for all conditions, also where one of them ends early.
-    speed = speed_of(max(longest, *(len(film.changed) for film in films)), fps)
-    return encode(films, fps, speed), speed, films
+    # One speed for all conditions, also where one of them ends early; it takes 4 to 10 seconds.
+    real_s = max(longest, *(len(film.changed) for film in films)) / fps
+    speed = real_s / min(max(real_s, _SHORTEST_S), _LONGEST_S)
+    return encode(films, fps * speed), speed, films
 
 
 def _film_episode(policy: TrainedPolicy, env: gym.Env[Any, Any], title: str, seed: int, stride: int) -> Film:
-    film = Film(stride=stride)
+    film = Film(stride)
     observation, _ = env.reset(seed=seed)
     policy.begin(env)
     done = False
@@ -133,55 +171,39 @@ def _film_episode(policy: TrainedPolicy, env: gym.Env[Any, Any], title: str, see
         if film.wants_frame:
             film.add_frame(env.render())  # type: ignore[arg-type]
         observation, _, terminated, truncated, info = env.step(policy(observation))
-        film.add_step(bool(info.get(keys.CBF_INTERVENED, False)), is_violation(info))
+        film.changed.append(bool(info.get(keys.CBF_INTERVENED, False)))
+        film.violated.append(is_violation(info))
         done = terminated or truncated
-    film.figures = info[keys.EPISODE_SUMMARY]
-    hurt = f", {film.figures['violations']:,} in violation" if "violations" in film.figures else ""
-    film.title = f"{title}: episode {seed}, return {film.figures['return']:.1f}{hurt}"
+    figures = info[keys.EPISODE_SUMMARY]
+    hurt = f", {figures['violations']:,} in violation" if "violations" in figures else ""
+    film.title = f"{title}: episode {seed}, return {figures['return']:.1f}{hurt}"
     return film
 
 
-def encode(films: Sequence[Film], fps: float, speed: float) -> bytes:
+def encode(films: Sequence[Film], steps_per_s: float) -> bytes:
     """An endless animated WebP of at most `MOST_BYTES`; half of the frames go until it fits.
 
     Args:
         films: Shown side by side, each with at least one frame; where one ends early, its last frame stays.
-        fps: Control steps per second of the task.
-        speed: Times real time.
+        steps_per_s: Control steps that are shown per second.
     """
     stride = max(film.stride for film in films)
     steps = max(len(film.changed) for film in films)
     while True:
-        pictures = [_side_by_side(films, at) for at in range(0, max(steps, 1), stride)]
+        pictures = [_side_by_side([_picture(film, at) for film in films]) for at in range(0, steps, stride)]
         data = io.BytesIO()
+        duration = max(1, round(1000 * stride / steps_per_s))
         pictures[0].save(
-            data,
-            "WEBP",
-            save_all=True,
-            append_images=pictures[1:],
-            duration=max(1, round(1000 * stride / (fps * speed))),
-            loop=0,
-            quality=_QUALITY,
-            method=3,
-        )
+            data, "WEBP", save_all=True, append_images=pictures[1:], duration=duration, loop=0, quality=_QUALITY
+        )  # fmt: skip
         if data.tell() <= MOST_BYTES or len(pictures) == 1:
             return data.getvalue()
         stride *= 2
 
 
-def first_frame(animation: bytes) -> bytes:
-    """The still picture for those who asked their system for less motion, and for paper."""
-    data = io.BytesIO()
-    with Image.open(io.BytesIO(animation)) as picture:
-        picture.convert("RGB").save(data, "WEBP", quality=_QUALITY)
-    return data.getvalue()
-
-
-def _side_by_side(films: Sequence[Film], step: int) -> Image.Image:
-    """Every film's picture of a step."""
-    parts = [_picture(film, step) for film in films]
+def _side_by_side(parts: Sequence[Image.Image]) -> Image.Image:
     width = sum(part.width for part in parts) + _GAP * (len(parts) - 1)
-    whole = Image.new("RGB", (width, max(part.height for part in parts)), _COLORS["now"])
+    whole = Image.new("RGB", (width, parts[0].height), _COLORS["now"])
     left = 0
     for part in parts:
         whole.paste(part, (left, 0))
@@ -203,9 +225,8 @@ def _picture(film: Film, step: int) -> Image.Image:
         row[np.asarray(flags, dtype=bool)[columns]] = _COLORS[color]
     now = min(picture.width - 1, at * film.stride * picture.width // steps)
     row[max(0, now - _WIDE) : now + _WIDE + 1] = _COLORS["now"]
-    top = TITLE if film.title else 0
-    whole = Image.new("RGB", (picture.width, top + picture.height + STRIP), _COLORS["now"])
+    whole = Image.new("RGB", (picture.width, TITLE + picture.height + STRIP), _COLORS["now"])
     ImageDraw.Draw(whole).text((4, 3), film.title, _COLORS["title"], ImageFont.load_default(size=15))
-    whole.paste(picture, (0, top))
-    whole.paste(Image.fromarray(np.tile(row[None], (STRIP, 1, 1))), (0, top + picture.height))
+    whole.paste(picture, (0, TITLE))
+    whole.paste(Image.fromarray(np.tile(row[None], (STRIP, 1, 1))), (0, TITLE + picture.height))
     return whole

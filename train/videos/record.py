@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
-from safe_wrappers.errors import ConfigurationError, RunStateError
+from safe_wrappers.errors import ConfigurationError
 
-from ..atomic import write_bytes, write_json
-from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
 from ..evaluation.episode_selection import ShownEpisode, shown_episode
 from ..evaluation.evaluate import conditions
-from ..processes.job import Job, Progress
-from ..processes.parallel import RunsFailedError, environment, run_jobs
+from ..files import read_json, write_bytes, write_json
+from ..processes import Job, Progress, RunsFailedError, environment
+from ..processes.parallel import run_jobs
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
-from ..run.trackers import track_film
 from ..run.training import finished_checkpoint
 from .film import film_episodes, for_film
 from .rendering import find_rendering
@@ -28,22 +27,13 @@ from .rendering import find_rendering
 _PROBLEM: Final = "problem.json"
 
 
-@dataclass(frozen=True)
-class Filmed:
-    """What is to be said of one episode on film."""
-
-    title: str
-    steps: int
-    changed: int
-
-
-@dataclass(frozen=True)
-class Video:
-    """Episodes on film, side by side."""
+class Video(NamedTuple):
+    """Episodes on film, side by side, and times real time at which they are shown."""
 
     animation: bytes
     speed: float
-    episodes: list[Filmed]
+    episodes: list[tuple[str, int, int]]
+    """The title of each, its steps, and how many of them were changed."""
 
 
 def video_path(experiment: ExperimentConfig, arm: ArmConfig, condition: str) -> Path:
@@ -53,17 +43,15 @@ def video_path(experiment: ExperimentConfig, arm: ArmConfig, condition: str) -> 
 
 def load_video(path: Path) -> Video | None:
     """Reads a video back; None if there is none."""
-    facts = path.with_suffix(".json")
-    if not (path.exists() and facts.exists()):
+    facts = _facts(path)
+    if not facts or not path.exists():
         return None
-    try:
-        values = read_facts(facts, "")
-    except RunStateError:
-        return None
-    if damage(path.parent, values.get("files", {})) is not None:
-        return None
-    episodes = [Filmed(**episode) for episode in values["episodes"]]
-    return Video(path.read_bytes(), values["speed"], episodes)
+    return Video(path.read_bytes(), facts["speed"], [tuple(episode) for episode in facts["episodes"]])
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    """What was noted of a film; empty where there is none."""
+    return read_json(path.with_suffix(".json"))
 
 
 def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
@@ -77,9 +65,7 @@ def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
 def video_problem(experiment: ExperimentConfig) -> str:
     """The one line that says why there are no videos; empty if nothing is known to stand against them."""
     path = experiment.folder / "videos" / _PROBLEM
-    return str(
-        read_facts(path, "`safe-wrappers evaluate` (or `compare`) writes it again.").get("problem", "")
-    )
+    return str(read_json(path).get("problem", ""))
 
 
 def record_videos(experiment: ExperimentConfig, console: Console) -> None:
@@ -96,9 +82,7 @@ def record_videos(experiment: ExperimentConfig, console: Console) -> None:
     for arm in experiment.arms:
         if arm.env not in envs:
             envs.append(arm.env)
-    for env in envs:
-        arms = [arm for arm in experiment.arms if arm.env == env]
-        problem = _record_arms(experiment, arms, env, shown, console) or problem
+            problem = _record_env(experiment, arm.env, shown, console) or problem
     path = experiment.folder / "videos" / _PROBLEM
     path.unlink(missing_ok=True)
     if problem:
@@ -106,32 +90,22 @@ def record_videos(experiment: ExperimentConfig, console: Console) -> None:
         console.print(f"No videos: {problem}", highlight=False, soft_wrap=True, markup=False)
 
 
-def _record_arms(
-    experiment: ExperimentConfig, arms: list[ArmConfig], env: EnvConfig, shown: ShownEpisode, console: Console
-) -> str:
-    """Films arms of one env; returns what stood against it."""
-    jobs = [
-        Job(
-            f"video {arm.name} {condition.replace('_', ' ')}",
-            1,
-            "episodes",
-            record_video,
-            (
-                arm,
-                shown,
-                experiment.run_folder(arm, shown.seed),
-                used,
-                video_path(experiment, arm, condition),
-            ),
-        )
-        for arm in arms
-        for condition, used in conditions(arm, experiment.evaluation_filter).items()
-        if not _up_to_date(experiment, arm, condition, used, shown)
-    ]
+def _record_env(experiment: ExperimentConfig, env: EnvConfig, shown: ShownEpisode, console: Console) -> str:
+    """Films the arms of one env; returns what stood against it."""
+    jobs = []
+    for arm in experiment.arms:
+        folder = experiment.run_folder(arm, shown.seed)
+        for condition, used in conditions(arm, experiment.evaluation_filter).items():
+            path = video_path(experiment, arm, condition)
+            state = _state(arm, used, shown, finished_checkpoint(arm, shown.seed, folder).timesteps)
+            if arm.env == env and (_facts(path).get("state") != state or not path.exists()):
+                path.unlink(
+                    missing_ok=True
+                )  # a film of another policy or episode must not be taken for this one
+                name = f"video {arm.name} {condition.replace('_', ' ')}"
+                jobs.append(Job(name, 1, "episodes", record_video, (arm, shown, folder, used, path)))
     if not jobs:
         return ""
-    for job in jobs:  # a film of another policy or episode must not be taken for this one
-        job.arguments[-1].unlink(missing_ok=True)
     if "rgb_array" not in _render_modes(env):
         return f"{env.id} draws no frames (it has no render mode rgb_array)."
     rendering = find_rendering(env)
@@ -142,10 +116,6 @@ def _record_arms(
             run_jobs(jobs, experiment.workers, console, "Videos")
     except RunsFailedError as error:
         return f"filming {env.id} failed: {str(error).strip().splitlines()[-1]}"
-    for job in jobs:
-        arm, _, folder, _, path = job.arguments
-        steps = finished_checkpoint(arm, shown.seed, folder).timesteps
-        track_film(arm, shown.seed, folder, path.stem.removeprefix(f"{arm.name}_"), path, steps)
     return ""
 
 
@@ -163,55 +133,36 @@ def record_video(
         progress: Where to report to.
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
-    policy = TrainedPolicy(arm, checkpoint)
+    policy = TrainedPolicy(arm, checkpoint.folder)
     filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
-    env = for_film(make_stack(filmed, used, arm.learner.in_evaluation))
-    try:
+    with closing(for_film(make_stack(filmed, used, arm.learner.in_evaluation))) as env:
         animation, speed, films = film_episodes(policy, env, shown.filmed)
-    finally:
-        env.close()
     write_bytes(path, animation)
     facts = {
         "state": _state(arm, used, shown, checkpoint.timesteps),
         "speed": speed,
-        "episodes": [asdict(Filmed(film.title, len(film.changed), sum(film.changed))) for film in films],
-        "files": checksums([path]),
+        "episodes": [(film.title, len(film.changed), sum(film.changed)) for film in films],
     }
     write_json(path.with_suffix(".json"), facts)
     progress.steps(1)
 
 
 def _state(arm: ArmConfig, used: FilterConfig, shown: ShownEpisode, timesteps: int) -> dict[str, Any]:
-    return {
+    """Whose film of what it is, as JSON gives it back."""
+    state = {
         "arm": arm.fingerprint(),
         "filter": used.plain(),
         "seed": shown.seed,
         "filmed": shown.filmed,
         "timesteps": timesteps,
     }
-
-
-def _up_to_date(
-    experiment: ExperimentConfig, arm: ArmConfig, condition: str, used: FilterConfig, shown: ShownEpisode
-) -> bool:
-    path = video_path(experiment, arm, condition)
-    facts = path.with_suffix(".json")
-    if not (path.exists() and facts.exists()):
-        return False
-    timesteps = finished_checkpoint(arm, shown.seed, experiment.run_folder(arm, shown.seed)).timesteps
-    expected = json.loads(json.dumps(_state(arm, used, shown, timesteps)))
-    try:
-        found = read_facts(facts, "")
-    except RunStateError:
-        return False
-    return found.get("state") == expected and damage(path.parent, found.get("files", {})) is None
+    found: dict[str, Any] = json.loads(json.dumps(state))
+    return found
 
 
 def _render_modes(env: EnvConfig) -> tuple[str, ...]:
     try:
-        made = make_stack(env, FilterConfig())
+        with closing(make_stack(env, FilterConfig())) as made:
+            return tuple(made.unwrapped.metadata.get("render_modes") or ())
     except ConfigurationError:
         return ()
-    modes = tuple(made.unwrapped.metadata.get("render_modes") or ())
-    made.close()
-    return modes

@@ -1,4 +1,8 @@
-"""Whether a task can draw frames on this machine, found out without risking this process."""
+"""Whether a task can draw frames on this machine, found out without risking this process.
+
+`python -m safe_wrappers.train.videos.rendering '["Id-v0", {}, []]'` draws one frame; the list is the asking process's
+`sys.path`: it may know modules that lie beside a config.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,12 @@ import sys
 from dataclasses import dataclass
 from typing import Final
 
-from ..config import EnvConfig
+import gymnasium as gym
+import numpy as np
+
+import safe_wrappers  # noqa: F401 (registers its tasks)
+
+from ..config import EnvConfig, check_env_id
 
 _SECONDS: Final = 60.0
 """A GL library that waits for a display never comes back."""
@@ -50,16 +59,11 @@ def find_rendering(env: EnvConfig) -> Rendering:
 
 def _probe(env: EnvConfig, variables: dict[str, str]) -> str:
     """What went wrong; empty if a frame was drawn."""
-    task = json.dumps([env.id, env.kwargs, sys.path])
-    command = [sys.executable, "-m", "safe_wrappers.train.render_probe", task]
+    command = [sys.executable, "-m", __name__, json.dumps([env.id, env.kwargs, sys.path])]
+    around = {**os.environ, **variables}
     try:
         done = subprocess.run(
-            command,
-            env={**os.environ, **variables},
-            capture_output=True,
-            text=True,
-            timeout=_SECONDS,
-            check=False,
+            command, env=around, capture_output=True, text=True, timeout=_SECONDS, check=False
         )
     except subprocess.TimeoutExpired:
         return f"no frame within {_SECONDS:.0f} s"
@@ -69,3 +73,21 @@ def _probe(env: EnvConfig, variables: dict[str, str]) -> str:
     if done.returncode < 0 or not lines:
         return f"the process ended with status {done.returncode}"
     return lines[-1][:120]
+
+
+def _draw_a_frame() -> None:
+    """Exits with 0 if the task drew a frame."""
+    env_id, kwargs, folders = json.loads(sys.argv[1])
+    sys.path.extend(folder for folder in folders if folder not in sys.path)
+    check_env_id(env_id)
+    env = gym.make(env_id, **{**kwargs, "render_mode": "rgb_array"})
+    env.reset(seed=0)
+    frame = np.asarray(env.render())
+    if frame.ndim != 3 or not frame.size:
+        raise SystemExit(f"a frame of shape {frame.shape} is no picture")
+    sys.stdout.flush()
+    os._exit(0)  # the frame is there; what GL libraries do on their way out is of no interest
+
+
+if __name__ == "__main__":
+    _draw_a_frame()

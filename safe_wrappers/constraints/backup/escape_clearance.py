@@ -18,8 +18,13 @@ from safe_wrappers.constraints.obstacles import (
     obstacle_marks,
     obstacles_from,
 )
-from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
-from safe_wrappers.control.backup.way_clearances import Around, least_left, way_clearances
+from safe_wrappers.control.backup.evasive_maneuvers import (
+    Around,
+    EvasiveManeuvers,
+    Maneuver,
+    least_left,
+    way_clearances,
+)
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
@@ -33,7 +38,6 @@ _DIRECTIONS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 _RECOVERY_S = 0.4  # time constant, s, with which the way out of a violation must come clear
 _BLENDS = (0.2, 0.4, 0.6, 0.8)  # shares of the way from a refused control to one that leaves a way out
 _APPROACHED = 2  # how many of those are approached
-_COMPILED = (Disc, Discs, Plane)  # obstacles that stand still, in `Around`
 
 
 @dataclass
@@ -49,7 +53,7 @@ class EscapeClearance(Constraint):
 
     Args:
         body: Name of the body on its two slides along x and y, each with a force actuator of its own.
-        obstacles: `TrackedDiscs`, `Discs`, and what stands still: `Disc`, `Box`, `Plane`.
+        obstacles: `TrackedDiscs`, `Discs`, and what stands still: `Disc`, `Plane`.
         radius: Of the machine around the body's origin, m.
         margin: Fixed protective distance, m.
         horizon_s: How far ahead, s: longer than the longest manoeuvre takes to come to rest.
@@ -68,14 +72,14 @@ class EscapeClearance(Constraint):
     horizon_s: float = 2.5
 
     def __post_init__(self) -> None:
-        self.obstacles = obstacles_from(self.obstacles)
+        self.obstacles = obstacles_from(self.obstacles, kinds=(TrackedDiscs, Discs, Disc, Plane))
         check_fields(self, non_negative, ("radius", "margin"), "m")
         self.horizon_s = positive("horizon_s", self.horizon_s, "s")
         if self.horizon_s <= max(_GOING_S):
             longest = f"the manoeuvres, which go for {max(_GOING_S):g} s before they brake"
             raise ConfigurationError(f"horizon_s must be longer than {longest}; got {self.horizon_s:g}")
         for obstacle in self.obstacles:
-            if len(getattr(obstacle, "center", getattr(obstacle, "point", ()))) > 2:
+            if isinstance(obstacle, Plane) and len(obstacle.point) > 2:
                 raise ConfigurationError(f"obstacles are seen from above: give {obstacle!r} x and y alone")
 
     def bind(self, plant: Plant) -> "BoundEscapeClearance":
@@ -152,7 +156,6 @@ class BoundEscapeClearance(BoundBackupClearance):
         fixed = [distances(o, self._position[None], self.plant)[0] - self.spec.radius for o in self._fixed]
         now = np.concatenate([moving, *fixed])
         near = [float(f.min(initial=np.inf)) for f in fixed]
-        self._others = [(o, d) for o, d in zip(self._fixed, near, strict=True) if type(o) not in _COMPILED]
         bounds = (centers - halves).min(axis=0), (centers + halves).max(axis=0)
         still = self._discs(near), self._planes(near)
         self._around = Around(centers[1:], halves[1:], sizes, *bounds, *still, self._position)
@@ -166,7 +169,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         """For `Around`; of clearances now of the fixed obstacles."""
         parts = [np.zeros((0, 4))]
         for obstacle, now in zip(self._fixed, near, strict=True):
-            if type(obstacle) in (Disc, Discs):
+            if not isinstance(obstacle, Plane):
                 centers = obstacle.centers(self.plant)[:, :2]
                 rest = np.tile([obstacle.radius + self.spec.radius, now], (len(centers), 1))
                 parts.append(np.concatenate([centers, rest], axis=1))
@@ -177,7 +180,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         rows = [
             [*_flat(obstacle.point), *_flat(obstacle.normal), self.spec.radius, now]
             for obstacle, now in zip(self._fixed, near, strict=True)
-            if type(obstacle) is Plane
+            if isinstance(obstacle, Plane)
         ]
         return np.array(rows).reshape(-1, 6)
 
@@ -206,12 +209,6 @@ class BoundEscapeClearance(BoundBackupClearance):
         position, velocity = self._held(controls)
         x, y = self._escapes.paths(position, velocity, self._open)
         nearest = way_clearances(x, y, self._around, self.spec.margin)
-        for obstacle, now in self._others:
-            here_x, here_y = self._position
-            if now - float(np.hypot(abs(x - here_x).max(), abs(y - here_y).max())) <= self.spec.margin:
-                points = np.stack([x.ravel(), y.ravel()], axis=1)
-                gap = distances(obstacle, points, self.plant).min(axis=1, initial=np.inf).reshape(x.shape)
-                np.minimum(nearest, gap - self.spec.radius, out=nearest)
         left = least_left(nearest, self._wanted)
         self._asked.append((velocity, self._open[left.argmax(axis=1)]))
         return left

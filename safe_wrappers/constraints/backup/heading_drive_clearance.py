@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, check_fields, non_negative
-from safe_wrappers.constraints.backup.base import BoundDetourClearance
-from safe_wrappers.constraints.backup.heading_drive_batch import HeadingDriveBatch
+from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
@@ -17,6 +17,7 @@ from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 from safe_wrappers.filter.constraint_batch import ConstraintBatch
+from safe_wrappers.plants.mujoco.actuators import Actuators, acting_ranges
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
@@ -94,7 +95,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
         self._scene = self.models, np.empty(6), self.discs(), self.spec.brake, self.reserve
         qpos, qvel, place = self.plant.qpos, self.plant.qvel, self.frame.place
-        value, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
+        value, self._in_play = among.least_clearance(qpos, qvel, place, self._scene)
         return np.array([value])
 
     @property
@@ -124,11 +125,11 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         if not self._in_play:
             return True
         drive, turn = self._pair(control).tolist()
-        return among.is_admitted(*self._scene, drive, turn)
+        return among.is_admitted(self._scene, drive, turn)
 
     def rows(self) -> HalfSpaces:
         """Secants of the clearance after one hold, over the acting controls, one row per disc in play."""
-        return self._half_spaces(*among.secants(*self._scene))
+        return self._half_spaces(*among.secants(self._scene))
 
     def _half_spaces(self, normals: Array, offsets: Array) -> HalfSpaces:
         return HalfSpaces(normals[:, ::-1].copy() if self.turns_first else normals, offsets)
@@ -138,7 +139,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         if not self.spec.detour:
             return []
         drive, turn = self._pair(control).tolist()
-        side = among.way_around(*self._scene, drive, turn, self._kept_side())
+        side = among.way_around(self._scene, drive, turn, self._kept_side())
         if side == 0.0:
             return []
         self._keep_side(side)
@@ -149,7 +150,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
 
         From inside a disc it drives out, whichever way is better.
         """
-        return self._pair(np.array([among.manoeuvre_drive(*self._scene), 0.0]))
+        return self._pair(np.array([among.manoeuvre_drive(self._scene), 0.0]))
 
     def draw(self) -> list[Mark]:
         """The discs with what is kept free before them; the outline of the area that braking sweeps, and its end."""
@@ -183,8 +184,115 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         plant, found = self.plant, np.empty(2)
         bounds = among.bounds_of(low, high, plant.lower, plant.upper, *plant.acting_range, self.turns_first)
         told = self._pair(proposal), self._kept_side(), self.spec.detour
-        return found, *among.closest_admitted(*self._scene, *told, bounds, found)
+        return found, *among.closest_admitted(self._scene, *told, bounds, found)
 
     def load(self, low: Array, high: Array) -> None:
-        among.is_admitted(*self._scene, 0.0, 0.0)
+        among.is_admitted(self._scene, 0.0, 0.0)
         self._closest(np.zeros(2), low, high)
+
+
+class HeadingDriveBatch(ConstraintBatch):
+    """The robots of n envs; positions and velocities are read from the envs' own data, without a delay.
+
+    Args:
+        bound: The constraint on every env's plant, all of one specification.
+        low: The action box, shape (2,).
+        high: Likewise.
+        dtype: Of actions: single or double precision.
+    """
+
+    def __init__(
+        self, bound: Sequence[BoundHeadingDriveClearance], low: Array, high: Array, dtype: np.dtype[Any]
+    ) -> None:
+        n = len(bound)
+        self._bound, self._single = list(bound), dtype == np.float32
+        self._low, self._high = low, high
+        self._sides, self._steps = np.zeros(n), np.zeros(n, dtype=np.int64)
+        self._positions: list[Array] = [np.zeros(3)] * n
+        self._velocities: list[Array] = [np.zeros(3)] * n
+        self._joints, self._motions = np.zeros((2, 3 * n)), np.zeros((n, 6))
+        self._origins = np.zeros((n, 2))
+        self._counts: list[int] = []
+        self._loaded = False
+        self._read_constants()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for i in range(len(self._bound)):  # a copy reads the data of the copied envs
+            self.restart(i, self.memory(i))
+
+    def _pairs(self, controls: Array) -> Array:
+        """(Drive, turn) from controls, shape (..., 2); the same swap leads back."""
+        return controls[..., ::-1] if self._bound[0].turns_first else controls
+
+    def restart(self, env: int, memory: Detour) -> None:
+        bound = self._bound[env]
+        self._positions[env], self._velocities[env] = bound.frame.views(bound.plant.published())
+        self._origins[env] = bound.frame.place[2:]
+        self._sides[env], self._steps[env] = memory
+
+    def memory(self, env: int) -> Detour:
+        return Detour(float(self._sides[env]), int(self._steps[env]))
+
+    def decide(
+        self, proposals: Array, judged: NDArray[np.bool_], controls: Array
+    ) -> tuple[Array, NDArray[np.int64]]:
+        self._observe()
+        n, one = len(proposals), self._bound[0]
+        scene = self._models, self._motions, self._discs, self._first, one.spec.brake, one.reserve
+        values, admitted, stages = np.empty(n), np.empty(n, dtype=bool), np.zeros(n, dtype=np.int64)
+        pairs = np.ascontiguousarray(self._pairs(proposals))
+        among.admit_each(*scene, pairs, values, admitted)
+        found, refused = pairs.copy(), np.flatnonzero(judged & ~admitted)
+        sides = np.where(self._steps > 0, self._sides, 0.0)
+        if refused.size or not self._loaded:  # the first step compiles what a later one would wait for
+            self._loaded = True
+            bounds, detour = self._bounds(refused), one.spec.detour
+            among.decide_each(*scene, pairs, refused, sides, detour, bounds, self._single, found, stages)
+        self._tried = np.where(judged & ~admitted, sides, 0.0)
+        controls[judged] = self._pairs(found)[judged]
+        return values, stages
+
+    def executed(self, envs: NDArray[np.bool_]) -> None:
+        detour = envs & (self._tried != 0.0)
+        self._sides[detour], self._steps[detour] = self._tried[detour], self._bound[0].detour_steps
+        self._steps[envs] -= 1
+
+    def _bounds(self, envs: NDArray[np.int64]) -> Array:
+        """The action box, and the part of it where forces still change, as (drive, turn), shape (r, 4, 2)."""
+        # Contiguous for any number of envs: else functions are compiled once for one env and again for several.
+        bounds, acting, dt = (
+            np.empty((len(envs), 4, 2)),
+            np.empty((len(envs), 2, 2)),
+            self._bound[0].plant.control_dt,
+        )
+        bounds[:, :2] = self._box[envs]
+        turn, on_hinge = self._bound[0].frame.turn_index, np.zeros((2, len(self._bound), 2))
+        on_hinge[:, :, turn] = self._turn_gear * self._motions[:, 2::3].T
+        acting_ranges(self._actuators, on_hinge[0], on_hinge[1], dt, envs, acting)
+        bounds[:, 2:] = np.clip(acting, bounds[:, :1], bounds[:, 1:2])
+        return np.ascontiguousarray(self._pairs(bounds))
+
+    def _observe(self) -> None:
+        """Take the present motion of every robot, and its discs."""
+        np.concatenate(self._positions, out=self._joints[0])
+        np.concatenate(self._velocities, out=self._joints[1])
+        self._motions[:] = self._joints.reshape(2, -1, 3).swapaxes(0, 1).reshape(-1, 6)
+        self._motions[:, :2] += self._origins
+        groups = [o.centers(b.plant)[:, :2] for b in self._bound for o in b.spec.obstacles]
+        counts = [*map(len, groups)]
+        if counts != self._counts:
+            discs = [b.discs() for b in self._bound]
+            self._counts, self._discs = counts, np.concatenate(discs)
+            self._first = np.cumsum([0, *map(len, discs)])
+        np.concatenate(groups, out=self._discs[:, :2])
+
+    def _read_constants(self) -> None:
+        models = [b.plant.model for b in self._bound]
+        self._models = np.array([b.models for b in self._bound])
+        self._actuators = Actuators(*map(np.array, zip(*map(Actuators.of, models), strict=True)))
+        turn = self._bound[0].frame.turn_index
+        self._turn_gear = np.array([m.actuator_gear[turn, 0] for m in models])
+        low = [np.maximum(self._low, b.plant.lower) for b in self._bound]
+        high = [np.minimum(self._high, b.plant.upper) for b in self._bound]
+        self._box = np.stack([low, high], axis=1)

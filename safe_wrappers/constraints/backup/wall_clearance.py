@@ -7,7 +7,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
-from safe_wrappers.control.backup import point_scene
+from safe_wrappers.control.backup import point_decision
 from safe_wrappers.control.backup.damped_axis import braking
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces
@@ -76,16 +76,16 @@ class BoundWallClearance(BoundBackupClearance):
         self._room = room = reach + self.spec.margin
         known = clip is not None
         at = point.axes, point.origin, point.joints, point.actuators
-        self._scene = point_scene.scene(*at, room, known, around)
+        self._scene = point_decision.scene(*at, room, known, around)
         self._motion = np.zeros(4)
 
     def clearance(self) -> Array:
         """Distance of the braking path from touching a wall, margin not taken off, m, shape (1,); no walls: (0,)."""
-        self._left = point_scene.room_left(self._scene, self.plant.qpos, self.plant.qvel, self._motion)
+        self._left = point_decision.room_left(self._scene, self.plant.qpos, self.plant.qvel, self._motion)
         return np.array([self._left + self.spec.margin] if len(self._scene[-1]) else [])
 
     def admits(self, control: Array) -> bool:
-        return point_scene.is_admitted(self._scene, self._motion, self._left, control)
+        return point_decision.is_admitted(self._scene, self._motion, self._left, control)
 
     def load(self, low: Array, high: Array) -> None:
         control = np.zeros(self.plant.model.nu)
@@ -96,19 +96,19 @@ class BoundWallClearance(BoundBackupClearance):
     def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
         """The proposal or the closest candidate, without a solver."""
         control = proposal.copy()
-        stage = point_scene.closest_admitted(self._scene, self._motion, self._left, low, high, control)
-        if stage == point_scene.UNRESOLVED:
+        stage = point_decision.closest_admitted(self._scene, self._motion, self._left, low, high, control)
+        if stage == point_decision.UNRESOLVED:
             return None
-        return proposal if stage == point_scene.PROPOSAL else control, stage, self._none
+        return proposal if stage == point_decision.PROPOSAL else control, stage, self._none
 
     def backup(self) -> Array:
         """The control that is always admitted: brake both axes. From outside it leads back inside."""
-        pair = point_scene.backup_pair(self._scene, self._motion, self._left)
+        pair = point_decision.backup_pair(self._scene, self._motion, self._left)
         return self._point.control(np.zeros(self.plant.model.nu), pair)
 
     def candidates(self, control: Array) -> list[Array]:
         """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
-        pairs = point_scene.candidates(self._scene, self._motion, self._left, control)
+        pairs = point_decision.candidates(self._scene, self._motion, self._left, control)
         return [self._point.control(control, pair) for pair in pairs]
 
     def draw(self) -> list[Mark]:
@@ -125,7 +125,7 @@ class BoundWallClearance(BoundBackupClearance):
 
     def rows(self) -> HalfSpaces:
         """Bounds on the control along x and y: a convex part of what is admitted, braking included."""
-        pairs, offsets = point_scene.half_spaces(self._scene, self._motion, self._left)
+        pairs, offsets = point_decision.half_spaces(self._scene, self._motion, self._left)
         normals = np.zeros((len(offsets), self.plant.model.nu))
         normals[:, self._point.actuators] = pairs
         return HalfSpaces(normals, offsets)

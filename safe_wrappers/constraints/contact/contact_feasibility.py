@@ -1,6 +1,5 @@
 """ContactFeasibility: the ground's forces on the robot stay inside their friction cones."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
-from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
@@ -64,13 +62,9 @@ class BoundContactFeasibility(BoundSlacks):
     def __init__(self, spec: ContactFeasibility, plant: Plant) -> None:
         super().__init__(spec, require_contacts(plant, "ContactFeasibility"))
         touching = touching_bodies(self.plant, "there is no cone to stay in")
-        chosen = np.flatnonzero(touching)
+        self._chosen = np.flatnonzero(touching)
         if self.spec.bodies is not None:
-            chosen = np.array([self._resting(name, touching) for name in self.spec.bodies])
-        self._index = np.full(self.plant.model.nbody, -1)
-        self._index[chosen] = np.arange(chosen.size)
-        self._size = chosen.size
-        self._weight_n = self.plant.weight_n
+            self._chosen = np.array([self._resting(name, touching) for name in self.spec.bodies])
 
     def _resting(self, name: str, touching: NDArray[np.bool_]) -> int:
         i = self.plant.named("body", name)
@@ -86,10 +80,12 @@ class BoundContactFeasibility(BoundSlacks):
         Infinite for a body that touches nothing; NaN where the simulation has diverged.
         """
         found = self.plant.contact_forecast(control)
-        if not found.finite:
-            return np.full(self._size, np.nan)
-        held = self.spec.friction_share, self._weight_n
-        return _worst(found.body, found.normal, found.force, found.friction, self._index, self._size, *held)
+        worst = np.full(self.plant.model.nbody, np.inf if found.finite else np.nan)
+        along = np.einsum("ki,ki->k", found.force, found.normal)
+        across = np.linalg.norm(found.force - along[:, None] * found.normal, axis=1)
+        inside = np.minimum(along, self.spec.friction_share * found.friction * along - across)
+        np.minimum.at(worst, found.body, inside / self.plant.weight_n)
+        return worst[self._chosen]
 
     def slacks(self, control: Array) -> Array:
         """What is left of the cone, tolerance added and margin taken off, per body, shares of the weight."""
@@ -110,33 +106,6 @@ def require_contacts(plant: Plant, asker: str) -> MujocoPlant:
     """The plant, if it can forecast contact forces."""
     hint = "forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
     return require_mujoco(plant, f"{asker} {hint}")
-
-
-@compiled
-def _worst(
-    body: NDArray[np.int64],
-    normals: Array,
-    forces: Array,
-    friction: Array,
-    index: NDArray[np.int64],
-    size: int,
-    share: float,
-    weight: float,
-) -> Array:
-    """Of each of the bodies that have an index, shape (size,), as `cone_excess` measures it with a share."""
-    worst = np.full(size, np.inf)
-    for i in range(len(body)):
-        which = index[body[i]]
-        if which < 0:
-            continue
-        n, f = normals[i], forces[i]
-        along = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
-        x, y, z = f[0] - along * n[0], f[1] - along * n[1], f[2] - along * n[2]
-        inside = share * friction[i] * along - math.sqrt(x * x + y * y + z * z)
-        least = (along if along < inside else inside) / weight
-        if least < worst[which] or least != least:  # what is not a number stays
-            worst[which] = least
-    return worst
 
 
 def checked_friction_share(share: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, whole_number
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.contact.contact_feasibility import checked_friction_share, touching_bodies
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.contact.friction_cone import cone_excess
@@ -26,6 +26,8 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
+_EDGES = 8  # of the pyramids inside the friction cones
+_SETTLE_S = 0.05  # time constant in which what still moves at a contact is to come to rest, s
 _SAME = 1e-9  # distance from the program's answer that is rounding, control units
 
 
@@ -42,30 +44,24 @@ class Stance(Constraint):
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1].
         cone: "pyramid" is conservative and quick, "exact" is the cone itself.
-        edges: Of the pyramid, >= 3.
         joint_tolerance: How far driven joints may press their stops, rad or m; None leaves them alone.
         zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, where there is one.
-        settle_s: Time constant in which what still moves at a contact is to come to rest, s.
 
     Source: appendix "Hierarchical whole-body control quadratic program".
     """
 
     friction_share: float = 0.7
     cone: Literal["pyramid", "exact"] = "pyramid"
-    edges: int = 8
     joint_tolerance: float | None = 0.1
     zmp_inset: float | None = None
-    settle_s: float = 0.05
 
     def __post_init__(self) -> None:
         self.friction_share = checked_friction_share(self.friction_share)
         if self.cone not in ("pyramid", "exact"):
             raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
-        self.edges = whole_number("edges", self.edges, 3)
         if self.joint_tolerance is not None:
             self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
         check_fields(self, positive, ("zmp_inset",), "m: forces that push do the rest")
-        check_fields(self, positive, ("settle_s",), "s")
 
     def bind(self, plant: Plant) -> "BoundStance":
         return BoundStance(self, plant)
@@ -117,7 +113,7 @@ class BoundStance(BoundConstraint):
         bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
         jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
         pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
-        acceleration = -(jacobians @ self.plant.qvel) / self.spec.settle_s
+        acceleration = -(jacobians @ self.plant.qvel) / _SETTLE_S
         limits: dict[str, Any] = {}
         if self.spec.joint_tolerance is not None:
             position, speed = self.plant.qpos[self._qpos], self.plant.qvel[self._dofs]
@@ -153,7 +149,7 @@ class BoundStance(BoundConstraint):
 
     def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
         exact = self.spec.cone == "exact"
-        return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, self.spec.edges)
+        return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, _EDGES)
 
     def admits(self, control: Array) -> bool:
         """Whether the standing contacts could answer this control with forces inside their cones."""

@@ -1,6 +1,5 @@
 """Limits on the positions and the speeds of hinges and slides, and which joints a constraint means."""
 
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -15,7 +14,7 @@ from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, HINGE, SCALAR_JOINTS
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, SCALAR_JOINTS
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
@@ -52,7 +51,7 @@ def _tied(model: mujoco.MjModel) -> list[set[int]]:
         elif kind in _LOOPS:
             at_sites = model.eq_objtype[e] == int(mujoco.mjtObj.mjOBJ_SITE)
             first, second = (
-                set(_chain(model, int(model.site_bodyid[end]) if at_sites else end)) for end in ends
+                set(chain(model, int(model.site_bodyid[end]) if at_sites else end)) for end in ends
             )
             groups.append(first ^ second)
     return groups + [_of_tendon(model, t) for t in np.flatnonzero(tendons).tolist()]
@@ -68,12 +67,12 @@ def _of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
         if kind == int(mujoco.mjtWrap.mjWRAP_JOINT):
             found.add(thing)
         elif kind == int(mujoco.mjtWrap.mjWRAP_SITE):
-            chains.append(set(_chain(model, int(model.site_bodyid[thing]))))
+            chains.append(set(chain(model, int(model.site_bodyid[thing]))))
     common = set.intersection(*chains) if chains else set[int]()
     return found.union(*chains) - common
 
 
-def _chain(model: mujoco.MjModel, body: int) -> list[int]:
+def chain(model: mujoco.MjModel, body: int) -> list[int]:
     """The joints between a body and the world."""
     found: list[int] = []
     while body:
@@ -196,26 +195,12 @@ class BoundJointPositionLimit(BoundRollout):
                 f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {self._low[j]:g} to "
                 f"{self._high[j]:g} with a margin of {self.spec.margin:g} at both ends"
             )
-        self._warn_of_degrees(own)
         self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
         if not (self._below.any() or self._above.any()):
             named = ", ".join(repr(model.joint(j).name) for j in ids)
             raise ConfigurationError(
                 f"none of these joints has a range in the model: pass lower and upper ({named})"
             )
-
-    def _warn_of_degrees(self, own: Array) -> None:
-        """Warn of a bound beyond a full turn and beyond twice the hinge's own range, shape (n, 2)."""
-        model: mujoco.MjModel = self.plant.model
-        for j, own_range, *bounds in zip(self._ids, own, self._low, self._high, strict=True):
-            known = max((abs(end) for end in own_range if np.isfinite(end)), default=0.0)
-            farthest = max((abs(bound) for bound in bounds if np.isfinite(bound)), default=0.0)
-            if model.jnt_type[j] == HINGE and farthest > 2.0 * max(known, np.pi):
-                warnings.warn(
-                    f"JointPositionLimit keeps the hinge {model.joint(j).name!r} between {bounds[0]:g} and "
-                    f"{bounds[1]:g} rad, and a full turn is 6.28 rad. If these are degrees, give np.deg2rad of them",
-                    stacklevel=2,
-                )
 
     def now(self) -> Array:
         return self._left(self.plant.qpos)

@@ -2,24 +2,27 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Final
 
+import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, name_list, positive
-from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain, Task
+from safe_wrappers.constraints.limits.joints import chain, driven_joints, refuse_uncovered, scalar_joints
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering import manipulability as of_arm
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS, SLIDE
 from safe_wrappers.plants.plant import Plant
 
+_JACOBIANS: Final = {"site": mujoco.mj_jacSite, "body": mujoco.mj_jacBody, "geom": mujoco.mj_jacGeom}
 _SAMPLES = 2000  # configurations that say which manipulability can be reached
 _STILL = 1e-9  # columns with a smaller norm are zero, m or rad per rad
 # Time constant of the rows, control intervals: a longer one brakes early, a shorter one is refused by forecasts.
 _DECAY_HOLDS = 2.0
-_ALONG_S = 1e-5  # width of the difference for the curvature of w along the motion, s
+_STEP, _ALONG = 1e-6, 1e-4  # widths of differences of w, over one joint and along the motion, rad or m
 
 
 @dataclass
@@ -37,10 +40,9 @@ class SingularityMargin(RolloutConstraint):
         site: Name of the site whose motion the task is about; or
         body: of a body, meaning its frame's origin; or
         geom: of a geom, meaning its centre.
-        directions: Of translation, some of "xyz".
-        rotations: About these axes, some of "xyz".
+        directions: Of translation, some of "xyz" in the world's axes.
+        rotations: About these axes, likewise.
         length: Length that weighs a rotation against a translation, m; needed if there are both.
-        frame: Axes of directions and rotations: the "world"'s or the frame's "own".
         joints: Names of those that do the task. None: those that an actuator drives directly and that move the frame.
         task_speed: Speed that has to be possible in every direction, m/s (rad/s for rotations alone).
         rate_limit: Largest rate of each joint at that speed, rad/s for hinges, m/s for slides.
@@ -59,7 +61,6 @@ class SingularityMargin(RolloutConstraint):
     directions: str = "xyz"
     rotations: str = ""
     length: float | None = None
-    frame: Literal["world", "own"] = "world"
     joints: Sequence[str] | None = None
     task_speed: float | None = None
     rate_limit: float | None = None
@@ -72,27 +73,34 @@ class SingularityMargin(RolloutConstraint):
 
     def __post_init__(self) -> None:
         self._check_shared()
-        speed, limit = self.task_speed, self.rate_limit
-        given, validated = self.threshold is not None, speed is not None and limit is not None
-        if given is validated or (given and (speed is not None or limit is not None)):
+        check_fields(self, positive, ("threshold", "task_speed", "rate_limit", "length"), "the task's units")
+        both = self.task_speed, self.rate_limit
+        if (self.threshold is None) is (None in both) or (
+            self.threshold is not None and both != (None, None)
+        ):
             raise ConfigurationError(
                 "give a threshold on the manipulability, or a task_speed and a rate_limit to validate one for; got "
                 f"threshold={self.threshold!r}, task_speed={self.task_speed!r}, rate_limit={self.rate_limit!r}"
             )
-        check_fields(self, positive, ("threshold",), "units of manipulability")
-        check_fields(self, positive, ("task_speed",), "task units per second")
-        check_fields(self, positive, ("rate_limit",), "rad/s or m/s")
-        kinds: tuple[FrameKind, ...] = ("site", "body", "geom")
-        named = [kind for kind in kinds if getattr(self, kind) is not None]
+        named = [kind for kind in _JACOBIANS if getattr(self, kind) is not None]
         if len(named) != 1 or not isinstance(getattr(self, named[0]), str):
-            found = ", ".join(f"{kind}={getattr(self, kind)!r}" for kind in kinds)
+            found = ", ".join(f"{kind}={getattr(self, kind)!r}" for kind in _JACOBIANS)
             raise ConfigurationError(f"name the one site, body or geom that the task moves; got {found}")
         self._kind = named[0]
-        if self.frame not in ("world", "own"):
-            raise ConfigurationError(f'frame is "world" or "own", got {self.frame!r}')
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
-        self._rows, self._weights = of_arm.task_rows(self.directions, self.rotations, self.length)
+        for name, given in (("directions", self.directions), ("rotations", self.rotations)):
+            if not (isinstance(given, str) and set(given) <= set("xyz") and len(set(given)) == len(given)):
+                raise ConfigurationError(f'{name} is some of "xyz", each once, or ""; got {given!r}')
+        if not self.directions + self.rotations:
+            raise ConfigurationError('a task has directions (some of "xyz"), rotations, or both; got neither')
+        if self.length is None and self.directions and self.rotations:
+            raise ConfigurationError(
+                "for both directions and rotations give the length (m) that weighs rotations"
+            )
+        weight = 1.0 if self.length is None else self.length
+        self._rows = ["xyz".index(d) for d in self.directions] + [3 + "xyz".index(r) for r in self.rotations]
+        self._weights = np.array([1.0] * len(self.directions) + [weight] * len(self.rotations))
 
     def bind(self, plant: Plant) -> "BoundSingularityMargin":
         return BoundSingularityMargin(self, plant)
@@ -105,40 +113,38 @@ class BoundSingularityMargin(BoundRollout):
 
     def __init__(self, spec: SingularityMargin, plant: Plant) -> None:
         super().__init__(spec, plant)
-        name = getattr(spec, spec._kind)
-        what = f"the {spec._kind} {name!r}"
-        self._chain = SerialChain(self.plant, self.spec._kind, name)
-        self._columns = self._chain.columns(self.spec.joints)
-        sampled = self._chain.sample(np.random.default_rng(0), _SAMPLES)
-        idle = np.linalg.norm(self._task(sampled), axis=1).max(axis=0) < _STILL
-        if self.spec.joints is not None and idle.any():
-            still = self._chain.name(self._columns[int(np.argmax(idle))])
-            nowhere = "in none of the task's directions: leave it out"
-            raise ConfigurationError(f"the joint {still!r} moves {what} {nowhere}")
-        self._columns = [c for c, does_nothing in zip(self._columns, idle, strict=True) if not does_nothing]
-        task = f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}"
-        count, wanted = len(self._columns), len(self.spec._rows)
-        if count < wanted:
-            there = ", ".join(map(self._chain.name, self._columns)) or "none"
+        model, kind = self.plant.model, spec._kind
+        name = getattr(spec, kind)
+        self._index, what = self.plant.named(kind, name), f"the {kind} {name!r}"
+        body = self._index if kind == "body" else int(getattr(model, f"{kind}_bodyid")[self._index])
+        carriers = sorted(chain(model, body))
+        self._carriers = [j for j in carriers if model.jnt_type[j] in SCALAR_JOINTS]
+        self._scalar = len(self._carriers) == len(carriers)
+        self._joints = self._doing(what)
+        self._data = mujoco.MjData(model)
+        sampled = self._sample()
+        jacobians = self._jacobians(sampled)
+        moving = np.linalg.norm(jacobians, axis=1).max(axis=0) > _STILL
+        self._joints = [j for j, moves in zip(self._joints, moving, strict=True) if moves]
+        jacobians = jacobians[..., moving]
+        task = f"directions={spec.directions!r}, rotations={spec.rotations!r}"
+        if len(self._joints) < len(spec._rows):
+            there = ", ".join(model.joint(j).name for j in self._joints) or "none"
             raise ConfigurationError(
-                f"{count} joints cannot move {what} in {wanted} directions at once ({task}); the joints are {there}"
+                f"{len(self._joints)} joints cannot move {what} in {len(spec._rows)} directions at once ({task}); "
+                f"the joints are {there}"
             )
-        own = self.spec.frame == "own"
-        self._what = Task(self.spec._rows, self.spec._weights, np.array(self._columns), own)
         # With as many joints as directions w is the determinant but for its sign, which turns at a singular pose.
-        self._signed, self._side = count == wanted, 1.0
-        found = np.abs(self._measure(sampled))
+        self._signed, self._side = len(self._joints) == len(spec._rows), 1.0
+        found = of_arm.manipulability(jacobians)
         most = float(found.max())
         if most < _STILL:
             nowhere = "cannot be moved in all of these directions at once in any configuration"
-            raise ConfigurationError(f"{what} {nowhere}: {task}, frame={self.spec.frame!r}")
-        if spec.threshold is not None:
-            self._threshold = spec.threshold
-        else:
+            raise ConfigurationError(f"{what} {nowhere}: {task}")
+        if spec.threshold is None:
             assert spec.task_speed is not None and spec.rate_limit is not None
-            jacobians = self._task(sampled)
             spec.validated = of_arm.validated_threshold(jacobians, spec.task_speed, spec.rate_limit)
-            self._threshold = spec.validated.threshold
+        self._threshold = spec.threshold if spec.validated is None else spec.validated.threshold
         if self._threshold * (1.0 + self.spec.margin) >= most:
             raise ConfigurationError(
                 f"no configuration has a manipulability above {self._threshold:g} with a margin of "
@@ -146,30 +152,67 @@ class BoundSingularityMargin(BoundRollout):
                 f"them are above {float(np.median(found)):.4g}"
             )
 
-    def _task(self, qpos: Array) -> Array:
-        """Shape (k, m, n)."""
-        return self._chosen(self._in_frame(*self._chain.jacobians(qpos)))
+    def _doing(self, what: str) -> list[int]:
+        """The joints that do the task, in the order of their ids; an error where they do not move the frame."""
+        model = self.plant.model
+        there = ", ".join(model.joint(j).name for j in self._carriers)
+        if self.spec.joints is None:
+            found = [j for j in driven_joints(model) if j in self._carriers]
+            if not found:
+                wanted = f"no actuator drives a joint that moves {what}: name the joints that move it"
+                raise ConfigurationError(f"{wanted}; there are {there or 'none'}")
+            remedy = "Name those that do the task: joints=[...]"
+            refuse_uncovered(model, self._carriers, remedy, self.plant.has_acceleration)
+            return found
+        ids = scalar_joints(self.plant, self.spec.joints)
+        for j, name in zip(ids, self.spec.joints, strict=True):
+            if j not in self._carriers:
+                wanted = f"the joint {name!r} does not move {what}"
+                raise ConfigurationError(f"{wanted}; those that do: {there}")
+        return sorted(set(ids))
 
-    def _chosen(self, jacobians: Array) -> Array:
-        """The task's directions, weighed, and the joints that do it, shape (..., m, n)."""
-        chosen = jacobians[..., self.spec._rows, :][..., self._columns]
-        return np.asarray(chosen * self.spec._weights[:, None])
+    def _sample(self) -> Array:
+        """Configurations with the joints that carry the frame uniform in their ranges, shape (samples, nq).
 
-    def _in_frame(self, jacobians: Array, axes: Array) -> Array:
-        """Six rows in the declared axes, shape (k, ..., 6, n)."""
-        if self.spec.frame == "world":
-            return jacobians
-        back = np.swapaxes(axes, -1, -2)
-        back = back.reshape(len(back), *(1,) * (jacobians.ndim - 3), 3, 3)
-        return np.concatenate([back @ jacobians[..., :3, :], back @ jacobians[..., 3:, :]], axis=-2)
+        A hinge without a range turns once; a slide without one, and every other joint, stays at the model's zero.
+        """
+        model, rng = self.plant.model, np.random.default_rng(0)
+        addresses = model.jnt_qposadr[self._carriers]
+        turn = np.where(model.jnt_type[self._carriers] == SLIDE, 0.0, np.pi)[:, None] * [-1.0, 1.0]
+        free = model.qpos0[addresses][:, None] + turn
+        limited = model.jnt_limited[self._carriers].astype(bool)[:, None]
+        ranges = np.where(limited, model.jnt_range[self._carriers], free)
+        qpos = np.tile(model.qpos0, (_SAMPLES, 1))
+        qpos[:, addresses] = rng.uniform(ranges[:, 0], ranges[:, 1], (_SAMPLES, len(addresses)))
+        return qpos
+
+    def _jacobians(self, qpos: Array) -> Array:
+        """The task's rows, weighed, over the joints that do it, at finite positions (k, nq): shape (k, m, n)."""
+        model, data, of_frame = self.plant.model, self._data, _JACOBIANS[self.spec._kind]
+        both = np.empty((len(qpos), 2, 3, model.nv))
+        for q, (linear, angular) in zip(qpos, both, strict=True):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            of_frame(model, data, linear, angular, self._index)
+        of_twist = both.reshape(len(qpos), 6, model.nv)[:, self.spec._rows]
+        return np.asarray(of_twist[..., model.jnt_dofadr[self._joints]] * self.spec._weights[:, None])
 
     def _measure(self, qpos: Array) -> Array:
         """w, shape (k,), below zero beyond the singular pose; NaN where a position is not finite."""
-        w = self._chain.manipulability(qpos, self._what)
-        return np.asarray(self._side * w if self._signed else np.abs(w))
+        finite, w = np.isfinite(qpos).all(axis=1), np.full(len(qpos), np.nan)
+        if finite.any():
+            jacobians = self._jacobians(qpos[finite])
+            signed = (
+                self._side * np.linalg.det(jacobians) if self._signed else of_arm.manipulability(jacobians)
+            )
+            w[finite] = signed
+        return w
 
     def now(self) -> Array:
-        self._chain.place(self.plant.pose())
+        if self.plant.model.nmocap:
+            pose = self.plant.pose()
+            self._data.mocap_pos[:], self._data.mocap_quat[:] = pose.mocap_pos, pose.mocap_quat
         self._side = 1.0
         w = self._measure(self.plant.qpos[None])
         if w[0] < 0.0:
@@ -179,30 +222,22 @@ class BoundSingularityMargin(BoundRollout):
     def room(self, forecast: Forecast) -> Array:
         return np.asarray(self._measure(forecast.qpos) / self._threshold - 1.0)[:, None]
 
-    def _slope(self, qpos: Array) -> Array:
-        """dw/dq over the chain's joints, shape (k, n)."""
-        jacobians, axes = self._chain.jacobians(qpos)
-        change = of_arm.chain_derivative(jacobians[:, :3], jacobians[:, 3:])
-        if self.spec.frame == "own":
-            # The axes turn with the joints, too.
-            turning = np.swapaxes(jacobians[:, 3:], 1, 2)[:, :, None, None, :]  # of joint k
-            blocks = np.swapaxes(jacobians.reshape(len(qpos), 2, 3, -1), 2, 3)[:, None]
-            carried = np.swapaxes(np.cross(turning, blocks), 3, 4)
-            change = change - carried.reshape(change.shape)
-        task, moved = (self._chosen(self._in_frame(part, axes)) for part in (jacobians, change))
-        return of_arm.manipulability_gradient(task, moved)
-
     def rows(self) -> HalfSpaces:
         """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides."""
-        if not (self._chain.scalar and self.plant.has_acceleration):
+        if not (self._scalar and self.plant.has_acceleration):
             return super().rows()
-        drift, effect = self.plant.acceleration
-        speeds = self.plant.qvel[self._chain.dofs]
-        along = np.tile(self.plant.qpos, (3, 1))
-        along[1:, self._chain.qpos] += np.outer([_ALONG_S, -_ALONG_S], speeds)
-        slope, ahead, behind = self._slope(along) / self._threshold
-        curvature = (ahead - behind) @ speeds / (2.0 * _ALONG_S)
+        model, n = self.plant.model, len(self._carriers)
+        places, dofs = model.jnt_qposadr[self._carriers], model.jnt_dofadr[self._carriers]
+        speeds = self.plant.qvel[dofs]
+        along = _ALONG / max(float(np.linalg.norm(speeds)), 1e-6)  # s
+        beside = np.tile(self.plant.qpos, (2 * n + 2, 1))
+        beside[:, places] += np.concatenate(
+            [_STEP * np.eye(n), -_STEP * np.eye(n), along * np.outer([1, -1], speeds)]
+        )
+        w = self._measure(beside) / self._threshold
+        slope = (w[:n] - w[n : 2 * n]) / (2.0 * _STEP)
+        curvature = (w[-2] - 2.0 * (self._least + 1.0) + w[-1]) / along**2
         a = 1.0 / (_DECAY_HOLDS * self.plant.control_dt)
         left = 2.0 * a * (slope @ speeds) + a * a * (self._least - self.spec.margin)
-        drift, effect = drift[self._chain.dofs], effect[self._chain.dofs]
-        return HalfSpaces(-(slope @ effect)[None], np.array([slope @ drift + curvature + left]))
+        drift, effect = self.plant.acceleration
+        return HalfSpaces(-(slope @ effect[dofs])[None], np.array([slope @ drift[dofs] + curvature + left]))

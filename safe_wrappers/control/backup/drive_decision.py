@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.drive_among_discs import (
     Look,
+    Scene,
     admits,
     backup_drive,
     look,
@@ -32,23 +33,14 @@ PROPOSAL, ROWS, CANDIDATE, OVERSHOOT, BLEND, BACKUP, UNRESOLVED = 0, 1, 2, 4, 5,
 
 @compiled
 def _decide(
-    models: Array,
-    at: Look,
-    proposal: Array,
-    side: float,
-    brake: bool,
-    detour: bool,
-    bounds: Array,
-    out: Array,
+    at: Look, proposal: Array, side: float, detour: bool, bounds: Array, out: Array
 ) -> tuple[int, float, Array, Array]:
     """The closest admissible (drive, turn) that a search finds, in the order of `filter/search.py`.
 
     Args:
-        models: As for `_admits`.
         at: The present state.
         proposal: Inside the box, shape (2,).
         side: Of a detour that goes on, or 0.
-        brake: Whether the backup manoeuvre brakes along the heading.
         detour: Whether to try ways around before projecting.
         bounds: Low and high of the controls, least and most between which the forces still change, shape (4, 2).
         out: What to execute, shape (2,).
@@ -61,15 +53,15 @@ def _decide(
     drive, turn = proposal[0], proposal[1]
     out[0], out[1] = drive, turn
     normals, offsets = np.zeros((0, 2)), np.zeros(0)
-    if admits(models, at, drive, turn, brake):
+    if admits(at, drive, turn):
         return PROPOSAL, 0.0, normals, offsets
     way = 0.0
     if detour:
-        way = passing_side(models, at, drive, turn, brake, side)
+        way = passing_side(at, drive, turn, side)
         if way != 0.0:
             around = min(max(way, low[1]), high[1])
             for ahead in (drive, min(max(0.0, low[0]), high[0])):
-                if admits(models, at, ahead, around, brake):
+                if admits(at, ahead, around):
                     out[0], out[1] = ahead, around
                     return CANDIDATE, way, normals, offsets
     # Measured in shares of what acts: a control that saturates early must not look cheap to change.
@@ -80,7 +72,7 @@ def _decide(
             unit[j] = (most[j] - least[j]) / (high[j] - low[j])
         force[j] = min(max(proposal[j], least[j]), most[j]) / unit[j]
         inner_low[j], inner_high[j] = least[j] / unit[j], most[j] / unit[j]
-    found, exact = rows(models, at, brake)
+    found, exact = rows(at)
     scaled, tighter = np.zeros((exact.size, 2)), np.zeros(exact.size)
     for i in range(exact.size):
         scaled[i, 0], scaled[i, 1] = found[i, 0] * unit[0], found[i, 1] * unit[1]
@@ -93,7 +85,7 @@ def _decide(
         # A component that saturates as the policy's did stays the policy's: the force is the same.
         for j in range(2):
             refused[j] = proposal[j] if answer[j] == force[j] else answer[j] * unit[j]
-        if admits(models, at, refused[0], refused[1], brake):
+        if admits(at, refused[0], refused[1]):
             out[0], out[1] = refused[0], refused[1]
             return ROWS, way, normals, offsets
         for share in OVERSHOOTS:
@@ -103,18 +95,18 @@ def _decide(
             if project_in_plane(force, scaled, tighter, inner_low, inner_high, slack, answer):
                 ahead = drive if answer[0] == force[0] else answer[0] * unit[0]
                 around = turn if answer[1] == force[1] else answer[1] * unit[1]
-                if admits(models, at, ahead, around, brake):
+                if admits(at, ahead, around):
                     out[0], out[1] = ahead, around
                     return OVERSHOOT, way, normals, offsets
     none, nothing = np.zeros((0, 2)), np.zeros(0)
-    back = min(max(backup_drive(models, at, brake), low[0]), high[0])
-    if not admits(models, at, back, 0.0, brake):
+    back = min(max(backup_drive(at), low[0]), high[0])
+    if not admits(at, back, 0.0):
         return UNRESOLVED, way, none, nothing
     far, near = 0.0, 1.0  # shares of the way from the proposal to the backup: refused, and admitted
     for _ in range(TRIES):
         share = far + 0.5 * (near - far)
         ahead, around = drive + share * (back - drive), turn + share * (0.0 - turn)
-        if admits(models, at, ahead, around, brake):
+        if admits(at, ahead, around):
             near, out[0], out[1] = share, ahead, around
         else:
             far = share
@@ -122,12 +114,12 @@ def _decide(
         return BLEND, way, none, nothing
     for share in BLENDS:
         ahead, around = refused[0] + share * (back - refused[0]), refused[1] + share * (0.0 - refused[1])
-        if admits(models, at, ahead, around, brake):
+        if admits(at, ahead, around):
             out[0], out[1] = ahead, around
             return BLEND, way, none, nothing
     for mixed in range(2):
         ahead, around = (refused[0], 0.0) if mixed == 0 else (back, refused[1])
-        if admits(models, at, ahead, around, brake):
+        if admits(at, ahead, around):
             out[0], out[1] = ahead, around
             return BLEND, way, none, nothing
     out[0], out[1] = back, 0.0
@@ -135,80 +127,51 @@ def _decide(
 
 
 @compiled
-def least_clearance(
-    qpos: Array,
-    qvel: Array,
-    place: Array,
-    models: Array,
-    motion: Array,
-    discs: Array,
-    brake: bool,
-    reserve: float,
-) -> tuple[float, int]:
+def least_clearance(qpos: Array, qvel: Array, place: Array, scene: Scene) -> tuple[float, int]:
     """`Look.value`, m (NaN if a disc is not a number), and how many discs are in play.
 
-    Writes the `motion`, shape (6,): `place` has the indices of the first of its joints in qpos and qvel, and the
-    body's place at qpos = 0, m.
+    Writes the scene's motion: `place` has the indices of the first of its joints in qpos and qvel, and the body's
+    place at qpos = 0, m.
     """
+    motion = scene[1]
     for i in range(3):
         motion[i], motion[3 + i] = qpos[int(place[0]) + i], qvel[int(place[1]) + i]
     motion[0] += place[2]
     motion[1] += place[3]
-    at = look(models, motion, discs, brake, reserve)
+    at = look(scene)
     return at.value, len(at.discs)
 
 
 @compiled
-def is_admitted(
-    models: Array, motion: Array, discs: Array, brake: bool, reserve: float, drive: float, turn: float
-) -> bool:
+def is_admitted(scene: Scene, drive: float, turn: float) -> bool:
     """Whether the end of a held control still has a safe stopping path."""
-    return admits(models, look(models, motion, discs, brake, reserve), drive, turn, brake)
+    return admits(look(scene), drive, turn)
 
 
 @compiled
-def secants(models: Array, motion: Array, discs: Array, brake: bool, reserve: float) -> tuple[Array, Array]:
+def secants(scene: Scene) -> tuple[Array, Array]:
     """Half-spaces of (drive, turn) that keep the clearance, about: shapes (k, 2) and (k,)."""
-    return rows(models, look(models, motion, discs, brake, reserve), brake)
+    return rows(look(scene))
 
 
 @compiled
-def way_around(
-    models: Array,
-    motion: Array,
-    discs: Array,
-    brake: bool,
-    reserve: float,
-    drive: float,
-    turn: float,
-    side: float,
-) -> float:
+def way_around(scene: Scene, drive: float, turn: float, side: float) -> float:
     """1 (left), -1 (right), or 0 with nothing to go around; `side` is that of a detour that goes on, or 0."""
-    return passing_side(models, look(models, motion, discs, brake, reserve), drive, turn, brake, side)
+    return passing_side(look(scene), drive, turn, side)
 
 
 @compiled
-def manoeuvre_drive(models: Array, motion: Array, discs: Array, brake: bool, reserve: float) -> float:
+def manoeuvre_drive(scene: Scene) -> float:
     """The drive control of the backup manoeuvre."""
-    return backup_drive(models, look(models, motion, discs, brake, reserve), brake)
+    return backup_drive(look(scene))
 
 
 @compiled
 def closest_admitted(
-    models: Array,
-    motion: Array,
-    discs: Array,
-    brake: bool,
-    reserve: float,
-    proposal: Array,
-    side: float,
-    detour: bool,
-    bounds: Array,
-    out: Array,
+    scene: Scene, proposal: Array, side: float, detour: bool, bounds: Array, out: Array
 ) -> tuple[int, float, Array, Array]:
     """`_decide` from the present state."""
-    at = look(models, motion, discs, brake, reserve)
-    return _decide(models, at, proposal, side, brake, detour, bounds, out)
+    return _decide(look(scene), proposal, side, detour, bounds, out)
 
 
 @compiled
@@ -269,9 +232,9 @@ def admit_each(
         admitted: Written: whether its proposal is admitted, shape (n,).
     """
     for i in range(len(motions)):
-        at = look(models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve)
+        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve))
         values[i] = at.value
-        admitted[i] = admits(models[i], at, proposals[i, 0], proposals[i, 1], brake)
+        admitted[i] = admits(at, proposals[i, 0], proposals[i, 1])
 
 
 @compiled
@@ -299,10 +262,8 @@ def decide_each(
     """
     for r in range(len(chosen)):
         i = chosen[r]
-        at = look(models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve)
-        stage, side, normals, offsets = _decide(
-            models[i], at, proposals[i], sides[i], brake, detour, bounds[r], out[i]
-        )
+        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve))
+        stage, side, normals, offsets = _decide(at, proposals[i], sides[i], detour, bounds[r], out[i])
         sides[i] = side
         if single:
             _round_inside(out[i], normals, offsets, bounds[r, 0], bounds[r, 1])

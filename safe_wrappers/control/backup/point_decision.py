@@ -1,22 +1,24 @@
 """Which controls leave a point mass among walls its way to rest, and the closest one to a refused one.
 
-`room` is the distance to keep from walls, `left` what braking from the present motion leaves beyond it, m. From
-outside the safe set (`left` below zero) the violation has to shrink.
+From outside the safe set (`left` below zero) the violation has to shrink. The functions for plain Python are at the
+end: what lasts from step to step is in arrays, and there is one call per question.
 """
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.backup import damped_axis as along
+from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.backup.point_among_walls import (
     Pair,
     PointAmongWalls,
     PointMotion,
     brake,
     clear,
+    clipped,
     distance,
     reachable,
     reached,
@@ -26,6 +28,8 @@ from safe_wrappers.control.backup.point_among_walls import (
 from safe_wrappers.control.numerics.compiled import compiled, hypot
 from safe_wrappers.control.numerics.rectangles import Rectangle, closer, gaps, nearest, one_of
 
+PROPOSAL, CANDIDATE, UNRESOLVED = 0, 2, 7
+"""What `closest_admitted` returns: a `Stage` of the search, or that it has found no admitted control."""
 HAIR_M: Final = 1e-7
 """Extra distance of corrections, for rounding to float32."""
 _NOISE_M: Final = 1e-12  # rounding of float64 between a path and the rest of it
@@ -34,71 +38,83 @@ _TURNS: Final = 4  # how many walls, one after another, a correction may have to
 _HALVINGS: Final = 5  # steps back towards the proposal, where the path fits and not its rectangle
 
 
-@compiled
-def _is_inside(left: float) -> bool:
-    return left >= -HAIR_M
+class At(NamedTuple):
+    """The present state.
+
+    Attributes:
+        among: The point and the walls.
+        motion: Clipped.
+        room: The distance to keep from walls, m.
+        left: What braking from the present motion leaves beyond it, m.
+    """
+
+    among: PointAmongWalls
+    motion: PointMotion
+    room: float
+    left: float
 
 
 @compiled
-def _left_after(among: PointAmongWalls, motion: PointMotion, room: float, control: Pair) -> float:
+def _is_inside(at: At) -> bool:
+    return at.left >= -HAIR_M
+
+
+@compiled
+def _left_after(at: At, control: Pair) -> float:
     """What is left after a control step, its own way not counted: it starts outside."""
-    return distance(among, step(among, motion, control[0], control[1])) - room
+    return distance(at.among, step(at.among, at.motion, control[0], control[1])) - at.room
 
 
 @compiled
-def _stopped_at(
-    among: PointAmongWalls, motion: PointMotion, axis: int, wall: Rectangle, before: bool, gap: float
-) -> float:
+def _stopped_at(at: At, axis: int, wall: Rectangle, before: bool, gap: float) -> float:
     """The control along an axis, within its bounds, whose rest point is this far before or behind a wall."""
-    constants, x, v = among.x_axis, motion.x, motion.vx
+    constants, x, v = at.among.x_axis, at.motion.x, at.motion.vx
     if axis == 1:
-        constants, x, v = among.y_axis, motion.y, motion.vy
+        constants, x, v = at.among.y_axis, at.motion.y, at.motion.vy
     start, end = (wall[2], wall[3]) if axis == 1 else (wall[0], wall[1])
     target = start - gap if before else end + gap
     return max(constants.low, min(along.control_to_rest_at(constants, x, v, target), constants.high))
 
 
 @compiled
-def backup(among: PointAmongWalls, motion: PointMotion, room: float, left: float) -> Pair:
+def backup(at: At) -> Pair:
     """Braking; from outside the safe set, along the shortest way back to rest just inside it."""
-    halt = brake(among, motion)
-    if _is_inside(left):
+    halt = brake(at.among, at.motion)
+    if _is_inside(at):
         return halt
-    around = stop(among, step(among, motion, halt[0], halt[1]))
-    found = nearest(around, among.walls, math.inf)[1]
+    around = stop(at.among, step(at.among, at.motion, halt[0], halt[1]))
+    found = nearest(around, at.among.walls, math.inf)[1]
     if found < 0:  # the state is not a number
         return halt
-    wall = one_of(among.walls, found)
+    wall = one_of(at.among.walls, found)
     across, beside = gaps(around, wall)
     if across >= beside:
         before = around[1] - wall[0] <= wall[1] - around[0]
-        return _stopped_at(among, motion, 0, wall, before, room + HAIR_M), halt[1]
+        return _stopped_at(at, 0, wall, before, at.room + HAIR_M), halt[1]
     before = around[3] - wall[2] <= wall[3] - around[2]
-    return halt[0], _stopped_at(among, motion, 1, wall, before, room + HAIR_M)
+    return halt[0], _stopped_at(at, 1, wall, before, at.room + HAIR_M)
 
 
 @compiled
-def _recovery(among: PointAmongWalls, motion: PointMotion, room: float, left: float) -> float:
+def _recovery(at: At) -> float:
     """What a control must leave from outside the safe set."""
-    axis = among.x_axis
-    target = left * math.exp(-axis.timestep * axis.substeps / _RECOVERY_S)
-    return min(target, _left_after(among, motion, room, backup(among, motion, room, left)))
+    axis = at.among.x_axis
+    target = at.left * math.exp(-axis.timestep * axis.substeps / _RECOVERY_S)
+    return min(target, _left_after(at, backup(at)))
 
 
 @compiled
-def admits(
-    among: PointAmongWalls, motion: PointMotion, room: float, left: float, control: Pair, spare: float
-) -> bool:
+def admits(at: At, control: Pair, spare: float) -> bool:
     """Whether a control keeps the room, and `spare` beyond it, m; from outside: whether it shrinks the violation.
 
     Where `left` is not a number nothing is admitted: it is not inside, and no comparison with it is true.
     """
-    if not _is_inside(left):
-        needed = _recovery(among, motion, room, left)
-        return _left_after(among, motion, room, control) >= needed - _NOISE_M
+    if not _is_inside(at):
+        needed = _recovery(at)
+        return _left_after(at, control) >= needed - _NOISE_M
     # Rounding may have taken a hair of the room: braking, which takes nothing, is admitted all the same.
-    extra = spare if spare > 0.0 else min(0.0, left) - _NOISE_M
-    return clear(among, motion, control[0], control[1], room + extra)
+    extra = spare if spare > 0.0 else min(0.0, at.left) - _NOISE_M
+    return clear(at.among, at.motion, control[0], control[1], at.room + extra)
 
 
 @compiled
@@ -108,32 +124,31 @@ def _replaced(control: Pair, axis: int, value: float) -> Pair:
 
 @compiled
 def _aside(
-    among: PointAmongWalls,
-    motion: PointMotion,
-    room: float,
+    at: At,
     control: Pair,
     around: Rectangle,
     wall: Rectangle,
     axis: int,
 ) -> Pair:
     """The control nearest to this one that stays clear of a wall by less along one axis; NaN: there is none."""
-    at, start, end, now = motion.x, wall[0], wall[1], control[0]
+    place, start, end, now = at.motion.x, wall[0], wall[1], control[0]
     if axis == 1:
-        at, start, end, now = motion.y, wall[2], wall[3], control[1]
-    before, behind = at < start, at > end
+        place, start, end, now = at.motion.y, wall[2], wall[3], control[1]
+    before, behind = place < start, place > end
     if before or behind:
         # At a corner the gap along the other axis counts too: the distance is Euclidean.
         across, beside = gaps(around, wall)
         other = max(across if axis == 1 else beside, 0.0)
+        room = at.room + HAIR_M
         gap = math.sqrt(max(room * room - other * other, 0.0))
-        limit = _stopped_at(among, motion, axis, wall, before, gap)
+        limit = _stopped_at(at, axis, wall, before, gap)
         if (limit < now) if before else (limit > now):
             return _replaced(control, axis, limit)
     return math.nan, math.nan
 
 
 @compiled
-def _turned(among: PointAmongWalls, motion: PointMotion, room: float, asked: Pair) -> Array:
+def _turned(at: At, asked: Pair) -> Array:
     """Controls whose rectangle is clear, by limiting one axis or the other at each wall in the way, shape (k, 2)."""
     todo, found = np.empty((2 * _TURNS + 2, 3)), np.empty((2**_TURNS, 2))
     waiting, count = 1, 0
@@ -141,15 +156,15 @@ def _turned(among: PointAmongWalls, motion: PointMotion, room: float, asked: Pai
     while waiting > 0:
         waiting -= 1
         control, turns = (todo[waiting, 0], todo[waiting, 1]), todo[waiting, 2]
-        around = reached(among, motion, control[0], control[1])
-        index = nearest(around, among.walls, room + 0.5 * HAIR_M)[1]
+        around = reached(at.among, at.motion, control[0], control[1])
+        index = nearest(around, at.among.walls, at.room + 0.5 * HAIR_M)[1]
         if index < 0:
             found[count, 0], found[count, 1] = control
             count += 1
         elif turns > 0.0:
-            wall = one_of(among.walls, index)
+            wall = one_of(at.among.walls, index)
             for axis in (1, 0):  # the last one is taken first
-                way = _aside(among, motion, room + HAIR_M, control, around, wall, axis)
+                way = _aside(at, control, around, wall, axis)
                 if way[0] == way[0]:
                     todo[waiting, 0], todo[waiting, 1], todo[waiting, 2] = way[0], way[1], turns - 1.0
                     waiting += 1
@@ -163,18 +178,16 @@ def _between(admitted: Pair, asked: Pair, share: float) -> Pair:
 
 
 @compiled
-def _towards(
-    among: PointAmongWalls, motion: PointMotion, room: float, left: float, admitted: Pair, asked: Pair
-) -> Pair:
+def _towards(at: At, admitted: Pair, asked: Pair) -> Pair:
     """An admitted control, moved straight towards the one asked for as far as prediction allows."""
     low, high = 0.5**_HALVINGS, 1.0
-    if not admits(among, motion, room, left, _between(admitted, asked, low), HAIR_M):
+    if not admits(at, _between(admitted, asked, low), HAIR_M):
         return admitted  # mostly: a wall straight ahead, and the rectangle was exact
-    if admits(among, motion, room, left, asked, HAIR_M):
+    if admits(at, asked, HAIR_M):
         return asked
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        if admits(among, motion, room, left, _between(admitted, asked, middle), HAIR_M):
+        if admits(at, _between(admitted, asked, middle), HAIR_M):
             low = middle
         else:
             high = middle
@@ -182,26 +195,26 @@ def _towards(
 
 
 @compiled
-def near(among: PointAmongWalls, motion: PointMotion, room: float, left: float, control: Pair) -> Array:
+def near(at: At, control: Pair) -> Array:
     """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
-    x_axis, y_axis = among.x_axis, among.y_axis
+    x_axis, y_axis = at.among.x_axis, at.among.y_axis
     asked = max(x_axis.low, min(control[0], x_axis.high)), max(y_axis.low, min(control[1], y_axis.high))
     turned, count = np.empty((0, 2)), 0
-    if _is_inside(left):
-        turned = _turned(among, motion, room, asked)
+    if _is_inside(at):
+        turned = _turned(at, asked)
     found, away = np.empty((len(turned) + 2, 2)), np.empty(len(turned) + 2)
     for i in range(len(turned)):
         one = turned[i, 0], turned[i, 1]
-        if admits(among, motion, room, left, one, 0.0):
-            if among.clip_known:
-                one = _towards(among, motion, room, left, one, asked)
+        if admits(at, one, 0.0):
+            if at.among.clip_known:
+                one = _towards(at, one, asked)
             found[count, 0], found[count, 1] = one
             count += 1
     if count == 0:  # where the path fits and no rectangle does
         for first in range(2):
-            one = backup(among, motion, room, left)
+            one = backup(at)
             for axis in (first, 1 - first):
-                one = _towards(among, motion, room, left, one, _replaced(one, axis, asked[axis]))
+                one = _towards(at, one, _replaced(one, axis, asked[axis]))
             found[count, 0], found[count, 1] = one
             count += 1
     for i in range(count):  # sorted by insertion: of equally near ones the first stays first
@@ -216,14 +229,14 @@ def near(among: PointAmongWalls, motion: PointMotion, room: float, left: float, 
 
 
 @compiled
-def bounds(among: PointAmongWalls, motion: PointMotion, room: float, left: float) -> tuple[Array, Array]:
+def bounds(at: At) -> tuple[Array, Array]:
     """A convex part of what is admitted, braking included, as half-spaces: normals (k, 2) and offsets (k,)."""
-    halt, wanted = backup(among, motion, room, left), room + HAIR_M
-    around, area = reached(among, motion, halt[0], halt[1]), reachable(among, motion)
-    normals, offsets, count = np.zeros((2 * len(among.walls), 2)), np.zeros(2 * len(among.walls)), 0
-    index = closer(area, among.walls, wanted, 0)
+    halt, wanted = backup(at), at.room + HAIR_M
+    around, area = reached(at.among, at.motion, halt[0], halt[1]), reachable(at.among, at.motion)
+    normals, offsets, count = np.zeros((2 * len(at.among.walls), 2)), np.zeros(2 * len(at.among.walls)), 0
+    index = closer(area, at.among.walls, wanted, 0)
     while index >= 0:
-        wall = one_of(among.walls, index)
+        wall = one_of(at.among.walls, index)
         gap = gaps(around, wall)
         corner = 0.0 < gap[0] < wanted and 0.0 < gap[1] < wanted
         # At a corner both axes keep their share of the distance; else the one with more room keeps it all.
@@ -237,9 +250,117 @@ def bounds(among: PointAmongWalls, motion: PointMotion, room: float, left: float
                 start, end, from_, to = wall[2], wall[3], around[2], around[3]
             before = start - to >= from_ - end
             sign = 1.0 if before else -1.0
-            limit = _stopped_at(among, motion, axis, wall, before, share * gap[axis] if corner else wanted)
+            limit = _stopped_at(at, axis, wall, before, share * gap[axis] if corner else wanted)
             normals[count, axis] = sign
             offsets[count] = max(sign * limit, sign * halt[axis])
             count += 1
-        index = closer(area, among.walls, wanted, index + 1)
+        index = closer(area, at.among.walls, wanted, index + 1)
     return normals[:count], offsets[:count]
+
+
+Scene = tuple[Array, Array, Array, Array, Array, Array]
+"""What the functions below take first, as a plain tuple, which compiled code takes fastest.
+
+* numbers: along x and along y, shape (2, 16): the numbers of the axis; where the point is at qpos = 0, m; the
+  indices of its slide in qpos and qvel, and of its actuator; the distance to keep, m; `clip_known`
+* the tables of the axes: x up, x down, y up, y down
+* walls: rectangles, m, shape (n, 4)
+"""
+
+
+def scene(
+    axes: tuple[DampedAxis, DampedAxis],
+    origin: Pair,
+    joints: tuple[int, int],
+    actuators: tuple[int, int],
+    room: float,
+    clip_known: bool,
+    among: list[Rectangle],
+) -> Scene:
+    """The scene of a point; of pairs x is first, then y."""
+    rows = [
+        [*axis[:-2], *of_axis, room, clip_known]
+        for axis, *of_axis in zip(axes, origin, joints, actuators, strict=True)
+    ]
+    x_axis, y_axis = axes
+    tables = x_axis.up, x_axis.down, y_axis.up, y_axis.down
+    return np.array(rows, dtype=np.float64), *tables, np.array(among, dtype=np.float64).reshape(-1, 4)
+
+
+@compiled
+def _axis(numbers: Array, up: Array, down: Array) -> DampedAxis:
+    n = numbers
+    return DampedAxis(n[0], n[1], n[2], int(n[3]), n[4], n[5], n[6], n[7], n[8], n[9], n[10], up, down)
+
+
+@compiled
+def _in(scene: Scene) -> PointAmongWalls:
+    numbers, x_up, x_down, y_up, y_down, walls = scene
+    x_axis, y_axis = _axis(numbers[0], x_up, x_down), _axis(numbers[1], y_up, y_down)
+    return PointAmongWalls(x_axis, y_axis, walls, numbers[0, 15] != 0.0)
+
+
+@compiled
+def _at(scene: Scene, motion: Array, left: float) -> At:
+    now = PointMotion(motion[0], motion[1], motion[2], motion[3])
+    return At(_in(scene), now, scene[0][0, 14], left)
+
+
+@compiled
+def _pair(scene: Scene, control: Array) -> Pair:
+    return control[int(scene[0][0, 13])], control[int(scene[0][1, 13])]
+
+
+@compiled
+def room_left(scene: Scene, qpos: Array, qvel: Array, motion: Array) -> float:
+    """What braking leaves beyond the room, m; NaN if the state is not finite. Writes the clipped motion, (4,)."""
+    among, numbers = _in(scene), scene[0]
+    for axis in range(2):
+        motion[axis] = qpos[int(numbers[axis, 12])] + numbers[axis, 11]
+        motion[2 + axis] = qvel[int(numbers[axis, 12])]
+    now = clipped(among, PointMotion(motion[0], motion[1], motion[2], motion[3]))
+    finite = math.isfinite(motion[0] + motion[1] + motion[2] + motion[3])
+    motion[2], motion[3] = now.vx, now.vy
+    return distance(among, now) - numbers[0, 14] if finite else math.nan
+
+
+@compiled
+def is_admitted(scene: Scene, motion: Array, left: float, control: Array) -> bool:
+    """Whether a control, shape (m,), keeps the room, or from outside shrinks the violation."""
+    return admits(_at(scene, motion, left), _pair(scene, control), 0.0)
+
+
+@compiled
+def closest_admitted(
+    scene: Scene, motion: Array, left: float, low: Array, high: Array, control: Array
+) -> int:
+    """Replaces a control, shape (m,), by the closest candidate in the box that is admitted; the stage that did it."""
+    at, asked = _at(scene, motion, left), _pair(scene, control)
+    if admits(at, asked, 0.0):
+        return PROPOSAL
+    i, j = int(scene[0][0, 13]), int(scene[0][1, 13])
+    found = near(at, asked)
+    for k in range(len(found)):
+        x, y = min(max(found[k, 0], low[i]), high[i]), min(max(found[k, 1], low[j]), high[j])
+        if math.isfinite(x + y) and admits(at, (x, y), 0.0):
+            control[i], control[j] = x, y
+            return CANDIDATE
+    return UNRESOLVED
+
+
+@compiled
+def candidates(scene: Scene, motion: Array, left: float, control: Array) -> Array:
+    """Admissible pairs near a refused control, the nearest first, shape (k, 2)."""
+    return near(_at(scene, motion, left), _pair(scene, control))
+
+
+@compiled
+def backup_pair(scene: Scene, motion: Array, left: float) -> Pair:
+    """The pair that is always admitted: brake both axes. From outside it leads back inside."""
+    return backup(_at(scene, motion, left))
+
+
+@compiled
+def half_spaces(scene: Scene, motion: Array, left: float) -> tuple[Array, Array]:
+    """Bounds on the pair: a convex part of what is admitted, shapes (k, 2) and (k,)."""
+    return bounds(_at(scene, motion, left))

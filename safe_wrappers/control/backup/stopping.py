@@ -1,8 +1,9 @@
-"""Kinetic stopping insets in one dimension, for commands that are held between samples.
+"""Kinetic stopping insets in one dimension, for commands that are held between samples, and rows of controls.
 
 Source: appendix "Relative degree and kinetic stopping insets" and its footnote 1. The barrier is the clearance left
 after braking, `h = D - v^2 / (2 a_brake)` with approach speed v; state error, hold interval and delay are reserves
-inside it. `a_brake` is a *validated lower bound* on the deceleration and is not checked here.
+inside it. `a_brake` is a *validated lower bound* on the deceleration and is not checked here. Along the line to each
+surface the motion is one-dimensional: the acceleration of the approach is bounded, which is affine in the control.
 """
 
 import math
@@ -10,10 +11,26 @@ from typing import Final
 
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.control.numerics.surfaces import nearest_points
 
 _RETREAT_RATE: Final = 1.0
 """1/s: rate at which a violation is to shrink."""
+_ROUNDING: Final = 1.0 + 1e-9
+_UNBOUNDED: Final = 1e12
+"""A control without a bound counts as this large."""
+
+Machine = tuple[Array, Array, float, float, float, float, float]
+"""What is the same for all points.
+
+* low, high: bounds of the control, shape (m,)
+* delay_s: as for `approaches`
+* control_dt: control interval, s
+* radius: as for `approaches`
+* braking: deceleration to count on, m/s^2
+* reserve: kept free in the rows, m, but not in the rooms
+"""
 
 
 @compiled
@@ -53,3 +70,145 @@ def held_limit(room: float, speed: float, brake: float, control_dt: float) -> fl
         approach = 0.0 if speed <= 0.0 else speed
         return min(-(approach * approach) / (2.0 * room), -speed / control_dt)
     return (_RETREAT_RATE * room - speed) / control_dt
+
+
+@compiled
+def approaches(
+    distance: Array, normal: Array, surface_velocity: Array, velocity: Array, delay_s: float, radius: float
+) -> tuple[Array, Array]:
+    """Clearances, m, and approach speeds, m/s, of a point from k surfaces, shapes (k,).
+
+    Args:
+        distance: Of the point from the surfaces, m, shape (k,).
+        normal: Unit vectors towards the point, shape (k, d).
+        surface_velocity: m/s, shape (k, d).
+        velocity: Of the point, m/s, shape (d,).
+        delay_s: The point is predicted over it already. What comes to meet it is here, s (a lower bound: distance is
+            convex).
+        radius: Of the machine around the point, m.
+    """
+    clearance, speed = distance.copy(), np.zeros(len(distance))
+    for i in range(len(distance)):
+        met = closing = 0.0
+        for j in range(len(velocity)):
+            met += normal[i, j] * surface_velocity[i, j]
+            closing += normal[i, j] * (velocity[j] - surface_velocity[i, j])
+        clearance[i] = distance[i] - delay_s * met - radius
+        speed[i] = -closing
+    return clearance, speed
+
+
+@compiled
+def _away(
+    normal: Array,
+    surface_velocity: Array,
+    curvature: Array,
+    velocity: Array,
+    acceleration: Array,
+    speed: float,
+    outside: bool,
+) -> float:
+    """Acceleration of the distance to a surface, m/s^2: along the normal, and of passing by on the outside."""
+    bend = sharpest = along = 0.0
+    for j in range(len(velocity)):
+        sideways = velocity[j] - surface_velocity[j]
+        bend += curvature[j] * (sideways * sideways)
+        sharpest = max(sharpest, curvature[j])
+        along += normal[j] * acceleration[j]
+    bend -= sharpest * (speed * speed)
+    return along + bend if outside and not bend <= 0.0 else along
+
+
+@compiled
+def _largest(low: float, high: float) -> float:
+    """Of the controls between two bounds."""
+    most = max(abs(low), abs(high))
+    return most if most < math.inf else _UNBOUNDED
+
+
+@compiled
+def approach_rows(
+    distance: Array,
+    normal: Array,
+    surface_velocity: Array,
+    curvature: Array,
+    velocity: Array,
+    drift: Array,
+    effect: Array,
+    machine: Machine,
+) -> tuple[Array, Array, Array]:
+    """Rooms left after braking, and a row for every surface whose limit the actuators could exceed.
+
+    Args:
+        distance: As for `approaches`.
+        normal: Likewise.
+        surface_velocity: Likewise.
+        curvature: Of the surfaces of equal distance along each coordinate, 1/m, shape (k, d).
+        velocity: As for `approaches`.
+        drift: The point's acceleration is `drift + effect @ u`, m/s^2, shape (d,).
+        effect: Shape (d, m).
+        machine: See `Machine`.
+
+    Returns:
+        Rooms, m, shape (k,); normals, shape (r, m), and offsets, shape (r,), of the rows.
+    """
+    low, high, delay_s, control_dt, radius, braking, reserve = machine
+    clearance, speed = approaches(distance, normal, surface_velocity, velocity, delay_s, radius)
+    room, rows, d, m = np.empty(len(distance)), 0, len(velocity), len(low)
+    normals, offsets = np.zeros((len(distance), m)), np.empty(len(distance))
+    for i in range(len(distance)):
+        room[i] = clearance[i] - held_stop(speed[i], braking, control_dt)
+        limit = held_limit(clearance[i] - reserve, speed[i], braking, control_dt)
+        outside = clearance[i] + radius > 0.0
+        limit += _away(normal[i], surface_velocity[i], curvature[i], velocity, drift, speed[i], outside)
+        strongest = 0.0
+        for k in range(m):
+            push = 0.0
+            for j in range(d):
+                push -= normal[i, j] * effect[j, k]
+            normals[rows, k] = push
+            strongest += abs(push) * _largest(low[k], high[k])
+        # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
+        if not strongest <= limit:
+            offsets[rows] = limit
+            rows += 1
+    return room, normals[:rows].copy(), offsets[:rows].copy()
+
+
+@compiled
+def approach_rows_of(
+    surfaces: Array, point: Array, velocity: Array, drift: Array, effect: Array, machine: Machine
+) -> tuple[Array, Array, Array]:
+    """`approach_rows` of surfaces that stand still, as in `control/numerics/surfaces.py`, shape (k, 8)."""
+    distance, normal, curvature = nearest_points(surfaces, point)
+    still = np.zeros(normal.shape)
+    return approach_rows(distance, normal, still, curvature, velocity, drift, effect, machine)
+
+
+@compiled
+def out_of_reach(surfaces: Array, reach: Array, machine: Machine) -> tuple[Array, bool]:
+    """The rooms of `approach_rows_of`, and whether it certainly has no rows.
+
+    `reach` is what `Points.reaches` says of the point.
+    """
+    low, high, delay_s, control_dt, radius, braking, reserve = machine
+    velocity = reach[3:6]
+    distance, normal, curvature = nearest_points(surfaces, reach[:3])
+    still, none = np.zeros(normal.shape), np.zeros(3)
+    clearance, speed = approaches(distance, normal, still, velocity, delay_s, radius)
+    room, certain = np.empty(len(distance)), True
+    for i in range(len(distance)):
+        room[i] = clearance[i] - held_stop(speed[i], braking, control_dt)
+        limit = held_limit(clearance[i] - reserve, speed[i], braking, control_dt)
+        outside = clearance[i] + radius > 0.0
+        limit += _away(normal[i], none, curvature[i], velocity, reach[6:9], speed[i], outside)
+        gives = strongest = 0.0
+        for j in range(3):
+            for k in range(3):
+                gives += normal[i, j] * reach[9 + 3 * j + k] * normal[i, k]
+        for k in range(len(low)):
+            # What acts now is the control nearest to zero.
+            change = _largest(low[k], high[k]) + abs(min(max(0.0, low[k]), high[k]))
+            strongest += math.sqrt(max(gives * reach[18 + k], 0.0)) * change
+        certain = certain and strongest * _ROUNDING <= limit
+    return room, certain

@@ -1,4 +1,4 @@
-"""Barrier conditions on a control: Lie derivatives, class-K decay, relative degree.
+"""Barrier conditions on a control: gradients by differences, whether a control acts, relative degree.
 
 Source: appendix "Safety and Control Barrier Functions". A barrier `h` is positive inside the safe set. For `x' = f(x)
 + g(x) u` the condition `Lf h + Lg h u >= -alpha(h)` is sufficient, in continuous time, for a barrier of relative
@@ -12,29 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array
-
-
-def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Array, Array]:
-    """Split `h'` into drift `Lf h`, shape (...), and control effectiveness `Lg h`, shape (..., m).
-
-    Args:
-        gradient: dh/dx, shape (..., n).
-        f: Drift x' at zero control, shape (..., n), state units per second.
-        g: Control matrix, shape (..., n, m), state units per second per control unit.
-    """
-    dh, drift, effect = (np.asarray(part, dtype=np.float64) for part in (gradient, f, g))
-    if dh.ndim == drift.ndim == 1 and effect.ndim == 2:  # half the time of einsum
-        return np.asarray(dh @ drift), np.asarray(dh @ effect)
-    return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
-
-
-def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array, Array]:
-    """The barrier condition as half-spaces `normals @ u <= offsets`: `-Lg h`, shape (..., m), and `Lf h + alpha(h)`.
-
-    `lf_h` and `decay`, alpha(h), are of shape (...), `lg_h` of shape (..., m).
-    """
-    lf, lg, alpha = (np.asarray(part, dtype=np.float64) for part in (lf_h, lg_h, decay))
-    return -lg, lf + alpha
 
 
 def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 1e-6) -> Array:

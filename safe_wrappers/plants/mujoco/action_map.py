@@ -124,8 +124,7 @@ class MappedRecorder(Recorder):
         super().__init__(model, data, substeps)
         self._map = action_map
         # Brakes are as strong as actions can make them.
-        low, high = (np.clip(end, *control_range(model)) for end in action_map.reach())
-        self._law = self._law._replace(low=low, high=high)
+        self._low, self._high = (np.clip(end, *control_range(model)) for end in action_map.reach())
 
     def act(self, data: mujoco.MjData, control: Array) -> None:
         """Give the machine an action, shape (nu,), as its env does at the start of a control interval."""

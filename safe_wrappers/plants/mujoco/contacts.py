@@ -1,20 +1,17 @@
 """The contacts of a MuJoCo model, as they are and as forecast: which bodies, how far apart, how much force."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, name_list
-from safe_wrappers.control.numerics.compiled import IS_COMPILED
 from safe_wrappers.errors import UnknownNameError
-from safe_wrappers.plants.mujoco.contact_memory import ContactMemory, contact_memory
-from safe_wrappers.plants.mujoco.contact_simulation import simulate
 from safe_wrappers.plants.mujoco.forecast import RESETS
 from safe_wrappers.plants.mujoco.model import fixed_bodies
-from safe_wrappers.plants.mujoco.replay import RATES_OF_ROTATION_VECTORS, RK4, evaluations
+from safe_wrappers.plants.mujoco.replay import evaluations
 
 # Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here.
 _FASTEST = float(mujoco.mjMAXVAL) ** 2
@@ -85,8 +82,7 @@ class ContactForecast(NamedTuple):
 class ContactReader:
     """Reads the contacts of a model's moving bodies with the fixed world.
 
-    `read` only copies MuJoCo's arrays; `forecast` evaluates all of them at once, because Python is slow. `follow`
-    simulates in compiled code where it can (no activations; from MuJoCo 4.0 on no Runge-Kutta).
+    `read` only copies MuJoCo's arrays; `forecast` evaluates all of them at once, because Python is slow.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -95,16 +91,8 @@ class ContactReader:
         # The last entry is for geom -1, of something flexible: it moves, but is not a body of the robot.
         bodies = np.where(fixed, 0, np.arange(model.nbody))
         self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
-        self._bodies = np.array(self._body_of_geom, dtype=np.int64)
         self._wrench = np.zeros(6)
-        self._memory: ContactMemory | None = None
-        self._compiles = IS_COMPILED and not model.na
-        if model.opt.integrator == RK4 and RATES_OF_ROTATION_VECTORS:
-            self._compiles = False
         self.clear()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_memory": None}  # a copy reads other data
 
     def clear(self) -> None:
         """Forget what has been read."""
@@ -151,11 +139,6 @@ class ContactReader:
     def follow(self, data: mujoco.MjData, substeps: int) -> ContactForecast:
         """Step the data, with the control it has, and return the contacts of all these physics substeps."""
         data.warning.number[RESETS] = 0
-        memory = self._memory_of(data) if self._compiles else None
-        found, inside = self._visited(data, substeps) if memory is None else self._compiled(memory, substeps)
-        return found._replace(finite=inside and not data.warning.number[RESETS].any())
-
-    def _visited(self, data: mujoco.MjData, substeps: int) -> tuple[ContactForecast, bool]:
         self.clear()
         inside = True
 
@@ -167,24 +150,7 @@ class ContactReader:
         for _ in range(substeps):
             evaluations(self._model, data, visit)
         inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
-        return self.forecast(inside), inside
-
-    def _memory_of(self, data: mujoco.MjData) -> ContactMemory | None:
-        known = self._memory
-        if known is None or known.data != data._address or known.model != self._model._address:
-            self._memory = known = contact_memory(self._model, data)
-        return known
-
-    def _compiled(self, memory: ContactMemory, substeps: int) -> tuple[ContactForecast, bool]:
-        """The same as `_visited`, faster."""
-        options = self._model.opt
-        stages = options.integrator == RK4
-        how = substeps, float(options.timestep), stages, _FASTEST
-        kinds, numbers, inside = simulate(memory, self._bodies, *how)
-        parts = numbers[:, :3], numbers[:, 3:6], numbers[:, 6:9], numbers[:, 9]
-        return ContactForecast(
-            substeps * (4 if stages else 1), kinds[:, 0], kinds[:, 1], *parts, inside
-        ), inside
+        return self.forecast(inside and not data.warning.number[RESETS].any())
 
 
 def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.plants.mujoco.forecast import RESETS, Recorder
+from safe_wrappers.plants.mujoco.forecast import Recorder
 
 # The envs add the turn to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum.
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])
@@ -73,27 +73,15 @@ class DisplacementRecorder(Recorder):
         data.mocap_quat[self._mocap] = data.xquat[self._gripper] + _TURN
         data.ctrl[:] = data.qpos[self._servoed] + self._servo_acts * step[3]
 
-    def simulate(self, begin: int, end: int, path: Array, published: Array, euler: bool = False) -> int:
-        """As `Recorder.simulate`, with what the env does at the start and at the end of each control interval."""
-        m, data, n, nq = self._model, self._data, self.substeps, self.nq
-        for hold in range(begin, end):
-            if hold:
-                self.act(data, self.braking(data))
-            for i in range(hold * n, hold * n + n):
-                mujoco.mj_step(m, data)
-                if i == hold * n + n - 1:
-                    self.settle(data)
-                path[i, :nq], path[i, nq:] = data.qpos, data.qvel
-            published[hold, 0], published[hold, 1] = data.xpos, data.xipos
-            if data.warning.number[RESETS].any():
-                return hold
-        return end
-
     def settle(self, data: mujoco.MjData) -> None:
         """Put a blocked gripper's fingers back to zero, and update the poses."""
         if self._closed.size:
             data.qpos[self._closed] = 0.0
             mujoco.mj_kinematics(self._model, data)
+
+    def brake(self, data: mujoco.MjData) -> None:
+        """Leave the gripper where it is."""
+        self.act(data, np.zeros(4))
 
     def braking(self, data: mujoco.MjData) -> Array:
         """No displacement, shape (4,)."""

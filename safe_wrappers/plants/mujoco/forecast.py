@@ -7,9 +7,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.plants.mujoco.model import Remade, control_range
-from safe_wrappers.plants.mujoco.native import mj_kinematics, mj_step
 
 _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
@@ -62,104 +60,6 @@ class Forecast:
         return Forecast(self._recorder, self.control, self.path[:k], self.published[:horizon])
 
 
-class _Machine(NamedTuple):
-    """What compiled code needs of a model and its data: their addresses, and views of the data."""
-
-    model: int
-    data: int
-    ctrl: Array
-    qpos: Array
-    qvel: Array
-    lengths: Array
-    speeds: Array
-    frames: Array
-    centres: Array
-    warnings: Array
-
-
-class _Braking(NamedTuple):
-    """Servos are told `rest + per_length * length`, less the damping of their speeds, in the range; shapes (nu,)."""
-
-    rest: Array
-    per_length: Array
-    damping: Array
-    low: Array
-    high: Array
-
-
-@compiled
-def _brake(law: _Braking, lengths: Array, speeds: Array, control: Array) -> None:
-    """Write the control that brakes."""
-    for j in range(control.size):
-        told = law.rest[j] + law.per_length[j] * lengths[j] - law.damping[j] * speeds[j]
-        if told < law.low[j]:
-            told = law.low[j]
-        if told > law.high[j]:
-            told = law.high[j]
-        control[j] = told
-
-
-@compiled
-def _simulate(
-    machine: _Machine,
-    law: _Braking,
-    begin: int,
-    end: int,
-    substeps: int,
-    euler: bool,
-    path: Array,
-    published: Array,
-) -> int:
-    """Simulate control intervals, of which all but the first one (0) brake; how many are whole.
-
-    With `euler` the intervals publish, as after Runge-Kutta steps, poses that do not lag by a substep.
-    Written are the state after every substep, (k, nq + nv), and what the ends publish, (horizon, 2, nbody, 3).
-    """
-    nq, nv, bodies = machine.qpos.size, machine.qvel.size, len(machine.frames)
-    for hold in range(begin, end):
-        if hold:
-            _brake(law, machine.lengths, machine.speeds, machine.ctrl)
-        for i in range(hold * substeps, (hold + 1) * substeps):
-            mj_step(machine.model, machine.data)
-            for j in range(nq):
-                path[i, j] = machine.qpos[j]
-            for j in range(nv):
-                path[i, nq + j] = machine.qvel[j]
-        if euler:
-            mj_kinematics(machine.model, machine.data)
-        for j in range(bodies):
-            for axis in range(3):
-                published[hold, 0, j, axis] = machine.frames[j, axis]
-                published[hold, 1, j, axis] = machine.centres[j, axis]
-        for warned in machine.warnings:
-            if warned:
-                return hold
-    return end
-
-
-@compiled
-def _kinematics(
-    machine: _Machine, turned: Array, qpos: Array, frames: Array, centres: Array, axes: Array
-) -> None:
-    """Write the poses of positions (k, nq), as `Poses` has them."""
-    for i in range(len(qpos)):
-        for j in range(machine.qpos.size):
-            machine.qpos[j] = qpos[i, j]
-        mj_kinematics(machine.model, machine.data)
-        for j in range(len(machine.frames)):
-            for axis in range(3):
-                frames[i, j, axis] = machine.frames[j, axis]
-                centres[i, j, axis] = machine.centres[j, axis]
-            for entry in range(9):
-                axes[i, j, entry] = turned[j, entry]
-
-
-def _machine(model: mujoco.MjModel, data: mujoco.MjData) -> _Machine:
-    motion = data.qpos, data.qvel, data.actuator_length, data.actuator_velocity
-    seen = data.xpos, data.xipos, data.warning.number[RESETS]
-    return _Machine(model._address, data._address, data.ctrl, *motion, *seen)
-
-
 class Recorder(Remade):
     """Steps the plant's own model and keeps what a forecast holds; `substeps` are those of a control interval.
 
@@ -173,7 +73,6 @@ class Recorder(Remade):
         self.is_runge_kutta = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
         self.held = deque[tuple[bytes | None, mujoco.MjData]]()
         self._still = mujoco.MjData(model)
-        self._moving, self._posed = _machine(model, data), _machine(model, self._still)
         # A unit force accelerates its joints by acc0 (in the reference pose), a transmission by gear times that.
         control_dt = substeps * model.opt.timestep
         gain, gear = model.actuator_gainprm[:, 0], np.abs(model.actuator_gear).max(axis=1)
@@ -185,7 +84,8 @@ class Recorder(Remade):
         bias = np.where(biased[:, None], model.actuator_biasprm[:, :3], 0.0)
         rest, per_length = -bias[:, :2].T / np.where(acts, gain, 1.0)
         damping[bias[:, 2] != 0.0] = 0.0  # it has damping of its own
-        self._law = _Braking(rest.copy(), per_length.copy(), damping, *control_range(model))
+        self._servos = rest, per_length, damping
+        self._low, self._high = control_range(model)
 
     def record(
         self, control: Array, horizon: int, first: Forecast | None = None, euler: bool = False
@@ -267,11 +167,25 @@ class Recorder(Remade):
             end: The one after the last.
             path: The states after each substep of all intervals, to be written to, shape (k, nq + nv).
             published: Likewise what the intervals' ends publish, shape (intervals, 2, nbody, 3).
-            euler: The steps are Euler's in the place of Runge-Kutta's.
+            euler: The steps are Euler's in the place of Runge-Kutta's; what they publish does not lag.
         """
-        extent = begin, end, self.substeps, euler
-        whole: int = _simulate(self._moving, self._law, *extent, path, published)
-        return whole
+        m, data, n, nq = self._model, self._data, self.substeps, self.nq
+        qpos, qvel, frames, centres = data.qpos, data.qvel, data.xpos, data.xipos
+        resets = data.warning.number[RESETS]
+        for hold in range(begin, end):
+            if hold:
+                self.brake(data)
+            for i in range(hold * n, hold * n + n):
+                mujoco.mj_step(m, data)
+                if i == hold * n + n - 1:
+                    self.settle(data)
+                path[i, :nq], path[i, nq:] = qpos, qvel
+            if euler:
+                mujoco.mj_kinematics(m, data)
+            published[hold, 0], published[hold, 1] = frames, centres
+            if resets.any():
+                return hold
+        return end
 
     def act(self, data: mujoco.MjData, control: Array) -> None:
         """Give the machine a control, as its env does at the start of a control interval."""
@@ -283,9 +197,19 @@ class Recorder(Remade):
 
     def braking(self, data: mujoco.MjData) -> Array:
         """Every actuator against its own motion, shape (nu,); read once per control interval, as controllers do."""
-        control = np.empty(self._model.nu)
-        _brake(self._law, data.actuator_length, data.actuator_velocity, control)
-        return control
+        return self._against_motion(data)
+
+    def brake(self, data: mujoco.MjData) -> None:
+        """Give the machine the control that brakes."""
+        data.ctrl[:] = self._against_motion(data)
+
+    def settle(self, data: mujoco.MjData) -> None:
+        """What the env does to its data at the end of a control interval: nothing, in most."""
+
+    def _against_motion(self, data: mujoco.MjData) -> Array:
+        rest, per_length, damping = self._servos
+        told = rest + per_length * data.actuator_length - damping * data.actuator_velocity
+        return np.minimum(np.maximum(told, self._low), self._high)
 
     def place(self, data: mujoco.MjData) -> None:
         """Take the places of mocap bodies, which positions do not determine, for later calls of `poses`."""
@@ -296,5 +220,10 @@ class Recorder(Remade):
         """Forward kinematics of positions of shape (k, nq)."""
         k, bodies = len(qpos), self._model.nbody
         frames, centres, axes = np.empty((k, bodies, 3)), np.empty((k, bodies, 3)), np.empty((k, bodies, 9))
-        _kinematics(self._posed, self._still.xmat, np.ascontiguousarray(qpos), frames, centres, axes)
+        m, still = self._model, self._still
+        places, seen = still.qpos, (still.xpos, still.xipos, still.xmat)
+        for i, positions in enumerate(qpos):
+            places[:] = positions
+            mujoco.mj_kinematics(m, still)
+            frames[i], centres[i], axes[i] = seen
         return Poses(frames, axes.reshape(k, bodies, 3, 3), centres)

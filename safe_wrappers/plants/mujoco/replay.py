@@ -83,27 +83,32 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
     qpos, qvel, act, qacc, act_dot = data.qpos, data.qvel, data.act, data.qacc, data.act_dot
     qpos0, qvel0, act0 = qpos.copy(), qvel.copy(), act.copy()
     velocity, acceleration, activation = np.zeros(model.nv), np.zeros(model.nv), np.zeros(model.na)
-    rate, turns = np.zeros(model.nv), _turns(model)
+    rate = np.zeros(model.nv)
+    turns = _turns(model) if RATES_OF_ROTATION_VECTORS else np.zeros(0, dtype=np.intp)
     for ahead, weight in _STAGES:
         mujoco.mj_forwardSkip(model, data, _FROM_POSITIONS, 1)
         visit(data, weight * step_s)
-        stage = qvel.copy()
-        if RATES_OF_ROTATION_VECTORS and turns.size:
+        stage = qvel
+        if turns.size:
+            stage = qvel.copy()
             stage[turns] = rotation_vector_rate(step_s * rate[turns], qvel[turns])
         velocity += weight * stage
         acceleration += weight * qacc
-        activation += weight * act_dot
+        if model.na:
+            activation += weight * act_dot
         if ahead:
             rate = ahead * stage
             qpos[:] = qpos0
             mujoco.mj_integratePos(model, qpos, rate, step_s)
             qvel[:] = qvel0 + step_s * (ahead * qacc)
-            act[:] = act0 + step_s * (ahead * act_dot)
+            if model.na:
+                act[:] = act0 + step_s * (ahead * act_dot)
             data.time = time + ahead * step_s
     qpos[:] = qpos0
     mujoco.mj_integratePos(model, qpos, velocity, step_s)
     qvel[:] = qvel0 + step_s * acceleration
-    act[:] = _within_ranges(model, act0 + step_s * activation)
+    if model.na:
+        act[:] = _within_ranges(model, act0 + step_s * activation)
     data.qacc_warmstart[:] = qacc
 
 

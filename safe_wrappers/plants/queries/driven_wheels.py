@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.vehicle.wheel import Wheel
+from safe_wrappers.control.vehicle.slip import Wheel
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, inertia

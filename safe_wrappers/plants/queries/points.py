@@ -6,63 +6,12 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.mujoco.actuators import moment_of
-from safe_wrappers.plants.mujoco.model import Remade
-from safe_wrappers.plants.mujoco.native import mj_jac, mj_jacDot, mj_solveM
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
-_AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_AFFINE)
 
-
-@compiled
-def _reach(
-    model: int,
-    data: int,
-    body: int,
-    point: Array,
-    qvel: Array,
-    qacc: Array,
-    gain_type: Array,
-    gain: Array,
-    length: Array,
-    velocity: Array,
-    moment: Array,
-    counts: Array,
-    starts: Array,
-    columns: Array,
-    found: Array,
-) -> None:
-    """Writes one point's numbers of `Points.reaches` into `found`; `model` and `data` are addresses."""
-    n, controls = len(qvel), len(length)
-    jacobian, rate, solved = np.empty((3, n)), np.empty((3, n)), np.empty((3, n))
-    mj_jac(model, data, jacobian.ctypes.data, 0, point.ctypes.data, body)
-    mj_jacDot(model, data, rate.ctypes.data, 0, point.ctypes.data, body)
-    mj_solveM(model, data, solved.ctypes.data, jacobian.ctypes.data, 3)
-    found[:] = 0.0
-    for i in range(3):
-        found[i] = point[i]
-        for j in range(n):
-            found[3 + i] += jacobian[i, j] * qvel[j]
-            found[6 + i] += jacobian[i, j] * qacc[j] + rate[i, j] * qvel[j]
-            for k in range(3):
-                found[9 + 3 * i + k] += solved[i, j] * jacobian[k, j]
-    forces, responses = np.zeros((controls, n)), np.empty((controls, n))
-    for k in range(controls):
-        scale = gain[k, 0]
-        if gain_type[k] == _AFFINE_GAIN:
-            scale += gain[k, 1] * length[k] + gain[k, 2] * velocity[k]
-        for place in range(starts[k], starts[k] + counts[k]):
-            forces[k, columns[place]] = moment[place] * scale
-    mj_solveM(model, data, responses.ctypes.data, forces.ctypes.data, controls)
-    for k in range(controls):
-        for j in range(n):
-            found[18 + k] += forces[k, j] * responses[k, j]
-
-
-class Points(Remade):
+class Points:
     """Origins of named bodies, sites and geoms (MujocoPlant), or one point of the state (AnalyticPlant).
 
     `named` has the names by kind; `position` and `velocity` are the indices of the point's coordinates in the state.
@@ -92,9 +41,6 @@ class Points(Remade):
             raise ConfigurationError(f"{wanted}; the model has the bodies {there}")
         for kind, name in self._named:
             self._machine.named(kind, name)
-        m, d = self._machine.model, self._machine.data
-        self._state = d.qvel, d.qacc, m.actuator_gaintype, m.actuator_gainprm
-        self._motors = d.actuator_length, d.actuator_velocity, *moment_of(d)
 
     @property
     def of_machine(self) -> bool:
@@ -124,14 +70,21 @@ class Points(Remade):
         """
         assert self._machine is not None
         plant, found = self._machine, []
-        data = plant.forward()
+        model, data = plant.model, plant.forward()
+        gain, _ = plant.actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
+        forces = plant.actuators.moment(data) * gain[:, None]
+        if plant.action_map is not None:
+            forces *= plant.action_map.scale[:, None]
+        responses, solved = np.empty_like(forces), np.empty((3, model.nv))
+        mujoco.mj_solveM(model, data, responses, forces)
+        energies = (forces * responses).sum(axis=1)
         for kind, name in self._named:
-            numbers = np.empty(18 + plant.lower.size)
-            frame = plant.frames.of(kind, name)
-            _reach(plant.model._address, data._address, *frame, *self._state, *self._motors, numbers)
-            if plant.action_map is not None:  # a unit of action is `scale` units of control
-                numbers[18:] *= plant.action_map.scale**2
-            found.append(numbers)
+            p, jacobian = plant.frames.jacobian(kind, name)
+            rate = plant.frames.jacobian_rate(kind, name)
+            mujoco.mj_solveM(model, data, solved, jacobian)
+            drift = jacobian @ data.qacc + rate @ data.qvel
+            parts = p, jacobian @ data.qvel, drift, (solved @ jacobian.T).ravel(), energies
+            found.append(np.concatenate(parts))
         return found
 
     def accelerations(self) -> list[tuple[Array, Array, Array, Array]]:

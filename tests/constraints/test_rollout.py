@@ -1,0 +1,359 @@
+"""What constraints on a forecast share: what is asked of it, from inside and from outside, and when it is spared."""
+
+import warnings
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from asking import Asked, bound
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from judged_loops import Judge, flagged, sliders
+
+import safe_wrappers as sw
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutMemory
+from safe_wrappers.plants.mujoco.forecast import Recorder
+
+HOLD_S = 0.05
+LIMITS = {
+    "speed": lambda **more: sw.constraints.SpeedLimit(0.8, "b0", "x", "substep", **more),
+    "joint position": lambda **more: sw.constraints.JointPositionLimit(-1.0, 1.0, **more),
+    "joint speed": lambda **more: sw.constraints.JointSpeedLimit(0.8, **more),
+    "workspace": lambda **more: sw.constraints.Workspace(
+        [-1.0, None, None], [1.0, None, None], bodies=["b0"], **more
+    ),
+    "upright": lambda **more: sw.constraints.Upright("b0", lowest=-1.0, **more),
+}
+kinds = pytest.mark.parametrize("kind", LIMITS)
+
+
+def slider_path(x, v, u, horizon, strength):
+    """The slider after every substep: the control held, then braking at half of its speed per control step.
+
+    The speed that is read for it is MuJoCo's `actuator_velocity`, which is one Euler step old.
+    """
+    path, before = [], v
+    for hold in range(horizon):
+        if hold:
+            u = float(np.clip(-0.5 * before / HOLD_S, -strength, strength))
+        for _ in range(5):
+            before = v
+            v += 0.01 * u
+            x += 0.01 * v
+            path.append(x)
+    return np.array(path)
+
+
+def looking(scene, limit, qpos, qvel):
+    """The limit, bound to a plant that has seen this state."""
+    plant = bound(scene)
+    scene.data.qpos[:], scene.data.qvel[:] = qpos, qvel
+    plant.observe()
+    return Asked(limit, plant)
+
+
+# What is asked ------------------------------------------------------------------------------------------------
+
+
+@given(
+    x=st.floats(-1.6, 1.6),
+    v=st.floats(-4.0, 4.0),
+    u=st.floats(-30.0, 30.0),
+    horizon=st.integers(1, 6),
+    margin=st.sampled_from([0.0, 0.2]),
+)
+def test_a_control_is_admitted_by_where_it_leads(x, v, u, horizon, margin):
+    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=horizon, margin=margin)
+    limit = looking(sliders(range_="-30 30"), limit, [x], [v])
+    beyond = np.abs(slider_path(x, v, u, horizon, 30.0)) - (1.0 - margin)
+    start = abs(x) - (1.0 - margin)
+    if start <= 0.0:
+        missing = beyond.max()
+    else:  # no farther out than it is, and back to exp(-t / 0.1 s) of it at the end, on the side that it is out on
+        side = np.sign(x) * slider_path(x, v, u, horizon, 30.0) - (1.0 - margin)
+        other = -side - 2.0 * (1.0 - margin)
+        missing = max(side.max() - start, side[-1] - start * np.exp(-horizon * HOLD_S / 0.1), other.max())
+    assume(abs(missing) > 1e-7 and abs(start) > 1e-9)
+    assert limit.admits(np.array([u])) == (missing < 0.0)
+    assert limit.slack(np.array([u])) == pytest.approx(-missing, abs=1e-9)
+    assert limit.value().min() == pytest.approx(1.0 - abs(x), abs=1e-12)
+
+
+def test_outside_it_comes_back_and_stays_whatever_the_policy_does():
+    scene = sliders(range_="-100 100")
+    scene.start = [1.4], [0.0]
+    filtered = sw.CBFActionFilter(scene, [sw.constraints.JointPositionLimit(-1.0, 1.0)])
+    judge = Judge(filtered, lambda model, data: 1.0 - np.abs(data.qpos))
+    with pytest.warns(sw.UnsafeStateWarning):
+        filtered.reset(seed=0)
+    rooms = [-0.4]
+    for _ in range(30):
+        least, end, _, info = judge.step(filtered, np.array([100.0]))
+        assert least >= min(rooms[-1], 0.0) - 1e-9 or flagged(info)  # never farther out
+        rooms.append(end)
+        assert info["cbf/unsafe"] == (rooms[-2] < -1e-6)
+    assert not info["cbf/infeasible"]
+    assert np.argmax(np.array(rooms) >= -1e-6) <= 12
+    assert min(rooms[12:]) >= -1e-6
+
+
+# Forecasts that are spared ------------------------------------------------------------------------------------
+
+
+def count_forecasts(monkeypatch):
+    calls = [0]
+    real = sw.MujocoPlant.forecast
+
+    def counted(self, *asked):
+        calls[0] += 1
+        return real(self, *asked)
+
+    monkeypatch.setattr(sw.MujocoPlant, "forecast", counted)
+    return calls
+
+
+def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
+    calls = count_forecasts(monkeypatch)
+    actions = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], (40, 1)), 12, axis=0)
+    seen, spent = {}, {}
+    for max_decrease in (None, 0.5):  # the fastest is 2 m/s, four control steps are 0.2 s
+        limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=4, max_decrease=max_decrease)
+        filtered = sw.CBFActionFilter(sliders(range_="-10 10"), [limit])
+        filtered.reset(seed=0)
+        calls[0] = 0
+        with warnings.catch_warnings(action="error"):
+            infos = [filtered.step(a)[4] for a in actions]
+        seen[max_decrease], spent[max_decrease] = np.array([i["executed_action"] for i in infos]), calls[0]
+        assert sum(i["cbf/intervened"] for i in infos) > 20
+    np.testing.assert_array_equal(seen[None], seen[0.5])
+    assert spent[0.5] < spent[None] - 50
+
+
+def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
+    calls = count_forecasts(monkeypatch)
+    scene = sliders(range_="-1 1")
+    scene.start = [-0.9], [1.0]  # 5 cm in a control step
+    limit = sw.constraints.JointPositionLimit(None, 2.0, joints=["x0"], horizon=4, max_decrease=0.12)
+    filtered = sw.CBFActionFilter(scene, [limit])
+    filtered.reset(seed=0)
+    calls[0] = 0
+    with pytest.warns(UserWarning) as caught:
+        for _ in range(20):
+            filtered.step(np.array([0.0]))
+    assert [str(w.message) for w in caught] == [
+        "JointPositionLimit: what is left of the limit fell by 0.15 rad or m within 3 control steps, farther than "
+        "the declared max_decrease of 0.12; from now on every control is forecast"
+    ]
+    assert calls[0] == 17  # three steps were taken for granted
+    with warnings.catch_warnings(action="error"):  # nor is it believed again in the next episode
+        filtered.reset(seed=0)
+        filtered.step(np.array([0.0]))
+    assert calls[0] == 18
+
+
+# Numbers that are none, and machines that cannot be forecast --------------------------------------------------
+
+
+def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monkeypatch):
+    # MuJoCo resets it, and from the reset on all looks well.
+    monkeypatch.chdir(tmp_path)  # it writes a log
+    scene = sliders(actuator='motor gear="1000"', range_=None)
+    limit = looking(scene, sw.constraints.JointPositionLimit(-1e6, 1e6), [0.0], [0.0])
+    assert limit.admits(np.array([1.0]))
+    assert not limit.admits(np.array([1e9]))
+    assert limit.admits(np.array([2.0]))  # and the next one is a forecast again
+
+
+@kinds
+def test_unlimited_actuators_are_held_too(kind):
+    scene = sliders(count=2, range_=None)
+    filtered = sw.CBFActionFilter(scene, [LIMITS[kind]()])
+    filtered.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        info = filtered.step(rng.normal(scale=100.0, size=2))[4]
+        assert not flagged(info) and not info["cbf/unsafe"]
+        assert limit_left(kind, scene) >= -1e-9
+
+
+def limit_left(kind, scene):
+    if kind == "upright":
+        return 0.0  # no actuator lifts this machine
+    return {"joint position": 1.0, "workspace": 1.0}.get(kind, 0.8) - abs(
+        scene.data.qpos[0] if kind in ("joint position", "workspace") else scene.data.qvel[0]
+    )
+
+
+@kinds
+@pytest.mark.parametrize("max_decrease", [None, 0.1])
+def test_a_reading_that_is_no_number_runs_the_fallback(kind, max_decrease):
+    scene = sliders()
+    filtered = sw.CBFActionFilter(scene, [LIMITS[kind](max_decrease=max_decrease)])
+    filtered.reset(seed=0)
+    filtered.step(np.array([0.5]))
+    scene.data.qvel[0] = np.nan
+    with pytest.warns(sw.UnsafeStateWarning):
+        info = filtered.step(np.array([1.0]))[4]
+    assert info["cbf/fallback"] and info["cbf/unsafe"] and not info["cbf/refused"].any()
+    np.testing.assert_array_equal(info["executed_action"], [0.0])
+
+
+# For how long a rollout constraint keeps the response of its forecasts, on a plant of one line of arithmetic
+
+
+INSTANTS = 8
+"""Of a control interval."""
+
+
+class Approaching(BoundRollout):
+    """What is left of a bound on the first control, which acts the more the later it is."""
+
+    def __init__(self, plant, margin=0.0, horizon=1):
+        self.spec, self.plant, self.max_decrease = (
+            SimpleNamespace(
+                margin=margin, horizon=horizon, look_ahead_below=None, euler_look_ahead=False, unit="m"
+            ),
+            plant,
+            None,
+        )
+
+    def room(self, forecast):
+        share = np.linspace(1.0 / INSTANTS, 1.0, INSTANTS)[:, None]
+        return self.plant.left - forecast[0] * self.plant.gain * share
+
+    def now(self):
+        return np.array([self.plant.left])
+
+
+def still_plant():
+    plant = SimpleNamespace(
+        has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1, observation_id=0
+    )
+    plant.left, plant.gain, plant.asked = 0.5, 1.0, []
+
+    def forecast(control, horizon, euler=False):
+        plant.asked.append(np.array(control))
+        return control
+
+    plant.braking, plant.forecast = lambda: np.zeros(2), forecast
+    return plant
+
+
+def test_a_response_is_kept_for_ten_control_steps():
+    plant = still_plant()
+    limit, memory, asked = Approaching(plant), RolloutMemory(), []
+    for plant.observation_id in range(1, 25):
+        limit.observe(memory)
+        plant.asked.clear()
+        limit.rows()
+        asked.append(len(plant.asked))
+        limit.rows()
+        assert len(plant.asked) == asked[-1]  # once per observation
+        memory = limit.executed(np.zeros(2))
+    # Of braking twice and one difference for each control, every tenth step; of braking alone between.
+    assert asked == [4, *[1] * 9, 4, *[1] * 9, 4, *[1] * 3]
+
+
+def test_a_new_episode_knows_no_response():
+    plant = still_plant()
+    limit = Approaching(plant)
+    for _ in range(2):
+        limit.observe(limit.start())
+        plant.asked.clear()
+        limit.rows()
+        assert len(plant.asked) == 4
+
+
+def test_the_first_linearisation_takes_the_kept_response_and_the_second_its_own():
+    plant = still_plant()
+    limit = Approaching(plant)
+    limit.observe(RolloutMemory())
+    limit.rows()
+    plant.gain, asked = 2.0, []
+    for _ in range(2):
+        plant.asked.clear()
+        rows = limit.linearize(np.array([0.9, 0.0]))
+        asked.append((len(plant.asked), rows.normals[:, 0].max()))
+    assert asked == [(1, pytest.approx(1.0)), (4, pytest.approx(2.0))]
+
+
+# What constraints that forecast do where controls are displacements: rows about braking, and what a search cost
+
+
+gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+
+pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.errors.UnsafeStateWarning")
+ZERO = np.zeros(4)
+
+
+def protected(env_id, steps=1000):
+    env = sw.protect(gym.make(env_id, max_episode_steps=steps))
+    env.reset(seed=0)
+    return env
+
+
+def to_the_corner(env, way, steps=9):
+    for _ in range(steps):
+        env.step(np.array(way, np.float32))
+    env.filter.observe()
+
+
+def room(rows, control):
+    """What the rows say is left of a control."""
+    return float((rows.offsets - rows.normals @ control).min())
+
+
+def test_rows_and_forecast_agree_about_braking():
+    # In the table a displacement of zero comes out, but too slowly.
+    env = protected("FetchPush-v4")
+    for constraint, slow in zip(env.filter.bound, (False, True), strict=True):
+        assert constraint.value().min() < -0.003
+        left = float(constraint.slacks(ZERO).min())
+        assert (left < 0.0) == slow != constraint.admits(ZERO)
+        assert room(constraint.rows(), ZERO) == pytest.approx(left, abs=1e-5)
+
+
+@pytest.mark.parametrize("way", [[1.0, 0.3, 0.2, 0.0], [-0.8, -1.0, 0.5, 0.0], [0.2, 0.9, 0.4, 0.0]])
+def test_rows_foretell_forecasts(way):
+    env = protected("FetchReach-v4")
+    to_the_corner(env, way)
+    box = env.filter.bound[0]
+    rows = box.rows()
+    rng = np.random.default_rng(0)
+    broken = 0
+    for _ in range(12):
+        control = np.append(rng.uniform(-0.7, 0.7, 3), 0.0)
+        left = float(box.slacks(control).min())
+        # What no control of the action space could break has no row.
+        assert min(room(rows, control), 0.002) == pytest.approx(min(left, 0.002), abs=0.003)
+        broken += left < -0.005
+    assert broken >= 3
+
+
+def counted(monkeypatch):
+    calls, whole = [0], Recorder.record
+
+    def record(self, *arguments):
+        calls[0] += 1
+        return whole(self, *arguments)
+
+    monkeypatch.setattr(Recorder, "record", record)
+    return calls
+
+
+def test_what_a_changed_step_costs(monkeypatch):
+    calls, costs = counted(monkeypatch), []
+    env = protected("FetchReach-v4")
+    rng = np.random.default_rng(1)
+    for k in range(60):
+        if k % 15 == 0:
+            action = np.where(rng.random(4) < 0.5, -1.0, 1.0).astype(np.float32)
+        calls[0] = 0
+        info = env.step(action)[-1]
+        if info["cbf/intervened"]:
+            costs.append(calls[0])
+        else:
+            assert calls[0] <= 1
+    # Its own forecast, that of braking and of the answer; differences, of three displacements, every tenth step.
+    assert len(costs) > 25 and min(costs) == 3 and np.mean(costs) < 6.0

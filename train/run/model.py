@@ -1,0 +1,161 @@
+"""From an arm's settings to its model, and the callbacks that its learner needs."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.sb3 import (
+    ExecutedActionDictReplayBuffer,
+    ExecutedActionHerReplayBuffer,
+    ExecutedActionReplayBuffer,
+    LagrangianMultiplier,
+    MarginCurriculum,
+)
+
+from ..config import ArmConfig
+from ..config.algorithms import (
+    ALGORITHMS,
+    DISCRETE,
+    HER,
+    LINEAR,
+    MASKED,
+    OFF_POLICY,
+    ON_POLICY,
+    RECURRENT,
+    SCHEDULED,
+    default_of,
+)
+
+_NOISE: Final = {"normal": NormalActionNoise, "ornstein_uhlenbeck": OrnsteinUhlenbeckActionNoise}
+
+
+def new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
+    """The arm's algorithm before its first step, around envs that are scaled as the arm says."""
+    if arm.normalize.observation or arm.normalize.reward:
+        envs = VecNormalize(
+            envs,
+            norm_obs=arm.normalize.observation,
+            norm_reward=arm.normalize.reward,
+            gamma=arm.hyperparameters.get("gamma", 0.99),
+        )
+    settings = _constructor_arguments(arm, envs)
+    model: BaseAlgorithm = ALGORITHMS[arm.algorithm](env=envs, seed=seed, device=arm.device, **settings)
+    return model
+
+
+def buffer_size(arm: ArmConfig) -> int:
+    """Transitions: SB3's default of a million would be saved with every checkpoint, mostly empty."""
+    return int(arm.hyperparameters.get("buffer_size", min(1_000_000, arm.total_steps)))
+
+
+def _constructor_arguments(arm: ArmConfig, envs: VecEnv) -> dict[str, Any]:
+    has_dict = isinstance(envs.observation_space, spaces.Dict)
+    policy = f"{'MultiInput' if has_dict else 'Mlp'}{'Lstm' if arm.algorithm in RECURRENT else ''}Policy"
+    # A copy: SB3 writes into policy_kwargs, and a run folder is known again by its settings.
+    settings = {"policy": policy, **deepcopy(arm.hyperparameters)}
+    for key in SCHEDULED:
+        if isinstance(settings.get(key), str):
+            settings[key] = LinearSchedule(float(settings[key].removeprefix(LINEAR)), 0.0, 1.0)
+    if isinstance(settings.get("train_freq"), list):  # SB3 wants a tuple, YAML has none
+        settings["train_freq"] = tuple(settings["train_freq"])
+    if isinstance(settings.get("action_noise"), dict):
+        ((kind, size),) = settings["action_noise"].items()
+        assert envs.action_space.shape is not None
+        mean = np.zeros(envs.action_space.shape)
+        settings["action_noise"] = _NOISE[kind](mean, np.full_like(mean, size))
+    elif "action_noise" in settings:
+        settings["action_noise"] = None
+    if arm.algorithm not in ON_POLICY:
+        settings["buffer_size"] = buffer_size(arm)
+    mode = {"mode": arm.learner.kind}
+    if arm.replays_goals:
+        own = arm.learner.stores_executed or arm.learner.penalised
+        settings["replay_buffer_class"] = ExecutedActionHerReplayBuffer if own else HerReplayBuffer
+        given = settings.get("replay_buffer_kwargs") or {}
+        settings["replay_buffer_kwargs"] = given | (mode if own else {})
+    elif arm.learner.stores_executed:
+        kind_of = ExecutedActionDictReplayBuffer if has_dict else ExecutedActionReplayBuffer
+        settings |= {"replay_buffer_class": kind_of, "replay_buffer_kwargs": mode}
+    return settings
+
+
+def learning_starts(arm: ArmConfig) -> int:
+    """Steps of random actions before an off-policy algorithm learns."""
+    return int(arm.hyperparameters.get("learning_starts", default_of(arm.algorithm, "learning_starts")))
+
+
+def whole_rollouts(arm: ArmConfig) -> int:
+    """Steps of all envs together that a run makes: `total_steps`, rounded up to whole rollouts."""
+    argument = "n_steps" if arm.algorithm in ON_POLICY else "train_freq"
+    given = arm.hyperparameters.get(argument, default_of(arm.algorithm, argument))
+    count, unit = (given, "step") if isinstance(given, int) else given
+    rollout = arm.n_envs * (count if unit == "step" else 1)  # how long episodes are is not known beforehand
+    return int(-(-arm.total_steps // rollout) * rollout)
+
+
+def learner_callbacks(arm: ArmConfig) -> list[BaseCallback]:
+    """What the arm's learner needs beside its algorithm: a margin that changes, a price on cost."""
+    learner, found = arm.learner, list[BaseCallback]()
+    if (margin := learner.margin_curriculum) is not None:
+        found.append(MarginCurriculum(margin.start, margin.end, margin.until))
+    if learner.cost_limit is not None:
+        found.append(LagrangianMultiplier(learner.cost_limit, learner.multiplier_rate))
+    return found
+
+
+def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
+    """Refuses an arm whose algorithm or margin does not fit this task, which only the task itself can tell.
+
+    Raises:
+        ConfigurationError: Actions of the wrong kind; a filter without a margin; or, for HER, no goals, or training
+            before an episode ends.
+    """
+    where, space = f"arms.{arm.name}", env.observation_space
+    kinds: tuple[type, ...] = (spaces.Box,) if arm.algorithm in OFF_POLICY else ()
+    if arm.algorithm in (*DISCRETE, *MASKED):
+        kinds = (spaces.Discrete, spaces.MultiDiscrete) if arm.algorithm in MASKED else (spaces.Discrete,)
+    if kinds and not isinstance(env.action_space, kinds):
+        others = OFF_POLICY if isinstance(env.action_space, spaces.Box) else DISCRETE
+        raise ConfigurationError(
+            f"{where}: {arm.algorithm} needs actions of a {' or '.join(kind.__name__ for kind in kinds)}, and"
+            f" {arm.env.id} has {env.action_space}. Other algorithms: {', '.join((*ON_POLICY[:-1], *others))}."
+        )
+    if arm.algorithm in MASKED and not env.has_wrapper_attr("action_masks"):
+        raise ConfigurationError(
+            f"{where}: {arm.algorithm} asks the env which actions are allowed, and neither {arm.env.id} nor the arm's"
+            " filter has action_masks. Give the arm a filter (an ActionShield has them), or use PPO."
+        )
+    if (margin := arm.learner.margin_curriculum) is not None:
+        if not env.has_wrapper_attr("set_margin"):
+            raise ConfigurationError(f"{where}.learner.margin_curriculum: the filter has no set_margin.")
+        try:
+            env.get_wrapper_attr("set_margin")(max(margin.start, margin.end))
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where}.learner.margin_curriculum: {error}") from None
+    if not arm.replays_goals:
+        return
+    goals = {"observation", "achieved_goal", "desired_goal"}
+    has_goals = isinstance(space, spaces.Dict) and goals <= set(space)
+    if not (has_goals and env.has_wrapper_attr("compute_reward")):
+        raise ConfigurationError(
+            f"{where}: {HER} needs observations that are a Dict with {', '.join(sorted(goals))}, and a task that has"
+            f" compute_reward; {arm.env.id} has {space}. Leave hyperparameters.replay_buffer_class out."
+        )
+    steps = env.spec.max_episode_steps if env.spec is not None else None
+    if steps is not None and learning_starts(arm) < steps * arm.n_envs:
+        raise ConfigurationError(
+            f"{where}: {HER} draws from episodes that have ended. With {arm.n_envs} envs of {steps} steps an episode"
+            f" hyperparameters.learning_starts has to be at least {steps * arm.n_envs}; it is {learning_starts(arm)}."
+        )
