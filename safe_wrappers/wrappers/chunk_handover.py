@@ -270,7 +270,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     def _warn_clipped(self, chunk: Array) -> None:
         """The first chunk that leaves the action space is warned of."""
         space: Any = self.action_space
-        if ((chunk < space.low) | (chunk > space.high)).any():
+        if (((chunk < space.low) | (chunk > space.high)) & np.isfinite(chunk)).any():
             self._warn_once(
                 "clipped", "the policy's action left the action space; its entries are clipped to it"
             )

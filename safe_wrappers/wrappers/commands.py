@@ -108,7 +108,8 @@ class CommandGate(LayerWrapper, CommandReceiver):
 
     def _warn_outside(self, action: NDArray[Any], whose: str) -> None:
         """The first action outside the space is warned of, where no filter inside boxes it."""
-        if not self._filtered and ((action < self._low) | (action > self._high)).any():
+        beyond = (action < self._low) | (action > self._high)
+        if not self._filtered and (beyond & np.isfinite(action)).any():
             message = f"the {whose} action left the action space, and no CBFActionFilter inside boxes it"
             self._warn_once("outside", f"{message}: {action}")
 

@@ -1,4 +1,4 @@
-"""critic_value and log_probability: what the learner's own networks say, in the env's units."""
+"""critic_value: what the learner's own critic says, in the env's units."""
 
 import gymnasium as gym
 import numpy as np

@@ -247,85 +247,9 @@ class ServoArm(MujocoEnv):
         return np.concatenate([self.data.qpos, self.data.qvel])
 
 
-LIMITS = {"max_acceleration": [8.0, 20.0], "max_speed": [1.0, 4.0]}
-HOLD = 0.02
-
-
 @pytest.fixture
 def arm(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(ARM)
     assert mujoco.MjModel.from_xml_string(ARM).nu == 2
     return ServoArm(str(path))
-
-
-def far_away(env):
-    return [9.0], [0.0]
-
-
-def admitted_stack(env, motion_limits=LIMITS, **more):
-    env = sw.LeaseExpiry(
-        env,
-        sw.StoppingBudget(far_away, braking=1.0, acceleration=0.0),
-        motion_limits=motion_limits,
-        max_lease_s=5.0,
-        fallback="hold",
-        **more,
-    )
-    return sw.ChunkHandover(env, 10, 5, rate_limit=50.0, fallback="hold")
-
-
-def simulated_reach(time, v, speed, acceleration, sign):
-    """The farthest that a body gets by pushing all the way, in small exact steps."""
-    x, dt = 0.0, time / 4000
-    for _ in range(4000):
-        new = min(v * sign + acceleration * dt, max(speed, v * sign)) * sign
-        x, v = x + 0.5 * (v + new) * dt, new
-    return x
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_chunk_whose_end_is_out_of_reach_is_refused_and_the_left_over_goes_on(arm, axis, sign):
-    env = admitted_stack(arm)
-    speed, acceleration = LIMITS["max_speed"][axis], LIMITS["max_acceleration"][axis]
-    for beyond, refused in ((0.999, False), (1.001, True)):
-        env.reset(seed=0)
-        first = np.zeros((10, 2))
-        first[:, 1 - axis] = np.linspace(0.0, 0.002, 10)
-        info = env.step(first)[4]
-        assert not info["lease/refused"] and not info["handover/refused"]
-        at = arm.data.actuator_length[axis]
-        goal = at + beyond * simulated_reach(0.2, arm.data.actuator_velocity[axis], speed, acceleration, sign)
-        chunk = np.repeat(arm.data.actuator_length[None].copy(), 10, axis=0)
-        chunk[-1, axis] = goal
-        info = env.step(chunk)[4]
-        assert info["lease/refused"] is refused and info["handover/refused"] is refused
-        assert info["handover/latency"] == (-1 if refused else 0)
-        if refused:
-            # The left-over of the first chunk went on, to its end.
-            np.testing.assert_allclose(info["executed_action"], first[-1].astype(np.float32), atol=1e-7)
-            assert info["handover/starved"] == 0 and not info["lease/braking"]
-            # What comes after it, in reach, takes over as if nothing had been.
-            info = env.step(np.repeat(arm.data.actuator_length[None].copy(), 10, axis=0))[4]
-            assert not info["lease/refused"] and info["handover/latency"] == 0
-
-
-def test_chunks_that_an_ideal_machine_follows_are_never_refused(arm):
-    # Followed exactly by a machine inside the limits: the env's own state is put on the path.
-    rng = np.random.default_rng(0)
-    env = admitted_stack(arm)
-    speeds, accelerations = np.array(LIMITS["max_speed"]), np.array(LIMITS["max_acceleration"])
-    refused = 0
-    for _ in range(200):
-        env.reset(seed=0)
-        x, v = rng.uniform(-1.0, 1.0, 2), rng.uniform(-speeds, speeds)
-        arm.set_state(x, v)
-        path = []
-        for _ in range(10):
-            new = np.clip(v + rng.choice([-1.0, 1.0], 2) * accelerations * HOLD, -speeds, speeds)
-            x, v = x + 0.5 * (v + new) * HOLD, new
-            path.append(x)
-        info = env.step(np.array(path))[4]
-        refused += info["lease/refused"] or info["handover/refused"]
-    assert refused == 0

@@ -181,18 +181,6 @@ def test_what_slides_uses_all_friction_and_a_pyramid_has_less_between_its_edges(
     assert info[keys.BALANCE_FRICTION_USED] == pytest.approx(used / share, rel=0.02)
 
 
-def test_a_light_touch_does_not_count():
-    everything, pebble = (sw.BalanceMonitor(Crates(0.4), bodies=b) for b in (None, ["pebble"]))
-    used = []
-    for env in (everything, pebble):
-        env.reset(seed=0)
-        settled(env, np.zeros(4))
-        env.unwrapped.data.qvel[6] = 2.0  # of 0.05 kg: half a per cent of the weight
-        used.append(env.step(np.zeros(4))[4][keys.BALANCE_FRICTION_USED])
-    assert PRESSING * 11.05 > 0.05
-    assert used[0] < 0.05 and used[1] == pytest.approx(1.0, rel=0.02)
-
-
 # All of it by hand, on robots -------------------------------------------------------------------------------------
 
 
@@ -226,7 +214,7 @@ def by_hand(raw, data, share, inset):
         hull = ConvexHull(p[:, :2]).equations
         margins.append(-(hull[:, :2] @ zmp + hull[:, 2]).max() - inset)
     steps = raw.frame_skip
-    return used, min(margins, default=0.0), len(margins) / steps, airborne / steps
+    return used, min(margins, default=np.nan), airborne / steps
 
 
 @pytest.mark.parametrize(("env_id", "strength"), [("Ant-v5", 0.08), ("Humanoid-v5", 0.3)])
@@ -245,8 +233,8 @@ def test_figures_are_those_of_stepping_by_hand(env_id, strength):
         np.testing.assert_allclose(values(info), by_hand(raw, start, 0.7, 0.02), rtol=1e-8, atol=1e-9)
         assert info[keys.BALANCE_PARTIAL] is False
         found.append(values(info))
-    used, margins, supported, airborne = np.array(found).T
-    assert (supported > 0.0).sum() > 10 and margins.min() < 0.0 < margins.max()
+    used, margins, airborne = np.array(found).T
+    assert (~np.isnan(margins)).sum() > 10 and np.nanmin(margins) < 0.0 < np.nanmax(margins)
     assert used.max() > 0.9 and (airborne < 1.0).sum() > 60
 
 
@@ -299,7 +287,8 @@ def test_no_number_that_is_none_is_reported(bad):
         with warnings.catch_warnings(action="ignore"):
             infos = [env.step(env.action_space.low)[4] for _ in range(27)]
         for info in infos[24:26]:  # and MuJoCo's reset in the step after it
-            assert np.isfinite([*values(info), *info[MOMENTA[0]], *info[MOMENTA[1]]]).all()
+            known = [info[keys.BALANCE_FRICTION_USED], info[keys.BALANCE_AIRBORNE]]
+            assert np.isfinite([*known, *info[MOMENTA[0]], *info[MOMENTA[1]]]).all()
         assert infos[24][keys.BALANCE_PARTIAL] is True and infos[23][keys.BALANCE_PARTIAL] is False
         assert infos[26][keys.BALANCE_PARTIAL] is False
 

@@ -324,18 +324,6 @@ def test_random_delays_are_drawn_within_bounds_all_of_them_and_again_with_the_se
     assert latencies(again, 3) == [first]
 
 
-def test_a_stale_stamp_is_consumed_from_its_age_on():
-    env = sw.ChunkHandover(Line(), 8, 2, blend="replace", fallback="zero")
-    env.reset(seed=0)
-    env.step(numbered(1, 8))
-    env.step(numbered(2, 8))
-    assert env.now_s == pytest.approx(0.4)
-    env.set_observation_time(0.3)  # made at control step 3, there at 4: its entry 1
-    info = env.step(numbered(3, 8))[4]
-    assert info["handover/latency"] == 1 and not info["handover/refused"]
-    np.testing.assert_array_equal(env.unwrapped.given[4:], numbered(3, 8)[1:3])
-
-
 @pytest.mark.parametrize(
     ("stamp", "why"),
     [(0.0, "old"), (0.4, "a repeat"), (0.39, "a repeat"), (0.7, "the future"), (-1.0, "old")],
@@ -350,16 +338,6 @@ def test_chunks_that_are_not_newer_or_from_the_future_are_refused(stamp, why):
     assert info["handover/refused"] and info["handover/latency"] == -1, why
     np.testing.assert_array_equal(env.unwrapped.given[6:], numbered(3, 8)[2:4])
     assert not env.step(numbered(5, 8))[4]["handover/refused"], "the next one, fresh, is welcome"
-
-
-def test_nothing_delivered_is_no_refusal():
-    env = sw.ChunkHandover(Line(), 8, 2, blend="replace", fallback="zero")
-    env.reset(seed=0)
-    env.step(numbered(1, 8))
-    env.set_observation_time(None)
-    info = env.step(np.full((8, 1), np.nan))[4]
-    assert not info["handover/refused"] and info["handover/starved"] == 0
-    np.testing.assert_array_equal(env.unwrapped.given[2:], numbered(1, 8)[2:4])
 
 
 def test_a_reset_forgets_chunks_stamps_and_commands():
@@ -579,23 +557,6 @@ def test_wrong_shapes_are_refused_and_the_env_is_not_stepped(chunk):
         env.step(chunk)
     assert env.unwrapped.given == []
     assert env.step([[0.25]] * 8)[4]["handover/latency"] == 0, "a list of the right shape is a chunk"
-
-
-@pytest.mark.parametrize("stamp", [math.nan, math.inf])
-def test_stamps_are_times(stamp):
-    env = handover(Line())
-    env.reset(seed=0)
-    with pytest.raises(ActionError, match="time in seconds"):
-        env.set_observation_time(stamp)
-
-
-def test_each_component_keeps_its_own_limit():
-    limits = np.array([2.0, 0.5])
-    env = sw.ChunkHandover(Line(2), 8, 4, 2, rate_limit=limits, fallback="zero")
-    rng = np.random.default_rng(0)
-    commands, _ = run(env, rng.uniform(-1, 1, (20, 8, 2)).astype(np.float32))
-    steps = np.abs(np.diff(commands.astype(np.float64), axis=0)).max(axis=0)
-    assert (steps <= limits * HOLD).all() and (steps > 0.8 * limits * HOLD).all()
 
 
 # The chunk seams' bugs seen in others ---------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 import safe_wrappers as sw
 from benchmarks import car_drivers
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.scene import MOST_MARKS, arrows, put
+from safe_wrappers.drawing.scene import MOST_MARKS, put
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
 
@@ -84,22 +84,6 @@ def test_an_env_without_frames_is_refused_with_the_line_to_write():
         sw.SafetyOverlay(sw.protect(gym.make(TASK)))
     with pytest.raises(ConfigurationError, match="'depth_array'"):
         sw.SafetyOverlay(sw.protect(gym.make(TASK, render_mode="depth_array")))
-
-
-@pytest.mark.parametrize(
-    "outer",
-    [
-        sw.protect,
-        lambda env: sw.CostFunction(env, lambda task: 0.0),
-        lambda env: sw.LeaseExpiry(
-            env, sw.StoppingBudget(sw.constraints.JointSpeedLimit(9.0), closing_speed=1.0)
-        ),
-        lambda env: sw.TeleopChannel(env, 0.0, 0.0),
-    ],
-)
-def test_what_the_overlay_would_not_see_belongs_inside(outer):
-    with pytest.raises(ConfigurationError, match=r"draw nothing of what is outside.*SafetyOverlay\(\w+\(env"):
-        outer(sw.SafetyOverlay(gym.make(TASK, render_mode="rgb_array")))
 
 
 # Nothing is changed -------------------------------------------------------------------------------------------
@@ -239,28 +223,6 @@ def test_a_window_gets_marks_and_words_before_each_step():
 
 
 # Arrows -------------------------------------------------------------------------------------------------------
-
-
-def drawn_arrows(env, proposed, executed):
-    bound = env.look()
-    found = arrows(env.plant, [b.spec for b in bound], np.array(proposed), np.array(executed))
-    return {mark.role: mark for mark in found}
-
-
-def test_a_drive_points_along_the_heading_and_a_turn_alone_nowhere():
-    env = make()
-    env.reset(seed=0)
-    heading = env.unwrapped.data.body("agent").xmat.reshape(3, 3)[:, 0]
-    found = drawn_arrows(env, [0.0, 1.0], [1.0, 0.0])
-    assert set(found) == {"executed"}
-    np.testing.assert_allclose(found["executed"].axes[:, 2], heading, atol=1e-6)
-    low = env.plant.acting_range[0][0]  # no control pushes harder
-    back = drawn_arrows(env, [0.5 * low, 0.0], [low, 0.0])
-    assert (
-        drawn_arrows(env, [0.5 * low, 0.0], [3.0 * low, 0.0])["executed"].size[2] == back["executed"].size[2]
-    )
-    np.testing.assert_allclose(back["executed"].axes[:, 2], -heading, atol=1e-6)
-    assert back["executed"].size[2] == pytest.approx(2.0 * back["proposed"].size[2])
 
 
 # With GL ------------------------------------------------------------------------------------------------------

@@ -1,18 +1,25 @@
-"""Machines' limits: no executed blend breaks them between its ends; what cannot be blended is refused."""
+"""Machines' limits: no executed blend breaks them between its ends; slow chunks; joints that ring."""
 
 import copy
+import itertools
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 from chunk_worlds import Line
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
 import safe_wrappers as sw
+from safe_wrappers.control.handover.vibration import smoothstep_share
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants import RigidModelCheck
+from safe_wrappers.wrappers.chunk_queue import Upsampling
+
+pytestmark = pytest.mark.filterwarnings("ignore:a command was held back:UserWarning")
+
 
 HOLD = 0.1
 
@@ -241,3 +248,161 @@ def test_they_are_recorded_as_plain_data():
     }
     again = gym.make(copy.deepcopy(env.spec))
     assert again.get_wrapper_attr("action_space") == env.action_space
+
+
+@pytest.mark.parametrize(("entries", "steps"), [(2, 3), (5, 4), (9, 33)])
+def test_commands_between_entries_are_the_spline_through_them(entries, steps):
+    chunk = np.random.default_rng(0).normal(size=(entries, 3))
+    commands = Upsampling(entries, steps).commands(chunk)
+    times = np.arange(entries) * steps
+    spline = CubicHermiteSpline(times, chunk, np.gradient(chunk, steps, axis=0))
+    assert commands == pytest.approx(spline(np.arange(times[-1] + 1)), abs=1e-12)
+    assert np.array_equal(commands[::steps], chunk)
+
+
+class Sent(gym.Wrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        self.sent = []
+
+    def step(self, action):
+        self.sent.append(np.array(action))
+        return self.env.step(action)
+
+
+def test_a_slow_chunk_drives_a_fast_loop_late_and_within_the_limit():
+    inner = Sent(gym.make("FlexJointReach-v0"))
+    env = sw.ChunkHandover(inner, 5, 10, inference_delay=3, steps_per_entry=5, rate_limit=[30.0, 10.0])
+    assert env.action_space.shape == (5, 2)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    chunks = [
+        0.4 * rng.uniform(env.action_space.low, env.action_space.high).astype(np.float32) for _ in range(3)
+    ]
+    for chunk in chunks:
+        info = env.step(chunk)[4]
+    assert info["handover/latency"] == 3
+    sent = np.array(inner.sent, dtype=np.float64)
+    assert (np.abs(np.diff(sent, axis=0)) <= np.array([30.0, 10.0]) * 0.01 + 1e-12).all()
+
+
+def test_a_late_slow_chunk_is_consumed_from_where_its_delay_ended():
+    inner = Sent(gym.make("FlexJointReach-v0"))
+    env = sw.ChunkHandover(inner, 5, 10, inference_delay=3, steps_per_entry=5, blend="replace")
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    first, second = (env.action_space.sample() for _ in range(2))
+    env.step(first)
+    env.step(second)
+    spline = [
+        np.clip(Upsampling(5, 5).commands(c.astype(np.float64)), [-3.0, -1.0], [3.0, 1.0])
+        for c in (first, second)
+    ]
+    sent = np.array(inner.sent, dtype=np.float64)
+    # 21 commands of a chunk: the first's from its fourth on, its left-over for three steps, then the second's.
+    assert sent[3:13] == pytest.approx(spline[0][3:13], abs=1e-6)
+    assert sent[13:20] == pytest.approx(spline[1][3:10], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "words"),
+    [
+        ({"steps_per_entry": 0}, "steps_per_entry"),
+        ({"steps_per_entry": 1.5}, "steps_per_entry"),
+        ({"chunk_size": 1, "execution_horizon": 1, "steps_per_entry": 2}, "one entry leads"),
+        ({"execution_horizon": 20, "steps_per_entry": 4}, "H = 17 control steps"),
+    ],
+)
+def test_bad_sizes(sizes, words):
+    with pytest.raises(ConfigurationError, match=words):
+        sw.ChunkHandover(
+            gym.make("Reacher-v5"), **{"chunk_size": 5, "execution_horizon": 3, "rate_limit": 5.0, **sizes}
+        )
+
+
+FLEX_HOLD = 0.1
+RINGS = RigidModelCheck(("spring",), (12.0,), (0.01,), 0.1, 8.3, FLEX_HOLD)
+SHARE = 0.01
+
+
+def smooth(s):
+    s = np.clip(s, 0.0, 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+def sent(chunks, horizon, **more):
+    line = Line(chunks[0].shape[1], dtype=np.float64)
+    env = sw.ChunkHandover(line, len(chunks[0]), horizon, fallback="hold", **more)
+    env.reset(seed=0)
+    infos = [env.step(chunk)[4] for chunk in chunks]
+    return np.array(line.given), infos
+
+
+def shortest(share, resonance):
+    """By trying: the first of fine durations from which on the share is kept."""
+    spans = np.linspace(0.01, 5.0, 500_000)
+    return spans[np.argmax(smoothstep_share(resonance * spans) <= share)]
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 5))
+def test_held_chunks_are_a_sum_of_whole_smoothsteps_however_often_a_seam_comes(seed, horizon):
+    rng = np.random.default_rng(seed)
+    levels = np.concatenate([[0.0], rng.uniform(-0.08, 0.08, 6)])
+    chunks = [np.full((16, 1), level) for level in levels]
+    found, infos = sent(chunks, horizon, flexible=RINGS)
+    steps = round(infos[1]["handover/blend_time"] / FLEX_HOLD)
+    assert steps > horizon and steps == np.ceil(shortest(SHARE, 12.0) / FLEX_HOLD)
+    t = np.arange(len(found))
+    closed = sum(
+        (after - before) * smooth((t - horizon * (k + 1) + 1) / steps)
+        for k, (before, after) in enumerate(itertools.pairwise(levels))
+    )
+    np.testing.assert_allclose(found[:, 0], closed, atol=1e-9)
+    cut, _ = sent(chunks, horizon, blend_time=steps * FLEX_HOLD)
+    if horizon < 4:
+        assert np.abs(cut[:, 0] - closed).max() > 1e-4  # without it each starts again from the middle
+
+
+def test_it_is_the_stricter_of_what_springs_ask_and_what_the_user_gave():
+    chunks = [np.full((20, 1), level) for level in (0.0, 0.9)]
+    found, infos = sent(chunks, 8, flexible=RINGS)
+    rate = 1.875 * 2.0 / shortest(SHARE, 12.0)  # of a blend over the box from -1 to 1
+    assert np.abs(np.diff(found[:, 0])).max() <= rate * FLEX_HOLD + 1e-12
+    assert infos[1]["handover/blend_time"] == pytest.approx(
+        FLEX_HOLD * np.ceil(shortest(SHARE, 12.0) / FLEX_HOLD)
+    )
+    slower, infos = sent(chunks, 8, flexible=RINGS, rate_limit=1.0, blend_time=1.5)
+    assert np.abs(np.diff(slower[:, 0])).max() <= 1.0 * FLEX_HOLD + 1e-12
+    assert infos[1]["handover/blend_time"] >= 1.7 - 1e-9  # 1.875 * 0.9 / 1.0, rounded up
+    _, infos = sent([0.1 * chunk for chunk in chunks], 8, flexible=RINGS, blend_time=1.5)
+    assert infos[1]["handover/blend_time"] == pytest.approx(1.5)
+
+
+def test_a_seam_on_the_flexible_arm_leaves_no_more_than_its_share():
+    """One change of torque at the elbow from rest: what rings on after it, against what rings on after a step."""
+
+    def left(**how):
+        env = sw.ChunkHandover(gym.make("FlexJointReach-v0"), 40, 20, fallback="zero", **how)
+        env.reset(seed=0)
+        # The arm hardly turns, so that its resonances stay.
+        for level in (0.0, 0.05):
+            env.step(np.full((40, 2), [0.0, level], np.float32))
+        return env.step(np.full((40, 2), [0.0, 0.05], np.float32))[4]["vibration_energy"]
+
+    step = left(blend="replace")
+    for blend in ("smoothstep", "quintic"):
+        assert left(blend=blend, flexible="auto") <= SHARE * step
+    assert left(blend_time=0.03) > 0.1 * step
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"flexible": RINGS, "blend": "replace"}, "limits and flexible are for smoothstep"),
+        ({"flexible": 3.0}, 'flexible is a RigidModelCheck, the dict of one, or "auto"'),
+    ],
+)
+def test_bad_input_is_refused(arguments, says):
+    with pytest.raises(ConfigurationError, match=says):
+        sw.ChunkHandover(Line(1), 16, 8, fallback="hold", **arguments)

@@ -1,4 +1,4 @@
-"""Where leases come from: constraints with an approach speed, constraints with a value, functions of the env."""
+"""What a stop takes by clearances and constraints, what commands may do, and which chunks are within reach."""
 
 import copy
 import math
@@ -6,15 +6,22 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+import ruckig
 from asking import Asked
 from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection
+from hypothesis import given
+from hypothesis import strategies as st
 from worlds import BoundSpeedRow, SpeedRow
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint
+from safe_wrappers.wrappers.admission import Admission
+from safe_wrappers.wrappers.stopping_budget import BoundBudget
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+
 RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
 FULL = np.array([1.0, 0.0])
 
@@ -309,3 +316,149 @@ def test_what_only_a_state_can_show_is_refused_at_the_reset():
     cart.unwrapped.reset_model = lambda: cart.unwrapped.set_state(np.array([2.0, 0.0]), np.zeros(2))
     with pytest.raises(ConfigurationError, match="too far out"):
         lease.reset(seed=0)
+
+
+HOLD, BRAKING = 0.1, 4.0
+
+
+def measured(room, own, reserves):
+    """The budget of a cart at rest, so far from a wall."""
+    cart, plant = BrakedCart(dt=HOLD, wall=room), cart_plant(HOLD)
+    wall = sw.constraints.Plane([room], [-1.0])
+    clearance = sw.constraints.Clearance([wall], braking=1.0, position=[0], velocity=[1], **own)
+    cart.reset()
+    # So fast a cart could be that no command is let through unseen.
+    bound = BoundBudget(sw.StoppingBudget(clearance, BRAKING, acceleration=1e3, **reserves), cart)
+    plant.bind(cart)
+    bound.bind(bound.plant_of(plant))
+    bound.reset()
+    bound.measure()
+    return bound
+
+
+def throttle(value):
+    return np.array([value, 0.0])
+
+
+@pytest.mark.parametrize("room", [0.0, 0.002, 0.008])
+@pytest.mark.parametrize(
+    ("own", "extra"),
+    [
+        ({}, {}),
+        ({"margin": 0.2}, {}),
+        ({"state_error": 0.2}, {}),
+        ({}, {"margin": 0.2}),
+        ({}, {"localisation": 0.2}),
+        ({"margin": 0.05, "state_error": 0.03}, {"margin": 0.08, "localisation": 0.04}),
+    ],
+    ids=str,
+)
+def test_what_a_command_may_do_counts_the_clearances_reserves_and_the_budgets(own, extra, room):
+    """From rest, one hold of an acceleration takes a h^2 / 2, and one hold of braking back to rest as much."""
+    left = room + sum(own.values()) + sum(extra.values())
+    budget = measured(left, own, extra)
+    most = room / HOLD**2
+    for more, admitted in ((-1.0, True), (-1e-6, True), (1e-6, False), (0.5, False)):
+        assert budget.can_stop_after(throttle(most + more), HOLD) == admitted
+
+
+def test_while_the_brake_only_begins_to_act_no_command_is_known_to_lead_away():
+    for act_s, admitted in ((0.0, True), (0.01, False)):
+        budget = measured(0.0, {}, {"act_s": act_s})
+        assert budget.longest_time() < HOLD
+        assert budget.can_stop_after(throttle(-1.0), HOLD) == admitted
+
+
+LIMITS = {"max_acceleration": 2.0, "max_speed": 1.0, "max_jerk": 8.0}
+
+
+class Nowhere(gym.Env):
+    """Says nothing of where it is."""
+
+
+def admission(state, arrival="moving", **changed):
+    motion_limits = {**LIMITS, "arrival": arrival, **changed}
+    return Admission(Nowhere(), motion_limits, lambda env: state, len(state[0]))
+
+
+def quickest(start, end):
+    """Ruckig's time to a moving end, one axis."""
+    request = ruckig.InputParameter(1)
+    request.current_position, request.current_velocity, request.current_acceleration = ([x] for x in start)
+    request.target_position, request.target_velocity, request.target_acceleration = ([x] for x in end)
+    request.max_velocity, request.max_acceleration, request.max_jerk = [1.0], [2.0], [8.0]
+    trajectory = ruckig.Trajectory(1)
+    ruckig.Ruckig(1).calculate(request, trajectory)
+    return trajectory.duration
+
+
+numbers = st.integers(-800, 800).map(lambda thousandths: thousandths / 1000.0)
+
+
+@given(numbers, numbers, st.floats(-0.4, 0.4), st.floats(-0.9, 0.9), st.floats(0.0, 0.5))
+def test_what_a_motion_reaches_is_admitted_and_rest_needs_the_constrained_time(q, v, a, goal, late):
+    v, a = 0.9 * v, a if abs(v) < 0.5 else 0.0  # a start that can keep the speed limit
+    needed = quickest((q, v, a), (goal, 0.0, 0.0))
+    state = ([q], [v], [a])
+    end = np.array([goal])
+    assert admission(state, "rest").admits(end, needed + 1e-9 + late)
+    assert admission(state).admits(end, needed + 1e-9 + late)  # what can stop there can pass there
+    if needed > 1e-3:
+        assert not admission(state, "rest").admits(end, needed * (1.0 - 1e-6) - 1e-9)
+
+
+def test_moving_admits_ends_at_which_no_machine_could_stop_in_time():
+    state = ([0.0, 0.0], [0.9, 0.0], [0.0, 0.0])
+    end = np.array([0.09, 0.0])
+    assert admission(state).admits(end, 0.1)
+    assert not admission(state, "rest").admits(end, 0.1)
+
+
+def test_every_axis_must_get_there():
+    state = ([0.0, 0.0], [0.0, 0.0])
+    assert admission(state, max_jerk=np.inf).admits(np.array([0.1, 0.2]), 0.5)
+    assert not admission(state, max_jerk=np.inf).admits(np.array([0.1, 0.3]), 0.5)  # 2.0 * 0.5^2 / 2 = 0.25
+    assert not admission(state, "rest", max_jerk=np.inf).admits(np.array([0.1, 0.2]), 0.5)  # 2.0 * 0.5^2 / 4
+
+
+def test_without_a_measured_acceleration_the_most_of_it_is_counted_on():
+    still, known = ([0.0], [0.0]), ([0.0], [0.0], [0.0])
+    end = np.array([0.2])
+    assert admission(still).admits(end, 0.5)
+    assert not admission(known).admits(end, 0.5)
+
+
+def test_the_lengths_of_actuators_are_what_is_measured_by_default():
+    env = gym.make("Reacher-v5")
+    env.reset(seed=0)
+    here = env.unwrapped.data.actuator_length.copy()
+    asked = Admission(env, {"max_acceleration": 2.0, "max_speed": 1.0}, None, 2)
+    env.unwrapped.data.actuator_velocity[:] = 0.0
+    assert asked.admits(here + 0.2, 0.5) and not asked.admits(here + 0.3, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("motion_limits", "measured", "error", "words"),
+    [
+        ({**LIMITS, "arrival": "soon"}, lambda env: ([0.0], [0.0]), UnknownNameError, "'moving' or 'rest'"),
+        ({"max_speed": 1.0}, lambda env: ([0.0], [0.0]), ConfigurationError, "max_acceleration"),
+        (
+            {**LIMITS, "max_speed": [1.0, 2.0]},
+            lambda env: ([0.0], [0.0]),
+            ConfigurationError,
+            "1 action comp",
+        ),
+        ({**LIMITS, "max_speed": 0.0}, lambda env: ([0.0], [0.0]), ConfigurationError, "max_speed"),
+        (LIMITS, None, UnsupportedEnvError, "pass measured"),
+    ],
+)
+def test_bad_limits(motion_limits, measured, error, words):
+    with pytest.raises(error, match=words):
+        Admission(Nowhere(), motion_limits, measured, 1)
+
+
+def test_rest_with_limited_jerk_needs_accelerations():
+    with pytest.raises(ConfigurationError, match="accelerations"):
+        Admission(gym.make("Reacher-v5"), {**LIMITS, "arrival": "rest"}, None, 2)
+    with pytest.raises(ConfigurationError, match="accelerations"):
+        admission(([0.0], [0.0]), "rest").admits(np.zeros(1), 1.0)
