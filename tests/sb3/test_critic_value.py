@@ -61,15 +61,6 @@ def test_dict_observations_and_scaled_ones():
     np.testing.assert_allclose(critic_value(model)(OBSERVATION, ACTIONS), expected, atol=1e-5)
 
 
-def test_tqc_is_judged_by_the_mean_of_its_quantiles():
-    tqc = pytest.importorskip("sb3_contrib").TQC
-    model = tqc("MlpPolicy", Box(), device="cpu", seed=0)
-    with torch.no_grad():
-        quantiles = model.critic(torch.as_tensor(OBSERVATION).repeat(3, 1), SCALED)
-    expected = quantiles.mean(2).min(1).values.numpy()
-    np.testing.assert_allclose(critic_value(model)(OBSERVATION, ACTIONS), expected, atol=1e-6)
-
-
 class Three(Box):
     """Three discrete actions."""
 

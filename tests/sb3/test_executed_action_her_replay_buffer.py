@@ -2,7 +2,6 @@
 
 import functools
 
-import goal_line
 import numpy as np
 import pytest
 import torch
@@ -12,7 +11,6 @@ from scipy import stats
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
 
@@ -160,80 +158,9 @@ def test_saved_loaded_and_gone_on_with(mode, tmp_path):
     assert np.isin(last, drawn.number).all()
 
 
-@all_modes
-def test_what_is_drawn_is_normalised_after_the_penalty(mode):
-    model = learn(mode, normalize=True)
-    envs = model.get_vec_normalize_env()
-    raw = draw(model.replay_buffer, 200)
-    np.random.seed(1)
-    drawn = model.replay_buffer.sample(200, env=envs)
-    scale = np.sqrt(envs.ret_rms.var + envs.epsilon)
-    np.testing.assert_allclose(drawn.rewards.ravel(), np.clip(raw.reward / scale, -10, 10), rtol=1e-4)
-    rms = envs.obs_rms["desired_goal"]
-    centred = np.clip((raw.goal - rms.mean) / np.sqrt(rms.var + envs.epsilon), -10, 10)
-    np.testing.assert_allclose(drawn.observations["desired_goal"].ravel(), centred, rtol=1e-4, atol=1e-5)
-
-
 # One step, by hand ---------------------------------------------------------------------------------------------
-
-
-class Pays:
-    """Stands for the vectorised env: HER asks it for nothing but rewards."""
-
-    def env_method(self, name, achieved, goals, infos, indices):
-        assert (name, indices, len(infos)) == ("compute_reward", [0], len(goals))
-        return [goal_line.GoalLine.compute_reward(None, achieved, goals, infos)]
-
-
-def by_hand(mode):
-    space = goal_line.GoalLine()
-    return ExecutedActionHerReplayBuffer(
-        8, space.observation_space, space.action_space, env=Pays(), device="cpu", mode=mode
-    )
 
 
 def info(proposed, executed, **more):
     wrote = {keys.PROPOSED_ACTION: [proposed], keys.EXECUTED_ACTION: [executed]}
     return wrote | {keys.CBF_INTERVENED: proposed != executed} | more
-
-
-def add(buffer, action, reward, done, wrote):
-    seen = {
-        "observation": np.zeros((1, 3)),
-        "achieved_goal": np.full((1, 1), 2.0),
-        "desired_goal": np.zeros((1, 1)),
-    }
-    buffer.add(seen, seen, np.array([[action]], np.float32), np.array([reward]), np.array([done]), [wrote])
-
-
-@pytest.mark.parametrize("mode", ["both", "adaption_penalty"])
-def test_an_action_that_is_not_finite_is_neither_stored_nor_charged(mode):
-    buffer = by_hand(mode)
-    charged = {keys.ADAPTION_PENALTY: 7.0, keys.ADAPTION_TASK_REWARD: -2.0}
-    add(buffer, np.nan, -9.0, True, info(0.5, 0.0, **charged))
-    drawn = draw(buffer, 50)
-    np.testing.assert_allclose(drawn.action, -0.2, atol=1e-6)  # 0 of [-2, 3]
-    np.testing.assert_allclose(drawn.reward[:10], -2.0)
-    np.testing.assert_allclose(drawn.reward[10:], 0.0)  # the new goal is where it was
-
-
-def test_no_whole_episode_is_sb3s_error_and_an_unknown_mode_ours():
-    buffer = by_hand("both")
-    add(
-        buffer,
-        0.2,
-        0.0,
-        False,
-        info(1.0, 1.0, **{keys.ADAPTION_PENALTY: 0.0, keys.ADAPTION_TASK_REWARD: 0.0}),
-    )
-    with pytest.raises(RuntimeError, match="learning_starts"):
-        buffer.sample(4)
-    buffer.truncate_last_trajectory()
-    assert draw(buffer, 4).reward.shape == (4,)
-    buffer.env = None
-    with pytest.raises(sw.SafeWrappersError, match=r"call set_env\(vec_env\)"):
-        buffer.sample(4)
-    with pytest.raises(
-        sw.SafeWrappersError, match="or 'adaption_penalty', got 'naive'; the naive learner uses"
-    ):
-        by_hand("naive")

@@ -320,21 +320,6 @@ def test_what_an_escape_executed_is_stored_in_place_of_the_policys_action():
 
 
 @pytest.mark.parametrize(
-    ("mode", "wrote", "message"),
-    [
-        ("safe_action", {}, r"no info\['executed_action'\].*needs a CBFActionFilter"),
-        ("both", info([0.5, 5.0], [0.5, 5.0]), r"no info\['adaption/penalty'\].*AdaptionPenalty\(env"),
-        ("safe_action", info([0.5, 5.0], [0.5, 5.0], 0.0), "has an AdaptionPenalty.*use mode 'both'"),
-        ("safe_action", info([0.4, 5.0], [0.4, 5.0]), "take that wrapper away"),
-        ("safe_action", info([0.5], [0.5]), r"has shape \(1,\), the action space \(2,\)"),
-    ],
-)
-def test_infos_that_do_not_fit_are_refused(mode, wrote, message):
-    with pytest.raises(sw.SafeWrappersError, match=message):
-        add(buffer(mode), [[0.0, 0.0]], [1.0], [wrote])
-
-
-@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"mode": "naive"}, "expected 'safe_action' or 'both', got 'naive'; the naive learner"),

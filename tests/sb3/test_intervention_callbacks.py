@@ -88,69 +88,6 @@ def lost_now_and_then():
     return Monitor(DroppedRefreshes(stack, share=1.0))
 
 
-class InfosKept(gym.Wrapper):
-    """Keeps the infos of a run, to compare with what was logged."""
-
-    kept: list
-
-    def step(self, action):
-        *result, info = self.env.step(action)
-        self.kept.append(info)
-        return *result, info
-
-
-def test_slips_spin_outs_and_contact_forces_reach_tensorboard(tmp_path):
-    rover = sw.protect(gym.make("SafeRover-v0", max_episode_steps=16))
-    env = InfosKept(sw.RecordInterventions(sw.ContactMonitor(rover)))
-    env.kept = []
-    model = PPO("MlpPolicy", Monitor(env), n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
-    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
-    with pytest.warns(UserWarning, match="made once more"):  # the rover's tyres push in every substep
-        model.learn(32, callback=InterventionCallback())
-    logged, infos = scalars(tmp_path), env.kept
-
-    def mean(of):
-        return [pytest.approx(np.mean([of(info) for info in infos]), rel=1e-5)]
-
-    assert logged["interventions/step_slip"] == mean(lambda i: np.abs(i["slip/ratio"]).max())
-    assert logged["interventions/step_slip_limited"] == mean(lambda i: i["slip/limited"].mean())
-    assert logged["interventions/step_spin_out"] == mean(lambda i: i["spin_out"])
-    assert logged["interventions/step_contact_force"] == mean(lambda i: i["contact/peak_force"])
-    assert logged["interventions/step_slip"][0] > 0.0 and logged["interventions/step_contact_force"][0] > 20.0
-    assert logged["interventions/spin_outs"] == [0.0]
-
-
-def crossing(**more):
-    """A robot among cars of which little is known, for 16 steps."""
-    cars = [sw.occlusion.Track("car*", acceleration_noise=[0.5, 0.0], start_velocity_std=1.0)]
-    task = gym.make("OccludedCrossing-v0", max_episode_steps=16)
-    return sw.RecordInterventions(sw.OcclusionPenalty(task, cars, "eye", tolerance=0.5, **more))
-
-
-def test_what_is_seen_and_what_it_costs_reaches_tensorboard(tmp_path):
-    env = InfosKept(crossing(weight=0.1))
-    env.kept = []
-    model = PPO("MlpPolicy", Monitor(env), n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
-    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
-    model.learn(32, callback=InterventionCallback())
-    logged, infos = scalars(tmp_path), env.kept
-
-    def mean(of):
-        return [pytest.approx(np.mean([of(info) for info in infos]), rel=1e-5)]
-
-    assert logged["interventions/step_seen"] == mean(lambda i: i["occlusion/visible"].mean())
-    assert logged["interventions/step_expired"] == mean(lambda i: i["occlusion/expired"].mean())
-    assert logged["interventions/step_sigma"] == mean(lambda i: i["occlusion/sigma"].max())
-    assert logged["interventions/step_occlusion_penalty"] == mean(lambda i: i["occlusion/penalty"])
-    for name in ("seen", "expired"):
-        assert 0.0 < logged[f"interventions/step_{name}"][0] < 1.0
-    ended = [info[keys.EPISODE_SUMMARY] for info in infos if keys.EPISODE_SUMMARY in info]
-    assert len(ended) == 2
-    for name in ("collisions", "seen", "expiries"):
-        assert logged[f"interventions/{name}"] == pytest.approx([np.mean([e[name] for e in ended])])
-    assert logged["interventions/expiries"][0] > 0.0
-
-
 def test_handover_lease_and_faults_reach_tensorboard(tmp_path):
     model = PPO("MlpPolicy", lost_now_and_then(), n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
     model.set_logger(configure(str(tmp_path), ["tensorboard"]))

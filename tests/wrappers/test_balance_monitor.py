@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.wrappers.monitors import PRESSING
 
 FLOATS = (keys.BALANCE_FRICTION_USED, keys.BALANCE_ZMP_MARGIN, keys.BALANCE_AIRBORNE)
@@ -316,22 +316,3 @@ def test_no_number_that_is_none_is_reported(bad):
 def test_bad_arguments_are_refused_in_words(arguments, error, message):
     with pytest.raises(error, match=message):
         sw.BalanceMonitor(gym.make("Ant-v5"), **arguments)
-
-
-def test_envs_without_a_balance_are_refused_in_words():
-    with pytest.raises(
-        UnsupportedEnvError, match=r"BalanceMonitor needs an env with MuJoCo's \.model and \.data"
-    ):
-        sw.BalanceMonitor(gym.make("Pendulum-v1"))
-    with pytest.raises(
-        UnsupportedEnvError, match="no body of this model can touch the fixed world with friction"
-    ):
-        sw.BalanceMonitor(gym.make("Reacher-v5"))
-    for bodies in (["ghost"], ["puck"]):  # that touch nothing, or without friction
-        with pytest.raises(UnsupportedEnvError, match=rf"no body of bodies=\['{bodies[0]}'\] can touch"):
-            sw.BalanceMonitor(Crates(), bodies=bodies)
-    fixed = Crates(more='<body name="stone" pos="0 4 0"><geom size=".1" friction="1 1 1"/></body>')
-    with pytest.raises(ConfigurationError, match=r"no body of bodies=\['stone'\] moves and has mass"):
-        sw.BalanceMonitor(fixed, bodies=["stone"])
-    with pytest.raises(ConfigurationError, match=r"ChunkHandover\(BalanceMonitor"):
-        sw.BalanceMonitor(sw.ChunkHandover(gym.make("Ant-v5"), 4, 2))

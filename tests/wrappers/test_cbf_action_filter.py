@@ -9,11 +9,11 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from worlds import Cart, Raw, SpeedRow, cart_plant, read, wall
+from worlds import Cart, Raw, SpeedRow, cart_plant, wall
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ActionError, ConfigurationError
 
 FLOATS = {*keys.CBF_FLOATS}
 BOOLS = {*keys.CBF_BOOLS}
@@ -81,19 +81,6 @@ def test_a_changed_action_has_the_spaces_dtype_and_lies_inside():
     np.testing.assert_allclose(info["executed_action"], [0.5], atol=1e-6)
     np.testing.assert_array_equal(info["executed_action"], sent)
     assert info["cbf/correction"] == pytest.approx(0.5, abs=1e-6)
-
-
-def test_info_says_what_was_proposed_even_if_the_policy_reuses_its_buffer():
-    filtered = cart([wall(100.0)], fallback="hold")
-    filtered.reset(seed=0)
-    buffer = np.array([0.25])
-    info = filtered.step(buffer)[4]
-    buffer[:] = -1.0
-    np.testing.assert_array_equal(info["proposed_action"], [0.25])
-    np.testing.assert_array_equal(info["executed_action"], [0.25])
-    with pytest.warns(UserWarning, match="not finite"):
-        info = filtered.step(np.array([np.nan]))[4]  # hold repeats what was executed, not the buffer
-    np.testing.assert_array_equal(info["executed_action"], [0.25])
 
 
 def test_the_rows_hold_for_what_was_executed():
@@ -167,29 +154,6 @@ def test_a_wrong_shape_is_refused_and_the_env_not_stepped(action):
 # Constructor refusals -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"fallback": "stop"}, UnknownNameError, "no fallback 'stop'; choose brake, hold, zero"),
-        ({"margin": -0.1}, ConfigurationError, "margin must be a finite number >= 0 .* got -0.1"),
-        ({"margin": np.nan}, ConfigurationError, "margin must be a finite number"),
-        ({"margin": "wide"}, ConfigurationError, "margin must be a number"),
-    ],
-)
-def test_unknown_names_and_bad_margins_are_refused(options, error, message):
-    with pytest.raises(error, match=message):
-        cart([wall(1.0)], **options)
-
-
-@pytest.mark.parametrize("hold", [0.05, 0.2])
-def test_another_dt_than_the_envs_is_refused(hold):
-    # Bug 7.
-    with pytest.raises(
-        ConfigurationError, match=rf"control_dt = {hold} s, but one step of this env lasts dt = 0.1 s"
-    ):
-        sw.CBFActionFilter(Cart(0.1), [wall(1.0)], plant=cart_plant(hold))
-
-
 # Unsafe starts ------------------------------------------------------------------------------------------------
 
 
@@ -208,14 +172,6 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
         speeds = [i["cbf/margin"] for i in infos]
         assert speeds[1] > speeds[0]
         assert abs(filtered.unwrapped.state[1]) <= 1.0 + 1e-2
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_parked_at_the_wall_is_neither_unsafe_nor_infeasible(dtype):
-    filtered = cart([wall(1.0)], env=Cart(0.1, dtype=dtype))
-    with warnings.catch_warnings(action="error"):
-        infos = full_throttle(filtered, 200)
-    assert not any(i["cbf/infeasible"] or i["cbf/unsafe"] for i in infos)
 
 
 def test_point_goal_started_inside_a_hazard_leaves_it():
@@ -342,37 +298,6 @@ def test_margin_is_added_to_the_constraints_own(own):
     full_throttle(narrow, 100), full_throttle(wide, 100)
     assert narrow.unwrapped.farthest == pytest.approx(1.0 - own, abs=1e-3)
     assert wide.unwrapped.farthest == pytest.approx(0.8 - own, abs=1e-3)
-
-
-class Plane2(gym.Env):
-    """Two controls and nothing else: what the filter sends is all that counts."""
-
-    dt = 0.1
-    action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float64)
-    observation_space = gym.spaces.Box(-1, 1, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.zeros(2)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), 0.0, False, False, {}
-
-
-def test_several_constraints_are_one_projection():
-    # Bug 5: projected one after another the second undoes the first.
-    plant = sw.AnalyticPlant(f=np.zeros_like, g=lambda x: np.eye(2), state=read, control_dt=0.1)
-    first, second = Raw([[1.0, 0.0]], [-0.1]), Raw([[-1.0, 1.0]], [-0.2])
-    filtered = sw.CBFActionFilter(Plane2(), [first, second], plant=plant)
-    filtered.reset(seed=0)
-    u = filtered.step(np.array([0.5, 0.9]))[4]["executed_action"]
-    together = sw.project([0.5, 0.9], [[1, 0], [-1, 1]], [-0.1, -0.2], [-1, -1], [1, 1]).control
-    one = sw.project([0.5, 0.9], [[1, 0]], [-0.1], [-1, -1], [1, 1]).control
-    one_after_the_other = sw.project(one, [[-1, 1]], [-0.2], [-1, -1], [1, 1]).control
-    assert one_after_the_other[0] > -0.1 + 0.05  # undone
-    np.testing.assert_allclose(u, together, atol=1e-9)
-    assert u[0] <= -0.1 + 1e-9 and -u[0] + u[1] <= -0.2 + 1e-9
 
 
 @pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")

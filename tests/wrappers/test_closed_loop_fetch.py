@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.errors import UnsafeStateWarning
 
 gym.register_envs(pytest.importorskip("gymnasium_robotics"))
 from benchmarks.fetch_drivers import drivers, obstacles  # noqa: E402 (the benchmark needs gymnasium_robotics)
@@ -139,29 +138,6 @@ def test_a_task_is_solved_as_well_as_without_the_filter(env_id, policy, steps):
 
 
 # Starts, other limits, other layers ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("env_id", ["FetchPush-v4", "FetchSlide-v4"])
-def test_fingers_that_start_in_the_table_come_out(env_id):
-    env = sw.protect(fetch(env_id))
-    for seed in range(3):
-        with pytest.warns(UnsafeStateWarning, match="outside the safe set"):
-            _, info = env.reset(seed=seed)
-        assert info["cbf/unsafe"] and info["cbf/margin"] < -0.005
-        steps = 0
-        while info["cbf/unsafe"]:
-            info = env.step(np.array([0.3, -0.2, -1.0, 0.0], np.float32))[-1]
-            steps += 1
-            assert steps < 10
-        assert info["cbf/margin"] > -1e-6
-
-
-@pytest.mark.parametrize("factor", [0.8, 1.2])
-def test_with_masses_that_are_wrong_by_a_fifth_it_stays_inside_its_margin(factor):
-    plant = sw.plants.DisplacementPlant()
-    plant.perturb(mass=factor)
-    env = sw.protect(fetch("FetchReach-v4", 70), plant=plant, margin=0.003)
-    assert drive(env, "corner-seeking", 70)["violations"] == 0
 
 
 def test_commands_in_flight_are_counted_on():

@@ -160,16 +160,6 @@ def alone(hazards, agent=(0.0, 0.0, 0.0), **options):
     return env
 
 
-def closest(env, action, steps):
-    near = math.inf
-    for _ in range(steps):
-        info = env.step(np.asarray(action, np.float32))[4]
-        assert info["cost_substep"] == 0.0
-        gaps = np.linalg.norm(env.unwrapped._path[:, None] - env.unwrapped.hazard_positions, axis=2)
-        near = min(near, gaps.min())
-    return near - 0.2
-
-
 def test_counting_on_the_drive_allows_more_speed():
     speeds = []
     for brake in (True, False):
@@ -180,15 +170,6 @@ def test_counting_on_the_drive_allows_more_speed():
             fastest = max(fastest, float(env.unwrapped.data.qvel[0]))
         speeds.append(fastest)
     assert speeds[0] > speeds[1] + 0.1
-
-
-def test_surrounded_it_stays_inside():
-    ring = [[0.5 * math.cos(a), 0.5 * math.sin(a)] for a in np.linspace(0, math.tau, 8, endpoint=False)]
-    env = alone(ring)
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        closest(env, rng.choice([-1.0, 1.0], 2), 15)
-    assert np.linalg.norm(env.unwrapped.agent_position) < 0.5
 
 
 # Refusals -----------------------------------------------------------------------------------------------------

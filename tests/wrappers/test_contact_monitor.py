@@ -12,7 +12,6 @@ from meddling import Meddling
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.control.contact.impact import complementarity_residuals
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 FLOATS = (
     keys.CONTACT_PEAK_FORCE,
@@ -169,36 +168,6 @@ def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
         for key in (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL):
             assert macro[key] == max(i[key] for i in infos)
         assert macro[keys.CONTACT_PARTIAL] is False
-
-
-@pytest.mark.parametrize(
-    ("env_id", "whole"),
-    [
-        ("SafePointGoal2-v0", True),
-        ("SafeCarGoal2-v0", True),
-        ("FlexJointReach-v0", True),
-        ("SafeAntVelocity-v0", True),
-        ("SafeRover-v0", False),  # its tyres push anew in every substep
-    ],
-)
-def test_which_of_our_tasks_are_seen_whole(env_id, whole):
-    env = sw.ContactMonitor(gym.make(env_id))
-    env.reset(seed=0)
-    with warnings.catch_warnings(action="ignore"):
-        partial = [env.step(a)[4][keys.CONTACT_PARTIAL] for a in actions(env, 20)]
-    assert all(partial) if not whole else not any(partial)
-
-
-def test_bad_input_is_refused_in_words():
-    with pytest.raises(UnsupportedEnvError, match=r"MuJoCo's \.model and \.data"):
-        sw.ContactMonitor(gym.make("Pendulum-v1"))
-    with pytest.raises(UnknownNameError, match="no body 'hoof'; it has: world, torso"):
-        sw.ContactMonitor(gym.make("HalfCheetah-v5"), bodies=["hoof"])
-    with pytest.raises(ConfigurationError, match="against is a list"):
-        sw.ContactMonitor(gym.make("HalfCheetah-v5"), against="world")
-    chunked = sw.ChunkHandover(gym.make("Reacher-v5"), 4, 2)
-    with pytest.raises(ConfigurationError, match=r"ChunkHandover\(ContactMonitor"):
-        sw.ContactMonitor(chunked)
 
 
 # The three conditions of an ideal contact ---------------------------------------------------------------------

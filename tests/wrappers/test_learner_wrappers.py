@@ -6,11 +6,13 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from simulated_worlds import Cart as SimulatedCart
 from worlds import Cart, SpeedRow, cart_plant
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
+
+sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
+from simulated_worlds import Cart as SimulatedCart
 
 
 def stack():
@@ -134,9 +136,6 @@ def test_a_non_finite_action_costs_the_constant_and_a_finite_amount():
 def test_what_it_refuses(build, message):
     with pytest.raises(sw.SafeWrappersError, match=message):
         build()
-
-
-sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
 
 
 class Two(gym.Wrapper):
@@ -324,21 +323,3 @@ def test_what_was_not_judged_is_not_a_number():
     shown = env._with_features(np.zeros(10), np.zeros(2))[10:]
     assert np.isnan(shown[0])
     assert shown[1:].tolist() == [0.0, 0.0]
-
-
-def test_refused():
-    env = gym.make("SafePointGoal1-v0")
-    limit = sw.protect(gym.make("SafePointGoal1-v0")).constraints
-    with pytest.raises(sw.SafeWrappersError, match="needs a filter inside or constraints"):
-        sw.FilterObservation(env)
-    with pytest.raises(sw.SafeWrappersError, match="leave constraints and plant out"):
-        sw.FilterObservation(sw.protect(env), limit)
-    with pytest.raises(sw.SafeWrappersError, match="shows what the filter decides by already"):
-        sw.FilterObservation(sw.FilterObservation(sw.protect(env)))
-    with pytest.raises(sw.SafeWrappersError, match="put it outside"):
-        sw.CBFActionFilter(sw.FilterObservation(env, limit), limit)
-    with pytest.raises(sw.SafeWrappersError, match="neighbours"):
-        sw.FilterObservation(sw.protect(env), neighbours=-1)
-    space = gym.spaces.Dict({"filter": gym.spaces.Box(0, 1, (1,))})
-    with pytest.raises(sw.SafeWrappersError, match="has a key 'filter' already"):
-        sw.FilterObservation(sw.protect(Pictured(env, space, lambda o: o)))

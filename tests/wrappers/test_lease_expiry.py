@@ -260,10 +260,6 @@ def test_expired_once_then_braking_until_something_fresh_comes_and_smoothly_back
     assert np.abs(np.diff(given_[8:], axis=0)).max() <= 1.875 / 3.0
 
 
-def gently(plant):
-    return np.zeros(2)
-
-
 def smooth_step(s):
     return 6 * s**5 - 15 * s**4 + 10 * s**3
 
@@ -281,33 +277,6 @@ def test_refused_brakes_at_once_though_the_old_lease_would_run_on():
     env.set_observation_time(0.1)  # the refused one again, when there is room: still not fresh
     assert env.step(FULL)[4]["lease/braking"]
     assert not env.step(FULL)[4]["lease/braking"]
-
-
-def test_a_lease_of_one_step_gives_authority_back_and_its_end_on_the_way_brakes_at_once():
-    cart = BrakedCart(wall=1e6, drive=0.0, v=1.0, braking=1e6)
-    env = leased(cart, max_lease_s=5.0, blend_time=0.5, fallback=gently)
-    env.reset()
-    env.set_observation_time(None)
-    env.step(FULL)
-    cart.wall = cart.x + 0.09
-    assert lease_info(env.step(FULL)[4]) == (False, True, True)
-    cart.wall = cart.x + 0.21
-    assert lease_info(env.step(FULL)[4]) == (False, False, False)
-    for wanted in ((False, False, False), (True, False, True)):
-        env.set_observation_time(None)
-        assert lease_info(env.step(FULL)[4]) == wanted
-    weights = [smooth_step(i / 6.0) for i in (1, 2)]
-    np.testing.assert_allclose([g[0] for g in cart.given], [0.0, 0.0, *weights, 0.0], atol=1e-7)
-
-
-def test_none_holds_the_command_in_force():
-    cart, env = far()
-    env.reset()
-    env.step(np.array([0.25, 0.0]))
-    for junk in (np.array([np.nan, 0.0]), FULL, np.array([-1.0, 1.0])):
-        env.set_observation_time(None)
-        env.step(junk)
-        assert cart.given[-1].tolist() == [0.25, 0.0]
 
 
 def test_the_age_of_a_command_counts():

@@ -321,34 +321,6 @@ def test_seeds_repeat_and_differ_and_the_env_s_own_generator_is_untouched():
     assert a == b
 
 
-def test_the_first_fix_has_the_declared_accuracy():
-    blind = sw.occlusion.Sensor(site="eye", range_m=0.01)
-    env = sw.OcclusionPenalty(
-        Turning(), [straight(start_position_std=[0.5, 0.1], mean_velocity=[2.0, 0.0])], blind, tolerance=1.0
-    )
-    env.reset(seed=0)
-    fixes = []
-    for _ in range(1500):
-        env.reset()
-        fixes.append(env.tracking.positions[0] - [1.0, 0.0])
-    np.testing.assert_allclose(np.std(fixes, axis=0), [0.5, 0.1], rtol=0.1)
-    np.testing.assert_allclose(np.mean(fixes, axis=0), 0.0, atol=0.06)
-    assert env.tracking.velocities.tolist() == [[2.0, 0.0]]
-
-
-def test_another_model_at_a_reset_is_looked_at_and_other_things_are_refused():
-    env = sw.OcclusionPenalty(Turning(), [straight("thing*")], EYE, tolerance=1.0)
-    assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == [True, True]
-    raw = env.unwrapped
-    raw.build(WALL.replace("2 0", "0.7 0"), "0.4 0 0")
-    assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == [False, True]
-    raw.build('<body name="thing3"><geom size="0.1"/></body>', "0.4 0 0")
-    with pytest.raises(
-        ConfigurationError, match=r"another model.*thing3, thing, thing2 and not thing, thing2"
-    ):
-        env.reset(seed=0)
-
-
 # What Gymnasium asks ----------------------------------------------------------------------------------------------
 
 
@@ -516,57 +488,3 @@ def test_what_is_seen_is_put_where_the_reckoned_pose_has_it():
         np.testing.assert_allclose(seen, apparent[:2], atol=1e-9)
     shown = observation[1:3] + ego.position[:2]
     np.testing.assert_allclose(shown, env.tracking.positions[0], atol=1e-9)
-
-
-def test_velocities_are_put_right_by_the_reckoned_motion():
-    ends = {}
-    for lever_arm in (True, False):
-        imu = sw.occlusion.Imu("eye", lever_arm=lever_arm)
-        sensor = sw.occlusion.Sensor(site="eye", position_std=None, velocity_std=0.01, imu=imu)
-        env = sw.OcclusionPenalty(
-            Turning(((0, 1, 0, -1, 0), (2.0, 0, 0, 0, 0))), [straight("thing*")], sensor, tolerance=0.5
-        )
-        env.reset(seed=0)
-        for _ in range(30):
-            env.step(STILL)
-        ends[lever_arm] = np.abs(env.tracking.velocities).max()
-    assert ends[True] < 0.02 and ends[False] > 0.2
-
-
-def test_what_moves_is_seen_to_move_in_the_reckoned_axes():
-    imu = sw.occlusion.Imu("eye", accelerometer_std=1.0, gyro_std=0.5)
-    sensor = sw.occlusion.Sensor(site="eye", position_std=None, velocity_std=0.01, imu=imu)
-    world = Turning(((0, 1, 0, -1, 0), (1.0, 0, 0.4, 0, 0)))
-    env = sw.OcclusionPenalty(world, [straight("thing")], sensor, tolerance=0.5)
-    env.reset(seed=0)
-    for _ in range(40):
-        env.step(PUSH)
-    ego, data = env.ego_motion, world.data
-    mujoco.mj_kinematics(world.model, data)
-    turned = ego.rotation @ data.body("robot").xmat.reshape(3, 3).T
-    arm = data.site("eye").xpos - data.body("robot").xpos
-    apparent = np.array([0.0, 0.4, 0.0]) - np.cross([0, 0, data.qvel[0]], arm)
-    own = ego.velocity + np.cross(ego.angular_velocity, turned @ arm)
-    seen = env.sensor.measured(env._sight, 2, np.zeros((1, 3)), np.array([[0.0, 0.4]]), ego)[0]
-    # in the plane, as the velocities are: what noise tilts the axes by is left out
-    np.testing.assert_allclose(seen, turned[:2, :2] @ apparent[:2] + own[:2], atol=1e-9)
-    assert np.abs(turned - np.eye(3)).max() > 0.01
-
-
-@pytest.mark.parametrize(
-    ("given", "kind", "says"),
-    [
-        ({"site": "nose"}, UnknownNameError, "no site 'nose'"),
-        ({"site": 3}, ConfigurationError, "site is the name of a site, got 3"),
-        ({"accelerometer_std": -1}, ConfigurationError, "accelerometer_std must be a finite number >= 0"),
-        ({"gyro_std": np.nan}, ConfigurationError, "gyro_std must be a finite number >= 0"),
-        ({"fix_every_s": 0}, ConfigurationError, "fix_every_s must be a finite number > 0"),
-        ({"lever_arm": 1}, ConfigurationError, "lever_arm is True or False, got 1"),
-        ({"axis": 1}, UnknownNameError, "imu has no 'axis'"),
-    ],
-)
-def test_what_it_cannot_be_is_refused(given, kind, says):
-    car = sw.occlusion.Track("car0", acceleration_noise=0.1)
-    with pytest.raises(kind, match=says):
-        sensor = sw.occlusion.Sensor(camera="eye", imu={"site": "eye"} | given)
-        sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), [car], sensor, tolerance=0.5)

@@ -212,13 +212,6 @@ def is_fast(env):
     return bool(abs(env.state[1]) > 1.0)
 
 
-class HasCalls:
-    """A function that cannot be imported by a name."""
-
-    def __call__(self, env):
-        return 0.5
-
-
 def pendulum(fn, steps=30):
     return sw.CostFunction(gym.make("Pendulum-v1", max_episode_steps=steps), fn)
 
@@ -253,11 +246,6 @@ def test_a_recorder_outside_counts_it_as_the_task_s_own():
     assert "cost_substep" not in summary
 
 
-def test_what_cannot_be_imported_is_still_rebuilt_by_gym_make():
-    assert drive(gym.make(pendulum(HasCalls()).spec), 1)[0][4] == {keys.COST: 0.5}
-    assert drive(gym.make(pendulum(lambda env: 2).spec), 1)[0][4] == {keys.COST: 2.0}
-
-
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), None, "1", [1.0], np.zeros(2), 1j])
 def test_what_is_no_finite_number_is_refused(bad):
     env = pendulum(lambda env: bad)
@@ -285,16 +273,3 @@ def test_a_task_s_own_cost_is_not_hidden():
     env = sw.CostFunction(gym.make("SafePointGoal1-v0"), lambda env: 0.0)
     with pytest.raises(sw.SafeWrappersError, match="reports a cost of its own"):
         drive(env, 1)
-
-
-def test_it_judges_control_steps_and_only_once():
-    with pytest.raises(sw.SafeWrappersError, match="has a CostFunction already"):
-        sw.CostFunction(pendulum(tip_speed), is_fast)
-    chunked = sw.ChunkHandover(gym.make("Reacher-v5"), 5, 3)
-    with pytest.raises(sw.SafeWrappersError, match=r"ChunkHandover\(CostFunction"):
-        sw.CostFunction(chunked, lambda env: 0.0)
-    with pytest.raises(sw.SafeWrappersError, match=r"RecordInterventions\(CostFunction"):
-        sw.CostFunction(sw.RecordInterventions(gym.make("Reacher-v5")), lambda env: 0.0)
-    inside = sw.ChunkHandover(sw.CostFunction(gym.make("Reacher-v5"), lambda env: 1.0), 5, 3)
-    inside.reset(seed=0)
-    assert inside.step(inside.action_space.low)[4][keys.COST] == 3.0  # of three control steps

@@ -63,17 +63,6 @@ def test_refused_names_exactly_those_that_refuse_alone(env_id):
     assert (seen > 0).sum() >= 3 and several > 0, seen
 
 
-def test_names_are_the_kinds_numbered_where_they_repeat():
-    env = made("Reacher-v5", LIMITS["Reacher-v5"])
-    assert env.constraint_names == [
-        "JointSpeedLimit",
-        "JointPositionLimit 1",
-        "Workspace",
-        "SpeedLimit",
-        "JointPositionLimit 2",
-    ]
-
-
 # Where all fail -----------------------------------------------------------------------------------------------
 
 

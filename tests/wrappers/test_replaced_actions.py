@@ -137,24 +137,6 @@ def test_without_an_admitted_anchor_the_filter_gets_the_action_and_info_tells_it
     assert two[keys.CBF_INTERVENED] and np.isnan(two[keys.MAP_SCALE])
 
 
-def test_actions_beyond_what_the_drive_can_do_are_mapped_as_its_most():
-    env = sw.SafeActionMap(sw.protect(gym.make(POINT)))
-    rng = np.random.default_rng(0)
-    env.reset(seed=0)
-    scaled = 0
-    for _ in range(400):
-        low, high = env.get_wrapper_attr("plant").acting_range
-        assert high[0] < 0.1  # of a box of 1: the rest does nothing
-        action = seeking(env, rng)
-        sent, scale = env.mapped(action)
-        if scale < 1.0:
-            scaled += 1
-            np.testing.assert_array_equal(sent, env.mapped(np.clip(action, low, high))[0])
-            assert (sent >= low - 1e-6).all() and (sent <= high + 1e-6).all()
-        env.step(action)
-    assert scaled > 20
-
-
 def test_what_is_not_finite_goes_to_the_filter():
     env = sw.SafeActionMap(limited())
     env.reset(seed=0)

@@ -152,14 +152,6 @@ def test_observations_rewards_infos_and_random_numbers_are_those_without_it(task
         assert any(step[-1][keys.CBF_INTERVENED] for step in bare[1:])
 
 
-def test_a_state_that_is_not_a_number_is_not_drawn():
-    env = sw.SafetyOverlay(make())
-    env.reset(seed=0)
-    assert env.marks()
-    env.unwrapped.data.qvel[0] = np.nan
-    assert env.marks() == []
-
-
 @pytest.mark.parametrize("filtered", [True, False])
 def test_a_lease_s_clearance_is_drawn_once(filtered):
     rail = sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"])

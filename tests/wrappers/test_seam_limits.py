@@ -1,6 +1,5 @@
 """Machines' limits: no executed blend breaks them between its ends; slow chunks; joints that ring."""
 
-import copy
 import itertools
 
 import gymnasium as gym
@@ -107,15 +106,6 @@ def test_a_change_of_source_is_faded_within_the_limits():
     env.switch("human")
     info = env.step(np.array([0.5]))[4]
     assert info["handover/blend_time"] == pytest.approx(0.7)
-
-
-def test_generous_limits_change_no_command_of_a_blend_time():
-    rng = np.random.default_rng(0)
-    chunks = [rng.uniform(-0.2, 0.2, (12, 2)) for _ in range(6)]
-    for blend in ("smoothstep", "quintic"):
-        _, without = driven(chunks, blend, blend_time=0.4)
-        _, sent = driven(chunks, blend, blend_time=0.4, limits={"jerk": 1e12})
-        assert np.array_equal(without, sent)
 
 
 # Torques of position commands -----------------------------------------------------------------------------------
@@ -230,26 +220,6 @@ def test_bad_limits_are_refused(limits, says):
         sw.ChunkHandover(Line(1), 8, 4, fallback="hold", limits=limits)
 
 
-def test_a_baseline_takes_no_limits():
-    with pytest.raises(ConfigurationError, match="a baseline that bounds nothing"):
-        sw.ChunkHandover(Line(1), 8, 4, blend="replace", fallback="hold", limits={"velocity": 1.0})
-
-
-def test_they_are_recorded_as_plain_data():
-    limits = sw.SeamLimits(velocity=[1.0], jerk=5.0)
-    env = sw.ChunkHandover(gym.make("InvertedPendulum-v5"), 8, 4, limits=limits)
-    recorded = env.spec.additional_wrappers[-1].kwargs["limits"]
-    assert recorded == {
-        "velocity": (1.0,),
-        "acceleration": None,
-        "jerk": 5.0,
-        "torque": None,
-        "torque_slew": None,
-    }
-    again = gym.make(copy.deepcopy(env.spec))
-    assert again.get_wrapper_attr("action_space") == env.action_space
-
-
 @pytest.mark.parametrize(("entries", "steps"), [(2, 3), (5, 4), (9, 33)])
 def test_commands_between_entries_are_the_spline_through_them(entries, steps):
     chunk = np.random.default_rng(0).normal(size=(entries, 3))
@@ -284,24 +254,6 @@ def test_a_slow_chunk_drives_a_fast_loop_late_and_within_the_limit():
     assert info["handover/latency"] == 3
     sent = np.array(inner.sent, dtype=np.float64)
     assert (np.abs(np.diff(sent, axis=0)) <= np.array([30.0, 10.0]) * 0.01 + 1e-12).all()
-
-
-def test_a_late_slow_chunk_is_consumed_from_where_its_delay_ended():
-    inner = Sent(gym.make("FlexJointReach-v0"))
-    env = sw.ChunkHandover(inner, 5, 10, inference_delay=3, steps_per_entry=5, blend="replace")
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    first, second = (env.action_space.sample() for _ in range(2))
-    env.step(first)
-    env.step(second)
-    spline = [
-        np.clip(Upsampling(5, 5).commands(c.astype(np.float64)), [-3.0, -1.0], [3.0, 1.0])
-        for c in (first, second)
-    ]
-    sent = np.array(inner.sent, dtype=np.float64)
-    # 21 commands of a chunk: the first's from its fourth on, its left-over for three steps, then the second's.
-    assert sent[3:13] == pytest.approx(spline[0][3:13], abs=1e-6)
-    assert sent[13:20] == pytest.approx(spline[1][3:10], abs=1e-6)
 
 
 @pytest.mark.parametrize(

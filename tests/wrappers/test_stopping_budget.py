@@ -11,7 +11,6 @@ from asking import Asked
 from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds import BoundSpeedRow, SpeedRow
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
@@ -113,35 +112,6 @@ def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
 # Other constraints --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Reacher-v5"])
-def test_a_joint_position_limit_with_a_closing_speed(env_id):
-    joint = {"InvertedPendulum-v5": "slider", "Reacher-v5": "joint1"}[env_id]
-    limit = sw.constraints.JointPositionLimit(-0.8, 0.8, [joint], margin=0.05)
-    env = sw.LeaseExpiry(
-        gym.make(env_id),
-        sw.StoppingBudget(limit, closing_speed=4.0, margin=0.02, localisation=0.01),
-        detect_s=0.015,
-        max_lease_s=2.0,
-    )
-    again, plant = copy.deepcopy(limit), sw.MujocoPlant()
-    plant.bind(env.env)
-    again = Asked(again, plant)
-    env.reset(seed=3)
-    rng, seen = np.random.default_rng(0), set()
-    for _ in range(60):
-        plant.observe()
-        value = again.value().min()
-        assert value <= 0.8 - abs(env.unwrapped.data.joint(joint).qpos[0]) + 1e-12
-        wanted = (value - 0.05 - 0.02 - 0.01) / 4.0 - 0.015
-        got = granted(env, env.action_space.high * rng.choice([-1.0, 1.0]))
-        if got is None:
-            assert wanted < env.control_dt
-        else:
-            assert got == pytest.approx(wanted, abs=1e-6)
-        seen.add(got is None)
-    assert seen == {True, False}
-
-
 HAZARDS = [sw.constraints.Discs("hazard_positions", radius=0.2)]
 
 
@@ -186,45 +156,6 @@ def test_a_heading_drive_never_violates_when_commands_stop():
             braked += info["lease/braking"]
             entered += info["cost_hazards"] > 0.0
     assert entered == 0 and braked > 100
-
-
-class Far(SpeedRow):
-    """Whose value says that nothing is near, or that nothing can be read."""
-
-    def bind(self, plant):
-        return BoundFar(self, plant)
-
-
-class BoundFar(BoundSpeedRow):
-    def value(self):
-        return np.array(self.spec.values)
-
-
-def test_a_constraint_forgets_the_episode():
-    begun = []
-
-    class Counted(Far):
-        def bind(self, plant):
-            return BoundCounted(self, plant)
-
-    class BoundCounted(BoundFar):
-        def start(self):
-            begun.append(len(begun))
-            return begun[-1]
-
-        def observe(self, memory):
-            assert memory == begun[-1]
-
-    counted = Counted(1.0)
-    counted.values = [1.0]
-    env = sw.LeaseExpiry(
-        BrakedCart(), sw.StoppingBudget(counted, closing_speed=1.0), plant=cart_plant(0.1), fallback="zero"
-    )
-    for _ in range(2):
-        before = len(begun)
-        env.reset()
-        assert len(begun) > before
-        env.step(np.zeros(2, np.float32))
 
 
 # Functions ----------------------------------------------------------------------------------------------------
@@ -414,27 +345,11 @@ def test_moving_admits_ends_at_which_no_machine_could_stop_in_time():
     assert not admission(state, "rest").admits(end, 0.1)
 
 
-def test_every_axis_must_get_there():
-    state = ([0.0, 0.0], [0.0, 0.0])
-    assert admission(state, max_jerk=np.inf).admits(np.array([0.1, 0.2]), 0.5)
-    assert not admission(state, max_jerk=np.inf).admits(np.array([0.1, 0.3]), 0.5)  # 2.0 * 0.5^2 / 2 = 0.25
-    assert not admission(state, "rest", max_jerk=np.inf).admits(np.array([0.1, 0.2]), 0.5)  # 2.0 * 0.5^2 / 4
-
-
 def test_without_a_measured_acceleration_the_most_of_it_is_counted_on():
     still, known = ([0.0], [0.0]), ([0.0], [0.0], [0.0])
     end = np.array([0.2])
     assert admission(still).admits(end, 0.5)
     assert not admission(known).admits(end, 0.5)
-
-
-def test_the_lengths_of_actuators_are_what_is_measured_by_default():
-    env = gym.make("Reacher-v5")
-    env.reset(seed=0)
-    here = env.unwrapped.data.actuator_length.copy()
-    asked = Admission(env, {"max_acceleration": 2.0, "max_speed": 1.0}, None, 2)
-    env.unwrapped.data.actuator_velocity[:] = 0.0
-    assert asked.admits(here + 0.2, 0.5) and not asked.admits(here + 0.3, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -455,10 +370,3 @@ def test_the_lengths_of_actuators_are_what_is_measured_by_default():
 def test_bad_limits(motion_limits, measured, error, words):
     with pytest.raises(error, match=words):
         Admission(Nowhere(), motion_limits, measured, 1)
-
-
-def test_rest_with_limited_jerk_needs_accelerations():
-    with pytest.raises(ConfigurationError, match="accelerations"):
-        Admission(gym.make("Reacher-v5"), {**LIMITS, "arrival": "rest"}, None, 2)
-    with pytest.raises(ConfigurationError, match="accelerations"):
-        admission(([0.0], [0.0]), "rest").admits(np.zeros(1), 1.0)

@@ -1,8 +1,5 @@
 """TeleopChannel, plain: an ideal one is none; a delay is a delay; links lose, delay and reorder as declared."""
 
-import dataclasses
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,9 +11,8 @@ from teleop_worlds import ceiling, channel, clamp, place
 import safe_wrappers as sw
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
-from safe_wrappers.serialize import plain_data
 from safe_wrappers.wrappers.faults import Jitter, Outages
-from safe_wrappers.wrappers.teleop import LONGEST_DELAY_S, Line, link_from
+from safe_wrappers.wrappers.teleop import LONGEST_DELAY_S, Line
 
 
 def rollout(env, actions, seed=0):
@@ -288,15 +284,6 @@ def test_random_numbers_are_seeded_and_kept_apart():
     first = traffic(line(link))
     assert traffic(line(link)) == first
     assert traffic(line(link, seed=1)) != first and traffic(line(link, stream="another")) != first
-
-
-def test_links_are_plain_data():
-    link = sw.teleop.Link(0.1, 0.02, 0.1, False, 2.0, 0.3)
-    data = json.loads(json.dumps(plain_data(link)))
-    assert link_from("uplink", data) == link == link_from("uplink", link)
-    assert link_from("uplink", 0.2) == sw.teleop.Link(0.2)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        link.delay_s = 0.0
 
 
 @pytest.mark.parametrize(
