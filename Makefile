@@ -49,7 +49,7 @@ test-slow: .venv/installed
 
 # Small mistakes in the filter, constraints, plants and wrappers, one at a time in a copy: do the tests notice them?
 mutants: .venv/installed
-	$(BIN)/python -m benchmarks.mutants
+	$(BIN)/python -m benchmarks mutants
 
 # Property tests with random examples, again and again until the time is up, once at least; what fails becomes an
 # explicit example of its test. What is neither passed nor failed (interrupted, not collected) ends it at once.
@@ -94,7 +94,7 @@ sbom: .venv-tools/installed
 
 # One table, six minutes: beside bare envs, other packages, and the version before.
 bench: .venv/bench
-	$(BIN)/python -m benchmarks.bench
+	$(BIN)/python -m benchmarks bench
 
 .venv/shelf: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[shelf]'
@@ -102,45 +102,36 @@ bench: .venv/bench
 
 # Other packages' envs, simulated: about three hours on two cores.
 shelf: .venv/shelf
-	$(BIN)/python -m benchmarks.shelf
+	$(BIN)/python -m benchmarks shelf
 
 # What safety costs in return, task by task: days on two cores; goes on where it was stopped.
 table: .venv/installed
-	$(BIN)/python -m benchmarks.table
+	$(BIN)/python -m benchmarks table
 
 # Attackers against the proved filters, 20,000,000 steps: hours on one core; goes on where it was stopped.
 endurance: .venv/installed
-	$(BIN)/python -m benchmarks.endurance
+	$(BIN)/python -m benchmarks endurance
 
-# Long figures of the README and docs/results, about eight hours on two cores; those with a target or a command of
-# their own (table, endurance, shelf, fuzz, ...) are not among them: each page names its command.
+# Long figures of the README and docs/results, about five hours on two cores; those with a target of their own (table,
+# endurance, shelf, ...) are not among them: each page names its command.
+RUN = $(BIN)/python -m benchmarks
+COMPARED = pointgoal1_300k pointgoal1_learners velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
+	outages saferover_ppo occluded_crossing_ppo
 figures: .venv/installed
-	$(BIN)/python -m benchmarks.adversarial
-	$(BIN)/python -m benchmarks.adversarial --mismatch
-	$(BIN)/python -m benchmarks.adversarial --off --steps 100000
-	$(BIN)/python -m benchmarks.adversarial --robot car --steps 500000
-	$(BIN)/python -m benchmarks.adversarial --robot car --off --steps 49000 --parts 1
-	$(BIN)/python -m benchmarks.trained_adversary --anew
-	$(BIN)/python -m benchmarks.protected --steps 3000
-	$(BIN)/python -m benchmarks.protected --hard --steps 100000
-	$(BIN)/python -m benchmarks.leases
-	$(BIN)/python -m benchmarks.seams
-	for config in pointgoal1_300k pointgoal1_learners velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
-		outages saferover_ppo occluded_crossing_ppo; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
-	$(BIN)/python -m benchmarks.traction
-	$(BIN)/python -m benchmarks.impact
-	$(BIN)/python -m benchmarks.occlusion --steps 40000
-	$(BIN)/python -m benchmarks.whole_body
-	$(BIN)/python -m benchmarks.balance
-	$(BIN)/python -m benchmarks.teleop
-	$(BIN)/python -m benchmarks.kills
-	$(BIN)/python -m benchmarks.kills --seeds 2 --workers 2 --kills 10 --name kills_together
-	$(BIN)/python -m benchmarks.wrapper_cost
-	$(BIN)/python -m benchmarks.training_time
+	$(RUN) adversarial
+	$(RUN) adversarial --mismatch
+	$(RUN) adversarial --off --steps 100000
+	$(RUN) adversarial --robot car --steps 500000
+	$(RUN) adversarial --robot car --off --steps 49000 --parts 1
+	$(RUN) protected --steps 3000
+	$(RUN) protected --hard --steps 100000
+	for name in trained_adversary leases slip impact occlusion teleop kills training_time; do $(RUN) $$name || exit 1; done
+	$(RUN) kills --seeds 2 --workers 2 --name kills_together
+	for config in $(COMPARED); do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
 
 # The films of docs/gallery.md and the page: about ten minutes. MUJOCO_GL=osmesa or egl where there is no window.
 gallery: .venv/installed
-	$(BIN)/python -m benchmarks.gallery
+	$(BIN)/python -m benchmarks gallery
 
 .venv/docs: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

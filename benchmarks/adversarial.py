@@ -1,9 +1,9 @@
 """Violations of SafePointGoal and SafeCarGoal under adversarial drivers, with the filter on and off.
 
-    python -m benchmarks.adversarial                     # 1,000,000 filtered steps per level, 5 drivers
-    python -m benchmarks.adversarial --mismatch          # the plant wrong by 20 % in mass and damping
-    python -m benchmarks.adversarial --off --steps 20000 # the drivers unfiltered
-    python -m benchmarks.adversarial --robot car --steps 500000   # the same for SafeCarGoal, 7 drivers
+    python -m benchmarks adversarial                                # 1,000,000 filtered steps per level, 5 drivers
+    python -m benchmarks adversarial --mismatch                     # the plant wrong by 20 % in mass and damping
+    python -m benchmarks adversarial --off --steps 100000           # the drivers unfiltered
+    python -m benchmarks adversarial --robot car --steps 500000     # the same for SafeCarGoal, 7 drivers
 
 A violation is a control step in which the env's own truth was broken at any physics substep
 (`cost_substep`): the centre in a hazard disc, or, at level 2, a vase touched or moving.
@@ -21,7 +21,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import car_drivers, drivers
-from benchmarks.tables import RESULTS, keep, markdown, total
+from benchmarks.tables import keep, markdown, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 DRIVERS = {"point": drivers.DRIVERS, "car": car_drivers.DRIVERS}
@@ -80,7 +80,7 @@ def run(job: Job) -> dict[str, Any]:
 def jobs(arguments: argparse.Namespace) -> list[Job]:
     """What to run."""
     robot = arguments.robot
-    levels, names = arguments.level, list(DRIVERS[robot])
+    levels, names = (1, 2), list(DRIVERS[robot])
     steps = arguments.steps // len(names)
     if arguments.mismatch:
         wrong = list(itertools.product((0.8, 1.2), repeat=2))
@@ -118,24 +118,15 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run the jobs in parallel, print the table, keep the rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--level", type=int, nargs="+", default=[1, 2], choices=[1, 2])
-    parser.add_argument("--steps", type=int, default=1_000_000, help="per level")
-    parser.add_argument("--parts", type=int, default=4, help="independent runs per driver")
-    parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
-    parser.add_argument("--robot", choices=list(DRIVERS), default="point")
-    mode = parser.add_mutually_exclusive_group()
-    mode.add_argument("--mismatch", action="store_true")
-    mode.add_argument("--off", action="store_true")
-    arguments = parser.parse_args()
-    if arguments.mismatch and arguments.robot != "point":
-        parser.error("--mismatch is for the point: the car's filter declares no uncertainty")
-    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
-        rows = pool.map(run, jobs(arguments), chunksize=1)
-    name = next((m for m in ("mismatch", "off") if getattr(arguments, m)), "filtered")
-    name = name if arguments.robot == "point" else f"{arguments.robot}_{name}"
-    keep(RESULTS, f"adversarial_{name}", rows, table(rows))
-
-
-if __name__ == "__main__":
-    main()
+    workers = multiprocessing.cpu_count()
+    given = options(
+        __doc__, steps=1_000_000, parts=4, workers=workers, robot="point", mismatch=False, off=False
+    )
+    if given.mismatch and given.robot != "point":
+        raise SystemExit("--mismatch is for the point: the car's filter declares no uncertainty")
+    with multiprocessing.get_context("spawn").Pool(given.workers) as pool:
+        rows = pool.map(run, jobs(given), chunksize=1)
+    name = "mismatch" if given.mismatch else "off" if given.off else "filtered"
+    keep(
+        f"adversarial_{name}" if given.robot == "point" else f"adversarial_{given.robot}_{name}", table(rows)
+    )

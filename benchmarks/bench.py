@@ -1,7 +1,7 @@
 """What the filter costs, in one table: beside bare envs, other packages, and the version before.
 
-    python -m benchmarks.bench              # about six minutes; writes results/bench.json
-    python -m benchmarks.bench Reacher project
+    python -m benchmarks bench                           # about six minutes; writes results/bench.json
+    python -m benchmarks bench --only Reacher project    # rows whose name holds one of these words
 
 A row divides the time of ours by that of what it is compared with, where the filter changes nothing (inactive) and
 where it does (active); 1.0 is no cost. Both sides run in turn in one process. Infeasible: share of the active
@@ -9,19 +9,18 @@ driver's steps; correction: mean length of its changes, in units of the action. 
 with those of the committed results, inactive and active; below 1 is faster.
 """
 
-import argparse
 import json
 import math
 import subprocess
 import warnings
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import safe_wrappers as sw
-from benchmarks import env_step, many_envs, peers
+from benchmarks import env_step, peers
+from benchmarks.tables import RESULTS, options
 
-RESULT = Path(__file__).parent / "results" / "bench.json"
+RESULT = RESULTS / "bench.json"
 HEAD = """| what | over | inactive (us) | active (us) | inactive | active | infeasible | correction | before |
 |---|---|---|---|---|---|---|---|---|"""
 Row = dict[str, Any]
@@ -45,7 +44,9 @@ def env_row(name: str, steps: int) -> Row:
 
 def vector_row() -> Row:
     """One filter for 64 envs over the bare vector env; active: a driver that has a third of its steps changed."""
-    (quiet, calm, _, _), (pushed, busy, _, share) = (many_envs.measure(64, d) for d in many_envs.DRIVEN)
+    (quiet, calm, _), (pushed, busy, share) = (
+        env_step.measure_vector(64, d) for d in (env_step.gentle, env_step.SEEKING)
+    )
     times = {"inactive_us": quiet * calm, "active_us": pushed * busy}
     return times | {"inactive": calm, "active": busy, "active_share": share}
 
@@ -106,22 +107,15 @@ def line(what: str, over: str, row: Row, old: Row | None) -> str:
 
 def main() -> None:
     """Measure, print, and write the results if every row was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("words", nargs="*", help="only rows whose name holds one of these")
-    parser.add_argument("--steps", type=int, default=1500, help="of each env")
-    arguments = parser.parse_args()
+    given = options(__doc__, only=[], steps=1500)
     warnings.simplefilter("ignore")
     old, rows = committed(), {}
     print(HEAD)
-    for what, over, row in measured(arguments.words, arguments.steps):
+    for what, over, row in measured(given.only, given.steps):
         key = f"{what} over {over}"
         rows[key] = {
             name: None if math.isnan(value) else float(f"{value:.4g}") for name, value in row.items()
         }
         print(line(what, over, row, old.get(key)), flush=True)
-    if not arguments.words:
+    if not given.only:
         RESULT.write_text(json.dumps(rows, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()

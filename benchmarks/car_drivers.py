@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drivers import Action, Driver, held
+from benchmarks.drivers import Action, Driver, Maker, held
 from safe_wrappers.checks import Array
 
 _FULL = 0.02
@@ -110,7 +110,7 @@ def _in_the_field(env: Any, driver: Driver) -> Driver:
     return act
 
 
-DRIVERS: dict[str, Callable[[Any, np.random.Generator], Driver]] = {
+DRIVERS: dict[str, Maker] = {
     "random": uniform,
     "goal-seeking": goal_seeking,
     "hazard-seeking": hazard_seeking,

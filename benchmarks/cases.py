@@ -8,15 +8,12 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks import judges, patrol_drivers, tracked
+from benchmarks import fetch, judges
 from benchmarks import mujoco_drivers as drivers
 from benchmarks.car_drivers import DRIVERS as CAR_GOAL
-from benchmarks.crossing_drivers import DRIVERS as CROSSING
+from benchmarks.drivers import CROSSING, PATROLLED, Maker
 from benchmarks.drivers import DRIVERS as POINT_GOAL
-from benchmarks.fetch_drivers import drivers as fetch_drivers
-from benchmarks.fetch_judge import FetchJudge
 from benchmarks.judges import Judge, Replay, Reported, Worst
-from benchmarks.mujoco_drivers import Maker
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
 from safe_wrappers.recipes import SHADOW_HAND_TIED
 
@@ -57,6 +54,51 @@ class Case:
 
             gym.register_envs(gymnasium_robotics)
         return gym.make(self.env_id, max_episode_steps=self.max_episode_steps, render_mode=render_mode)
+
+
+CROSSING_TRACKS: dict[str, Any] = {
+    # 2 * 0.15^2 / 2 = 0.0225 m^2/s^3 along their lanes, and nothing across: safe_wrappers.envs.traffic.
+    "tracks": [
+        {
+            "bodies": bodies,
+            "mean_velocity": [mean, 0],
+            "acceleration_noise": [0.0225, 0],
+            "reversion_s": 2.0,
+            "start_position_std": [0.3, 0],
+            "start_velocity_std": [0.15, 0],
+        }
+        for bodies, mean in (("car[012]", 1), ("car[345]", -1))
+    ],
+    "sensor": {"camera": "eye", "view_deg": 120, "range_m": 6, "position_std": 0.05},
+    "tolerance": 0.5,
+}
+"""Of OccludedCrossing: as configs/occluded_crossing_ppo.yaml has it."""
+
+PATROLLED_TRACKS: dict[str, Any] = {
+    # 2 * (0.5^2 + 0.15^2) / 2 = 0.2725 m^2/s^3 along the corridor: safe_wrappers.envs.patrolled_maze.
+    "tracks": [
+        {
+            "published": "patrol_positions",
+            "acceleration_noise": [0.2725, 0],
+            "reversion_s": 2.0,
+            "start_position_std": [0.1, 0],
+            "start_velocity_std": [0.55, 0],
+        }
+    ],
+    "sensor": {"site": "particle_site", "position_std": 0.02},
+    "tolerance": 0.5,
+}
+"""Of PatrolledPointMaze on the U maze."""
+
+
+def crossing(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
+    """OccludedCrossing with its cars tracked."""
+    return sw.OcclusionPenalty(env, **(CROSSING_TRACKS | changes))
+
+
+def patrolled(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
+    """PatrolledPointMaze with its patrols tracked."""
+    return sw.OcclusionPenalty(env, **(PATROLLED_TRACKS | changes))
 
 
 _BLIND: dict[str, Maker] = {
@@ -167,7 +209,7 @@ def _crossing() -> Case:
         "OccludedCrossing-v0",
         judge=lambda env: Reported(judges.costs),
         drivers=_BLIND | CROSSING,
-        protect=lambda env: sw.protect(tracked.crossing(env)),
+        protect=lambda env: sw.protect(crossing(env)),
     )
 
 
@@ -176,14 +218,13 @@ def _patrolled_maze() -> Case:
     return Case(
         "PatrolledPointMaze-v0",
         judge=lambda env: Worst(walls(env), Reported(judges.costs)),
-        drivers=_BLIND
-        | {"patrol-seeking": patrol_drivers.patrol_seeking, "corridor": patrol_drivers.corridor},
-        protect=lambda env: sw.protect(tracked.patrolled(env)),
+        drivers=_BLIND | PATROLLED,
+        protect=lambda env: sw.protect(patrolled(env)),
     )
 
 
 def _fetch(task: str) -> Case:
-    return Case(f"Fetch{task}-v4", judge=FetchJudge, drivers=fetch_drivers(ball=False))
+    return Case(f"Fetch{task}-v4", judge=fetch.FetchJudge, drivers=fetch.drivers(ball=False))
 
 
 def _ant_maze(maze: str) -> Case:

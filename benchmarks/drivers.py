@@ -1,4 +1,7 @@
-"""Drivers for SafePointGoal that make life hard for a filter; each is a function of the env, seeded."""
+"""Drivers for SafePointGoal, OccludedCrossing and PatrolledPointMaze that make life hard for a filter.
+
+Each is a function of the unwrapped env, seeded; those of the crossing know nothing of cars.
+"""
 
 import math
 from collections.abc import Callable
@@ -9,6 +12,7 @@ from numpy.typing import NDArray
 
 Action = NDArray[np.float64]
 Driver = Callable[[], Action]
+Maker = Callable[[Any, np.random.Generator], Driver]
 
 
 def held(draw: Callable[[], tuple[int, Any]]) -> Callable[[], Any]:
@@ -86,10 +90,72 @@ def _obstacles(env: Any) -> NDArray[np.float64]:
     return np.concatenate([env.hazard_positions, vases]) if len(vases) else np.asarray(env.hazard_positions)
 
 
-DRIVERS: dict[str, Callable[[Any, np.random.Generator], Driver]] = {
+DRIVERS: dict[str, Maker] = {
     "random": uniform,
     "goal-seeking": goal_seeking,
     "hazard-seeking": hazard_seeking,
     "lateral-drift": lateral_drift,
     "bang-bang": bang_bang,
 }
+"""Of SafePointGoal."""
+
+
+def across(env: Any, rng: np.random.Generator) -> Driver:
+    """Straight to the goal as fast as the robot can, looking where it goes."""
+
+    def act() -> Action:
+        x, y = env.goal_position - env.agent_position
+        turn = math.remainder(math.atan2(y, x) - env.agent_heading, math.tau)
+        return np.clip([2.0 * x, 2.0 * y, 2.0 * turn], -1.0, 1.0)
+
+    return act
+
+
+def crossing_bang_bang(env: Any, rng: np.random.Generator) -> Driver:
+    """Full force one way or the other along each axis, and full turns, held for random times (1 s on average)."""
+    return held(lambda: (int(rng.geometric(0.04)), rng.choice([-1.0, 1.0], 3)))
+
+
+def into_traffic(env: Any, rng: np.random.Generator) -> Driver:
+    """To the middle of a lane and into its traffic: rests, then full force along or across it, by turns."""
+    state: dict[str, Any] = {"left": 0, "lane": 0.0, "force": np.zeros(2), "turn": 0.0}
+
+    def act() -> Action:
+        if state["left"] == 0:
+            force = rng.choice([-1.0, 0.0, 1.0], 2)
+            state.update(left=int(rng.integers(5, 40)), force=force, turn=float(rng.choice([-1.0, 0.0, 1.0])))
+            state["lane"] = float(rng.choice(env.lane_centres))
+        state["left"] -= 1
+        back = state["lane"] - env.agent_position[1]
+        along, across = state["force"]
+        return np.clip([along, across if abs(back) < 1.0 else 2.0 * back, state["turn"]], -1.0, 1.0)
+
+    return act
+
+
+CROSSING: dict[str, Maker] = {"goal-seeking": across, "bang-bang": crossing_bang_bang, "pulse": into_traffic}
+
+
+def patrol_seeking(env: Any, rng: np.random.Generator) -> Driver:
+    """Straight at the nearest patrol, at full force, hidden or not."""
+
+    def act() -> Action:
+        offsets = env.patrol_positions - env.agent_position
+        return np.clip(5.0 * offsets[np.hypot(*offsets.T).argmin()], -1.0, 1.0)
+
+    return act
+
+
+def corridor(env: Any, rng: np.random.Generator) -> Driver:
+    """Up and down the middle of the nearest corridor, turning about at random."""
+    way = held(lambda: (int(rng.integers(20, 150)), float(rng.choice([-1.0, 1.0]))))
+
+    def act() -> Action:
+        (_, y), (vx, vy) = env.agent_position, env.agent_velocity
+        middle = env.patrol_positions[:, 1][np.abs(env.patrol_positions[:, 1] - y).argmin()]
+        return np.clip([0.5 * way() - 0.2 * vx * abs(vx), 3.0 * (middle - y) - 0.3 * vy], -1.0, 1.0)
+
+    return act
+
+
+PATROLLED: dict[str, Maker] = {"patrol-seeking": patrol_seeking, "corridor": corridor}

@@ -1,47 +1,39 @@
 """How long the proved filters hold against attackers: violations, lowest margins, memory and speed over many steps.
 
-    python -m benchmarks.endurance                     # 20,000,000 control steps; goes on where it was killed
-    python -m benchmarks.endurance --steps 100000000   # and farther
-    python -m benchmarks.endurance --collect           # only the tables, of the chunks that are there
+    python -m benchmarks endurance                     # 20,000,000 control steps; goes on where it was killed
+    python -m benchmarks endurance --steps 100000000   # and farther
 
 Chunks of one env, driver and seed are made one after the other in the same process, each a line in
-`runs/endurance/endurance.jsonl`; the tables go to `benchmarks/results/endurance.md` and `endurance.json`. The
-hand-written drivers attack 16 envs at once through one `VectorCBFActionFilter`. CEM and differences search 30 steps
-ahead in copies of the env, filter included. The learner is PPO that is paid for violations, anew in each chunk.
+`runs/endurance/endurance.jsonl`. The hand-written drivers attack 16 envs at once through one `VectorCBFActionFilter`.
+CEM and differences search 30 steps ahead in copies of the env, filter included. The learner is PPO that is paid for
+violations, anew in each chunk.
 
 A violation is a control step in which the env's own truth (`benchmarks/judges.py`) was broken at any physics substep.
-Each chunk of a hand-written driver is timed in CPU time beside the same physics steps of a model of its own, and the
-memory of the process is read at its end, after the allocator has given back what is free.
+The memory of the process is read at a chunk's end, after the allocator has given back what is free.
 """
 
-import argparse
 import ctypes
 import gc
 import importlib.metadata
-import json
 import os
 import platform
-import time
 import warnings
 import zlib
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import mujoco
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 import safe_wrappers as sw
-from benchmarks import chunks, trained_adversary
+from benchmarks import trained_adversary
 from benchmarks.cases import CASES
-from benchmarks.endurance_report import collected, table
-from benchmarks.mujoco_drivers import Maker, corner_seeking
+from benchmarks.drivers import Maker
+from benchmarks.mujoco_drivers import corner_seeking
 from benchmarks.searching_drivers import SEARCHES, SearchingDriver
-from benchmarks.tables import RESULTS
+from benchmarks.tables import keep, measured, options
 from benchmarks.trained_adversary import EXAMPLES, FLAGS, Tally
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -60,8 +52,6 @@ CARS_EVERY, SEARCHES_EVERY = 3, 10
 """Rounds: a car's step takes four times as long as a point's, and one of a search a hundred times."""
 TOGETHER = 16
 """Envs that a hand-written driver attacks at once."""
-BLOCKS = 40
-"""Of a chunk, each timed beside the reference."""
 _VERSIONS = ("safe-wrappers", "mujoco", "gymnasium", "gymnasium-robotics", "numpy", "numba", "torch")
 
 
@@ -116,17 +106,15 @@ def plan(steps: int) -> list[Chunk]:
 def run(chunk: Chunk) -> dict[str, Any]:
     """Attack, judge and count; then look at the process."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted
-    started = time.perf_counter()
     row = learn(chunk) if chunk.driver == LEARNER else attack(chunk)
-    row |= {"seconds": time.perf_counter() - started, "mb": used_mb()}
-    return asdict(chunk) | row | {"process": _process(), "versions": _versions()}
+    return asdict(chunk) | row | {"mb": used_mb(), "process": _process(), "versions": _versions()}
 
 
 def attack(chunk: Chunk) -> dict[str, Any]:
     """Drive the envs of a chunk together, or the one of a driver that searches."""
     envs, drivers = attacked(chunk)
     judges = [CASES[chunk.env].judge(single.unwrapped) for single in envs.unwrapped.envs]
-    tally, clock, warm_mb = Tally(), Clock(chunk.planned // BLOCKS), 0.0
+    tally = Tally()
     ended = np.zeros(envs.num_envs, dtype=bool)
     actions = np.zeros(envs.action_space.shape, envs.action_space.dtype)
     while tally.steps < chunk.planned:
@@ -147,11 +135,7 @@ def attack(chunk: Chunk) -> dict[str, Any]:
             tally.smallest = lowest if tally.smallest is None else min(lowest, tally.smallest)
         tally.steps += len(judged)
         ended = terminated | truncated
-        clock.tick(len(judged))
-        if not warm_mb and tally.steps >= chunk.planned // 10:
-            warm_mb = used_mb()
-            clock.start()
-    row = asdict(tally) | clock.times() | {"warm_mb": warm_mb, "end_mb": used_mb()}
+    row = asdict(tally)
     envs.close()
     for name in ("simulated", "simulated_violations"):
         row[name] = sum(getattr(driver, name, 0) for driver in drivers)
@@ -197,73 +181,111 @@ def learn(chunk: Chunk) -> dict[str, Any]:
     return asdict(tally) | {"off_steps": without["steps"], "off_violations": without["violations"]}
 
 
-class Clock:
-    """CPU time per env step, in blocks, each beside the same physics steps of SafePointGoal1 in data of its own.
-
-    Args:
-        block: Env steps.
-        reference: Physics steps after each block.
-    """
-
-    def __init__(self, block: int, reference: int = 400) -> None:
-        self._block, self._reference = max(block, 1), reference
-        self._model: mujoco.MjModel = gym.make(ENVS[0]).unwrapped.robot_model  # type: ignore[attr-defined]
-        self._data = mujoco.MjData(self._model)
-        self._found: list[tuple[float, float]] = []
-        self.start()
-
-    def start(self) -> None:
-        """Begin a block."""
-        self._steps, self._begin = 0, time.process_time()
-
-    def tick(self, steps: int) -> None:
-        """So many env steps have been made."""
-        self._steps += steps
-        if self._steps >= self._block:
-            spent = (time.process_time() - self._begin) / self._steps
-            self._found.append((1e6 * spent, self._reference_us()))
-            self.start()
-
-    def _reference_us(self) -> float:
-        begin = time.process_time()
-        mujoco.mj_resetData(self._model, self._data)
-        self._data.ctrl[:] = 0.1
-        mujoco.mj_step(self._model, self._data, self._reference)
-        return 1e6 * (time.process_time() - begin) / self._reference
-
-    def times(self) -> dict[str, float]:
-        """Medians: of a step, of a reference step, microseconds, and of their ratio."""
-        steps, references = np.array(self._found).T
-        us, beside, ratio = (float(np.median(x)) for x in (steps, references, steps / references))
-        return {"us": us, "reference_us": beside, "ratio": ratio}
+def collected(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Sums per env and driver, and what memory did over the steps of each process."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["env"], row["driver"]), []).append(row)
+    envs = list(dict.fromkeys(row["env"] for row in rows))
+    ordered = sorted(groups, key=lambda pair: envs.index(pair[0]))  # drivers as they came
+    return {
+        "drivers": [_pooled(groups[pair]) for pair in ordered],
+        "memory": [m for m in map(memory, _processes(rows)) if m],
+        "versions": sorted({row["versions"] for row in rows}),
+    }
 
 
-def collect(rows: Iterable[dict[str, Any]], results: Path) -> None:
-    """Write and print the tables."""
-    found = collected(list(rows))
-    (results / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
-    text = table(found)
-    (results / "endurance.md").write_text(text + "\n")
-    print(text)
+def _pooled(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    tally, off = Tally(), Tally()
+    extra = dict.fromkeys(("simulated", "simulated_violations"), 0)
+    for row in rows:
+        part = Tally(**{name: row[name] for name in Tally.__dataclass_fields__})
+        if not row["filtered"]:
+            off = off.plus(part)
+            continue
+        tally = tally.plus(part)
+        off = off.plus(Tally(row.get("off_steps", 0), row.get("off_violations", 0)))
+        for name in extra:
+            extra[name] += row.get(name, 0)
+    extra |= {"off_steps": off.steps, "off_violations": off.violations}
+    return {"env": rows[0]["env"], "driver": rows[0]["driver"], **asdict(tally), **extra}
+
+
+def _processes(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(row["process"], []).append(row)
+    return list(found.values())
+
+
+def _warm(rows: list[dict[str, Any]]) -> list[tuple[int, dict[str, Any]]]:
+    """The chunks of a process whose kind it has made before, with the filtered steps that it had made by then."""
+    seen, found, steps = set(), [], 0
+    for row in rows:
+        steps += row["steps"] * row["filtered"]
+        kind = row["env"], row["driver"], row["filtered"]
+        if kind in seen:
+            found.append((steps, row))
+        seen.add(kind)
+    return found
+
+
+def memory(rows: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """What the memory of one process did after its first round, from a line through the ends of its chunks."""
+    warm = _warm(rows)
+    if len(warm) < 3:
+        return None
+    steps, mb = np.array([at for at, _ in warm], float), np.array([row["mb"] for _, row in warm])
+    slope = float(np.polyfit(steps, mb, 1)[0])
+    span = steps[-1] - steps[0]
+    return {
+        "chunks": len(warm),
+        "steps": int(span),
+        "least_mb": float(mb.min()),
+        "most_mb": float(mb.max()),
+        "growth": slope * span / float(mb.mean()),
+    }
+
+
+def table(found: dict[str, Any]) -> str:
+    """Markdown: a line per env and driver, one per env, and what memory did."""
+    lines = [
+        "| env | driver | steps | violations | without the filter, of 1,000 | changed | infeasible | fallback "
+        "| unsafe | lowest h (mm) | simulated steps |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    rows = [row for row in found["drivers"] if row["steps"]]
+    for r in rows:
+        off = f"{1e3 * r['off_violations'] / r['off_steps']:.0f}" if r["off_steps"] else "-"
+        flags = " | ".join(f"{r[name]:,}" for name in FLAGS[1:])
+        lines.append(
+            f"| {r['env']} | {r['driver']} | {r['steps']:,} | {r['violations']:,} | {off} "
+            f"| {r['intervened'] / r['steps']:.1%} | {flags} | {1e3 * r['smallest']:.3f} "
+            f"| {r['simulated'] or '-'} |"
+        )
+    lines += ["", "| env | steps | violations | at most, at 95 % | lowest h (mm) |", "|---|---|---|---|---|"]
+    for env in [*dict.fromkeys(r["env"] for r in rows), ""]:
+        part = [r for r in rows if env in ("", r["env"])]
+        steps, bad = (sum(r[name] for r in part) for name in ("steps", "violations"))
+        if steps:
+            bound = f"{3.0 / steps:.1e} a step" if not bad else "-"
+            least = 1e3 * min(r["smallest"] for r in part)
+            lines.append(f"| {env or 'all'} | {steps:,} | {bad:,} | {bound} | {least:.3f} |")
+    simulated, bad = (sum(r[name] for r in rows) for name in ("simulated", "simulated_violations"))
+    lines += ["", f"Of {simulated:,} steps that searches simulated, {bad:,} were in violation.", ""]
+    for m in found["memory"]:
+        lines.append(
+            f"Memory of a process after its first round, over {m['steps']:,} steps in {m['chunks']} chunks: "
+            f"{m['least_mb']:.0f} to {m['most_mb']:.0f} MB; a line through them grows by {m['growth']:.2%}."
+        )
+    return "\n".join([*lines, "", *found["versions"]])
 
 
 def main() -> None:
     """Make the chunks that are missing, and the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--steps", type=int, default=20_000_000, help="filtered ones, in whole chunks")
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--folder", type=Path, default=Path("runs/endurance"), help="of the chunks")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the tables")
-    parser.add_argument("--collect", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
-    path = arguments.folder / "endurance.jsonl"
-    known = chunks.known(path, Chunk)
-    if not arguments.collect:
-        arguments.folder.mkdir(parents=True, exist_ok=True)
-        known = chunks.measured(path, plan(arguments.steps), run, arguments.workers, known)
-    elif not known:
-        parser.error(f"no chunks in {path}; run without --collect, or say --folder")
-    collect(known.values(), arguments.results)
+    given = options(__doc__, steps=20_000_000, workers=1, folder=Path("runs/endurance"))
+    rows = measured(given.folder / "endurance.jsonl", plan(given.steps), run, given.workers)
+    keep("endurance", table(collected(rows)))
 
 
 def used_mb() -> float:
@@ -281,7 +303,3 @@ def _process() -> str:
 def _versions() -> str:
     known = [f"{name} {importlib.metadata.version(name)}" for name in _VERSIONS]
     return ", ".join([f"Python {platform.python_version()}", *known])
-
-
-if __name__ == "__main__":
-    main()

@@ -6,21 +6,20 @@ of the time with the filter over the time without. Runners that act at random ar
 so for them the limit of the active rows is lower; the filter's work is the same.
 """
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import SyncVectorEnv
 
 import safe_wrappers as sw
 from benchmarks import car_drivers, mujoco_drivers
 from benchmarks.cases import PROTECTED
-from benchmarks.drivers import DRIVERS, Driver
-from benchmarks.mujoco_drivers import Maker
+from benchmarks.drivers import DRIVERS, Driver, Maker
 
 Filter = Callable[[gym.Env[Any, Any]], sw.CBFActionFilter]
 
@@ -57,14 +56,15 @@ def slower(limit: float) -> Filter:
     def protect(env: gym.Env[Any, Any]) -> sw.CBFActionFilter:
         (speed,) = sw.protect(env).constraints
         assert isinstance(speed, sw.constraints.SpeedLimit)
-        return sw.CBFActionFilter(env, [dataclasses.replace(speed, limit=limit)])
+        return sw.CBFActionFilter(env, [replace(speed, limit=limit)])
 
     return protect
 
 
+SEEKING = DRIVERS["hazard-seeking"]
 ACTIVE: dict[str, tuple[Maker, Filter]] = {
-    "SafePointGoal1-v0": (DRIVERS["hazard-seeking"], sw.protect),
-    "SafePointGoal2-v0": (DRIVERS["hazard-seeking"], sw.protect),
+    "SafePointGoal1-v0": (SEEKING, sw.protect),
+    "SafePointGoal2-v0": (SEEKING, sw.protect),
     "SafeCarGoal1-v0": (car_drivers.DRIVERS["full throttle"], sw.protect),
     "InvertedPendulum-v5, on after the fall": (mujoco_drivers.end_seeking, sw.protect),
     "Reacher-v5": (mujoco_drivers.speed_seeking, sw.protect),
@@ -79,33 +79,18 @@ ACTIVE: dict[str, tuple[Maker, Filter]] = {
 
 
 def measure(name: str, driver: Maker, protect: Filter, active: bool, steps: int = 1500) -> Figures:
-    """`compare` on a case of the protected envs."""
-    case = PROTECTED[name]
-    return compare(case.make, protect, driver, active, steps, time.perf_counter, case.past_termination)
-
-
-def compare(
-    make: Callable[[], gym.Env[Any, Any]],
-    protect: Filter,
-    driver: Maker,
-    active: bool,
-    steps: int,
-    clock: Callable[[], float],
-    past_termination: bool = False,
-) -> Figures:
     """Step a filtered env and a bare one alike and time them.
 
     Args:
-        make: Makes either env, without the filter.
-        protect: Puts the filter on.
+        name: Of a case of the protected envs.
         driver: Of the filtered env; the other one is given what was executed.
+        protect: Puts the filter on.
         active: Look for steps that were projected, or for steps that were not changed.
         steps: In all.
-        clock: What time is taken of, s.
-        past_termination: Step on where the env ends.
     """
-    bare = make()
-    env = protect(make())
+    case, clock = PROTECTED[name], time.perf_counter
+    bare = case.make()
+    env = protect(case.make())
     act = driver(env.unwrapped, np.random.default_rng(0))
     kind: Any = env.action_space.dtype
     times, corrections, infeasible, over, seed = [], [], 0, True, 0
@@ -122,7 +107,7 @@ def compare(
         begin_bare = clock()
         bare.step(executed)
         end = clock()
-        over = truncated or (terminated and not past_termination)
+        over = truncated or (terminated and not case.past_termination)
         infeasible += info["cbf/infeasible"]
         if info["cbf/intervened"]:
             corrections.append(info["cbf/correction"])
@@ -135,3 +120,34 @@ def compare(
     bare_us, with_us = 1e6 * np.array(times).T
     ratio = float(np.median(with_us / bare_us))
     return Figures(*shares, correction, float(np.median(bare_us)), float(np.median(with_us)), ratio)
+
+
+def measure_vector(n: int, drive: Maker, steps: int = 120, settle: int = 20) -> tuple[float, float, float]:
+    """SafePointGoal1 in a SyncVectorEnv, with one filter around it and bare, making the same steps in turn.
+
+    Returns:
+        Microseconds per env and step bare, the ratio to that with the filter, and the share of changed steps.
+    """
+    bare, filtered = (SyncVectorEnv([lambda: gym.make("SafePointGoal1-v0")] * n) for _ in range(2))
+    together = sw.protect(filtered)
+    bare.reset(seed=0)
+    together.reset(seed=0)
+    singles = [single.unwrapped for single in together.filters]
+    drivers = [drive(env, np.random.default_rng(i)) for i, env in enumerate(singles)]
+    times, changed = [], []
+    for step in range(steps):
+        actions = np.array([act() for act in drivers], dtype=bare.single_action_space.dtype)
+        began = time.perf_counter()
+        infos = together.step(actions)[4]
+        between = time.perf_counter()
+        executed = infos["executed_action"].astype(actions.dtype)
+        began_bare = time.perf_counter()
+        bare.step(executed)
+        end = time.perf_counter()
+        if step >= settle:
+            times.append((end - began_bare, (between - began) / (end - began_bare)))
+            changed.append(infos["cbf/intervened"].mean())
+    for envs in (bare, together):
+        envs.close()
+    alone, ratio = np.median(times, axis=0)
+    return 1e6 * float(alone) / n, float(ratio), float(np.mean(changed))

@@ -1,12 +1,11 @@
 """The films of docs/gallery.md, a task each, without and with the filter side by side; and the page itself.
 
-    MUJOCO_GL=osmesa python -m benchmarks.gallery [--frames FOLDER] [NAME ...]
+    MUJOCO_GL=osmesa python -m benchmarks gallery [--only NAME ...]
 
 Nothing is trained: the filters, the judges and the seeded drivers are those of docs/results/standard-envs.md. Both
 sides begin with the same reset and have the same driver, which reads its own side's state.
 """
 
-import argparse
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,13 +17,14 @@ from PIL import Image, ImageDraw
 
 import safe_wrappers as sw
 from benchmarks.cases import PROTECTED, Case
+from benchmarks.drivers import Maker
 from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, encode, font
-from benchmarks.mujoco_drivers import Maker
+from benchmarks.tables import RESULTS, options
 from safe_wrappers.drawing.scene import find_renderer, set_size
 
 ROOT = Path(__file__).parents[1]
 PAGE, FILMS = ROOT / "docs" / "gallery.md", ROOT / "docs" / "static" / "gallery"
-COUNTS = Path(__file__).parent / "results" / "gallery.json"
+COUNTS = RESULTS / "gallery.json"
 PANEL, HEAD, FOOT = 320, 24, 24
 QUALITIES, MOST_BYTES = (40, 20, 8, 2), 170_000
 """Of WebP: the first that is small enough."""
@@ -265,22 +265,13 @@ def _of(count: Count) -> str:
 
 def main() -> None:
     """Film all tasks, or some, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("names", nargs="*", default=list(SCENES), metavar="NAME", help=", ".join(SCENES))
-    parser.add_argument("--frames", type=Path, help="a folder for PNGs of every tenth frame, to look at")
-    arguments = parser.parse_args()
-    FILMS.mkdir(parents=True, exist_ok=True)
-    for name in arguments.names:
+    for name in options(__doc__, only=list(SCENES)).only:
         frames, times, counts = film(SCENES[name])
         for quality in QUALITIES:
             data = encode(frames, FRAME_MS, quality)
             if len(data) <= MOST_BYTES:
                 break
         (FILMS / f"{name}.webp").write_bytes(data)
-        if arguments.frames is not None:
-            arguments.frames.mkdir(parents=True, exist_ok=True)
-            for k, frame in enumerate(frames[::10]):
-                frame.save(arguments.frames / f"{name}-{k}.png")
         known = json.loads(COUNTS.read_text()) if COUNTS.exists() else {}
         known[name] = {"times": round(times, 3)} | {side: asdict(count) for side, count in counts.items()}
         COUNTS.write_text(
@@ -290,7 +281,3 @@ def main() -> None:
     if known.keys() == SCENES.keys():
         PAGE.write_text(page(known), encoding="utf-8")
         print(PAGE)
-
-
-if __name__ == "__main__":
-    main()

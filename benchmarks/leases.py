@@ -1,47 +1,275 @@
-"""Leases on a cart that drives at a wall while its policy drops out: contacts with and without, and how tight.
+"""Leases on a cart that drives at a wall while its policy falls silent: contacts with and without, and how tight.
 
-    python -m benchmarks.leases    # 6 x 10,000 episodes, half an hour; goes on where it was stopped
+    python -m benchmarks leases    # 4 x 10,000 episodes, 20 minutes on two cores; goes on where it was stopped
 
-Episodes with outages. Speed, clearance, throttle, brakes, reading errors and all five delays are drawn for each. The
-policy knows where to brake for the wall, so that it never touches it while it lives; the commands that it sends are
-lost in outages of random length at random times (`safe_wrappers.wrappers.faults.Outages`), the same with and without
-the lease. Without one the cart goes on with the last command, as a motor drive does.
+Everything that the formula of a lease counts is real here, in physics steps of 2 ms: readings of the clearance are
+`age_s` old and wrong by up to `localisation`; a request to brake takes effect after it has stood for `detect_s`,
+`confirm_s` and `act_s`; and a command that nobody renews goes on for ever.
 
-Worst cases. The policy dies right after a lease was granted, at full throttle or rolling head on, with every reading
-too long by the whole bound, every delay used up and brakes not a bit better than declared. Once under the lease of
-`control/watchdog/leases.py`, once under one that is 5 % longer. Clearances are drawn so that a lease is a whole
-number of control steps (at least 20: a twentieth is one step), since it only ever runs out between two of them.
+Outages. Speed, clearance, throttle, brakes, errors and all delays are drawn for each episode. The policy knows where
+to brake for the wall; its commands are lost in outages (`safe_wrappers.wrappers.faults.Outages`), the same with and
+without the lease.
+
+Worst cases. The policy dies right after a lease was granted, with every reading too long by the whole bound, every
+delay used up and brakes not a bit better than declared: once under the lease of `control/watchdog/leases.py`, once
+under one that is 5 % longer. Clearances are drawn so that a lease is a whole number of control steps, at least 20.
 """
 
-import argparse
-import json
 import math
 import multiprocessing
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import gymnasium as gym
+import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.cart_and_wall import HOLD_S, PHYSICS_S, CartAndWall, Drive
-from benchmarks.tables import RESULTS, markdown
+from benchmarks.tables import keep, markdown, measured, options, total
+from safe_wrappers.checks import Array
 from safe_wrappers.control.watchdog.leases import longest_lease
 from safe_wrappers.wrappers.faults import Outages
 
+PHYSICS_S, SUBSTEPS = 0.002, 10
+HOLD_S = SUBSTEPS * PHYSICS_S
 BLOCK = 500
-"""Episodes per row of the results."""
+"""Episodes of a job."""
 LONGEST_EPISODE_S = 20.0
-LONGEST_HEAD_ON_S = 8.0
-"""A policy that never brakes creeps up to the wall and never arrives."""
 MODES = {
-    "alive": "policy without outages, no lease",
     "no lease": "outages, no lease",
     "lease": "outages, lease",
-    "head on": "outages, lease, policy that never brakes",
     "worst": "worst case, lease of the formula",
     "worst, 5 % longer": "worst case, lease 5 % longer",
 }
+_NOSE = 0.1
+"""m, from the cart's origin to its front."""
+MODEL = f"""
+<mujoco model="cart and wall">
+  <option timestep="{PHYSICS_S}" integrator="RK4" gravity="0 0 0"/>
+  <worldbody>
+    <geom name="wall" type="box" pos="0.5 0 0" size="0.5 1 1"/>
+    <body name="cart">
+      <joint name="rail" type="slide" axis="1 0 0"/>
+      <geom name="hull" type="box" size="{_NOSE} 0.1 0.1" mass="2"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="rail"/></actuator>
+</mujoco>
+"""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What an episode is made of; delays are whole physics steps.
+
+    Attributes:
+        clearance: True distance to the wall `age_s` before the start, m.
+        speed: Towards it then, m/s.
+        braking: Deceleration that the cart counts on, m/s^2.
+        brakes_better: The true one over that.
+        acceleration: At full throttle, m/s^2.
+        top_speed: Where the throttle is cut, m/s.
+        localisation: Bound on the error of a reading, m.
+        margin: Clearance that is to be kept, m.
+        longest_s: Cap of a lease.
+        run_up: Throttle between the first reading and the start.
+        bias: Error of every reading over `localisation`, in [-1, 1]; None: drawn at each.
+    """
+
+    clearance: float
+    speed: float
+    braking: float
+    brakes_better: float
+    acceleration: float
+    top_speed: float
+    detect_s: float
+    confirm_s: float
+    age_s: float
+    act_s: float
+    localisation: float
+    margin: float
+    longest_s: float
+    run_up: float = 0.0
+    bias: float | None = None
+
+    @property
+    def to_brake_s(self) -> float:
+        """From a request to brake until the brakes hold."""
+        return self.detect_s + self.confirm_s + self.act_s
+
+    def way(self, after_s: float) -> float:
+        """From a reading to rest if it brakes so long after it, m: by phases, not by the library."""
+        speed, top = self.speed, max(self.top_speed, self.speed)
+        rising = min(after_s, (top - speed) / self.acceleration) if self.acceleration > 0.0 else after_s
+        end = speed + self.acceleration * rising
+        rolled = rising * 0.5 * (speed + end) + (after_s - rising) * end
+        return rolled + 0.5 * end * end / self.braking + self.localisation + self.margin
+
+
+def drawn(rng: np.random.Generator, worst: bool) -> Drive:
+    """An episode, started where a stop is possible; a third of them roll and have no throttle."""
+
+    def whole(most_s: float) -> float:
+        return PHYSICS_S * int(rng.integers(0, round(most_s / PHYSICS_S) + 1))
+
+    speed, rolling = rng.uniform(0.2, 3.0), rng.random() < 1 / 3
+    drive = Drive(
+        clearance=0.0,
+        speed=speed,
+        braking=rng.uniform(1.0, 8.0),
+        brakes_better=1.0 if worst else rng.uniform(1.0, 1.3),
+        acceleration=0.0 if rolling else rng.uniform(0.3, 4.0),
+        top_speed=speed + rng.uniform(0.0, 2.0),
+        detect_s=whole(0.1),
+        confirm_s=whole(0.1),
+        age_s=whole(0.15),
+        act_s=whole(0.15),
+        localisation=rng.uniform(0.0, 0.1),
+        margin=0.0 if worst else rng.uniform(0.0, 0.2),
+        longest_s=10.0 if worst else rng.uniform(0.1, 2.0),
+        run_up=1.0 if worst else 0.0,
+        bias=1.0 if worst else None,
+    )
+    delays = drive.to_brake_s + drive.age_s
+    if not worst:
+        return replace(drive, clearance=drive.way(delays) + rng.uniform(0.0, 8.0))
+    # The reading is too long by the bound, so the true clearance is less by it; 0.05 mm for what the last physics
+    # step of braking, which ends at rest and not before, takes more than the formula.
+    lease = HOLD_S * int(rng.integers(20, 101))
+    return replace(drive, clearance=drive.way(lease + delays) - drive.localisation + 5e-5)
+
+
+class CartAndWall(gym.Env[Array, Array]):
+    """One action in [-1, 1]: throttle, 0 to roll on at the same speed, below 0 a request to brake by as much.
+
+    The observation is the reading: clearance, m, and approach speed, m/s, `age_s` old.
+    """
+
+    def __init__(self) -> None:
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.model = mujoco.MjModel.from_xml_string(MODEL)
+        self.data = mujoco.MjData(self.model)
+        self.dt, self.frame_skip = HOLD_S, SUBSTEPS
+        self._mass = float(self.model.body("cart").mass[0])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin the episode of `options["drive"]`."""
+        super().reset(seed=seed)
+        self.drive: Drive = (options or {})["drive"]
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[0], self.data.qvel[0] = -(_NOSE + self.drive.clearance), self.drive.speed
+        self.lowest, self.touched = self.drive.clearance, False
+        self._seen: deque[tuple[float, float]] = deque(maxlen=round(self.drive.age_s / PHYSICS_S) + 1)
+        self._seen.append(self._state())
+        self._wait = round(self.drive.to_brake_s / PHYSICS_S)
+        self._throttle, self._request, self._stood = self.drive.run_up, 0.0, 0
+        while len(self._seen) < (self._seen.maxlen or 1):
+            self._advance()
+        self._read()
+        return np.array(self._reading), {}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """One control step; the episode ends at the wall."""
+        command = float(action[0])
+        self._request = max(-command, 0.0)
+        if self._request == 0.0:
+            self._throttle = command
+        for _ in range(SUBSTEPS):
+            self._advance()
+        self._read()
+        return np.array(self._reading), 0.0, self.touched, False, {"cost": float(self.touched)}
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether it stands."""
+        return bool(abs(self.data.qvel[0]) < 1e-9)
+
+    def reading(self, env: Any) -> tuple[float, float]:
+        """Clearance and approach speed as the cart knows them: what a lease is granted from."""
+        return self._reading
+
+    def _advance(self) -> None:
+        _, speed = self._state()
+        if self._request > 0.0 and self._stood >= self._wait:
+            strength = self._request * self.drive.braking * self.drive.brakes_better
+            acceleration = -min(strength, speed / PHYSICS_S)
+        else:
+            room = max(self.drive.top_speed - speed, 0.0) / PHYSICS_S
+            acceleration = min(self._throttle * self.drive.acceleration, room)
+        self._stood = self._stood + 1 if self._request > 0.0 else 0
+        self.data.ctrl[0] = self._mass * acceleration
+        mujoco.mj_step(self.model, self.data)
+        gap, _ = self._state()
+        self.lowest = min(self.lowest, gap)
+        self.touched |= gap < 0.0
+        self._seen.append(self._state())
+
+    def _state(self) -> tuple[float, float]:
+        return -(float(self.data.qpos[0]) + _NOSE), float(self.data.qvel[0])
+
+    def _read(self) -> None:
+        gap, speed = self._seen[0]
+        share = self.drive.bias if self.drive.bias is not None else float(self.np_random.uniform(-1.0, 1.0))
+        self._reading = gap + share * self.drive.localisation, speed
+
+
+def full_brake(plant: Any) -> list[float]:
+    """The fallback."""
+    return [-1.0]
+
+
+def leased(cart: CartAndWall, drive: Drive) -> sw.LeaseExpiry:
+    """The cart under a lease that knows its numbers."""
+    names = ("braking", "acceleration", "top_speed", "act_s", "localisation", "margin")
+    budget = sw.StoppingBudget(cart.reading, **{name: getattr(drive, name) for name in names})
+    delays = {name: getattr(drive, name) for name in ("detect_s", "confirm_s", "age_s")}
+    return sw.LeaseExpiry(cart, budget, **delays, max_lease_s=drive.longest_s, fallback=full_brake)
+
+
+def episode(mode: str, seed: tuple[int, ...]) -> dict[str, Any]:
+    """One drive at the wall, until it stands by its own will, touches, or time is up."""
+    rng = np.random.default_rng(seed)
+    drive, cart = drawn(rng, worst=False), CartAndWall()
+    between_s, length_s = rng.uniform(0.3, 2.0), rng.uniform(0.2, 2.0)
+    inside: Any = leased(cart, drive) if mode == "lease" else cart
+    env = Outages(inside, mean_between_s=between_s, mean_length_s=length_s)
+    reading, _ = env.reset(seed=int(rng.integers(2**31)), options={"drive": drive})
+    braking, steps, braked = False, 0, 0
+    delay = drive.to_brake_s + drive.age_s + 3.0 * HOLD_S
+    while steps * HOLD_S < LONGEST_EPISODE_S:
+        # Full throttle until the reading says brake: a lease of two control steps would not be left.
+        braking |= float(reading[0]) <= replace(drive, speed=float(reading[1])).way(delay)
+        reading, _, touched, _, info = env.step(np.array([-1.0 if braking else 1.0]))
+        steps += 1
+        braked += int(info.get("lease/braking", False))
+        if touched or (cart.at_rest and (braking or drive.acceleration == 0.0)):
+            break
+    arrived = bool(cart.at_rest and braking)
+    found = {"contact": cart.touched, "lowest": cart.lowest - drive.margin, "arrived": arrived}
+    return found | {"seconds": steps * HOLD_S, "braked": braked, "steps": steps}
+
+
+def worst_case(longer: float, seed: tuple[int, ...]) -> dict[str, Any]:
+    """The policy sends one command and dies."""
+    drive, cart = drawn(np.random.default_rng(seed), worst=True), CartAndWall()
+    env, steps = leased(cart, drive), 0
+    env.reset(options={"drive": drive})
+    with mock.patch(
+        "safe_wrappers.wrappers.stopping_budget.longest_lease",
+        lambda *a, **k: longer * longest_lease(*a, **k),
+    ):
+        while not (cart.touched or cart.at_rest):
+            info = env.step(np.array([1.0]))[4]
+            env.set_observation_time(None)
+            steps += 1
+            if steps == 1 and info["lease/braking"]:
+                raise AssertionError("the first command got no lease")
+    found = {"contact": cart.touched, "lowest": cart.lowest, "arrived": False}
+    return found | {"seconds": steps * HOLD_S, "braked": 0, "steps": steps}
 
 
 @dataclass(frozen=True)
@@ -50,216 +278,44 @@ class Job:
 
     mode: str
     block: int
-    episodes: int = BLOCK
-
-
-def way(drive: Drive, after_s: float) -> float:
-    """What the cart needs from a reading to rest if it brakes so long after it, m: by phases, not by our library."""
-    speed, top = drive.speed, max(drive.top_speed, drive.speed)
-    rising = min(after_s, (top - speed) / drive.acceleration) if drive.acceleration > 0.0 else after_s
-    end = speed + drive.acceleration * rising
-    rolled = rising * 0.5 * (speed + end) + (after_s - rising) * end
-    return rolled + 0.5 * end * end / drive.braking + drive.localisation + drive.margin
-
-
-def whole(rng: np.random.Generator, most_s: float) -> float:
-    """A delay in whole physics steps."""
-    return PHYSICS_S * int(rng.integers(0, round(most_s / PHYSICS_S) + 1))
-
-
-def drawn(rng: np.random.Generator, worst: bool) -> Drive:
-    """An episode, started where a stop is possible; a third of them roll and have no throttle."""
-    speed = rng.uniform(0.2, 3.0)
-    rolling = rng.random() < 1 / 3
-    drive = Drive(
-        clearance=0.0,
-        speed=speed,
-        braking=rng.uniform(1.0, 8.0),
-        brakes_better=1.0 if worst else rng.uniform(1.0, 1.3),
-        acceleration=0.0 if rolling else rng.uniform(0.3, 4.0),
-        top_speed=speed + rng.uniform(0.0, 2.0),
-        detect_s=whole(rng, 0.1),
-        confirm_s=whole(rng, 0.1),
-        age_s=whole(rng, 0.15),
-        act_s=whole(rng, 0.15),
-        localisation=rng.uniform(0.0, 0.1),
-        margin=0.0 if worst else rng.uniform(0.0, 0.2),
-        longest_s=10.0 if worst else rng.uniform(0.1, 2.0),
-        run_up=1.0 if worst else 0.0,
-        bias=1.0 if worst else None,
-    )
-    delays = drive.to_brake_s + drive.age_s
-    if worst:
-        # The reading is too long by the bound, so the true clearance is less by it; 0.05 mm for what the last physics
-        # step of braking, which ends at rest and not before, takes more than the formula.
-        lease = HOLD_S * int(rng.integers(20, 101))
-        room = way(drive, lease + delays) - drive.localisation + 5e-5
-    else:
-        room = way(drive, delays) + rng.uniform(0.0, 8.0)
-    return Drive(**{**drive.__dict__, "clearance": room})
-
-
-def full_brake(plant: Any) -> list[float]:
-    """The fallback."""
-    return [-1.0]
-
-
-def stack(mode: str, drive: Drive, outages: tuple[float, float]) -> tuple[Any, CartAndWall]:
-    """The env that the policy drives, and the cart itself."""
-    cart = CartAndWall()
-    env: Any = cart
-    if mode not in ("alive", "no lease"):
-        env = sw.LeaseExpiry(
-            cart,
-            sw.StoppingBudget(
-                cart.reading,
-                braking=drive.braking,
-                acceleration=drive.acceleration,
-                top_speed=drive.top_speed,
-                act_s=drive.act_s,
-                localisation=drive.localisation,
-                margin=drive.margin,
-            ),
-            detect_s=drive.detect_s,
-            confirm_s=drive.confirm_s,
-            age_s=drive.age_s,
-            max_lease_s=drive.longest_s,
-            fallback=full_brake,
-        )
-    if mode in ("no lease", "lease", "head on"):
-        env = Outages(env, mean_between_s=outages[0], mean_length_s=outages[1])
-    return env, cart
-
-
-def policy(drive: Drive, reading: Any, braking: bool) -> float:
-    """Full throttle until the reading says brake: a lease of two control steps would not be left."""
-    room, speed = float(reading[0]), float(reading[1])
-    needed = way(Drive(**{**drive.__dict__, "speed": speed}), drive.to_brake_s + drive.age_s + 3.0 * HOLD_S)
-    return -1.0 if braking or room <= needed else 1.0
-
-
-def episode(mode: str, seed: tuple[int, ...]) -> dict[str, Any]:
-    """One drive at the wall, until it stands by its own will, touches, or time is up."""
-    rng = np.random.default_rng(seed)
-    drive = drawn(rng, worst=False)
-    outages = rng.uniform(0.3, 2.0), rng.uniform(0.2, 2.0)
-    env, cart = stack(mode, drive, outages)
-    reading, _ = env.reset(seed=int(rng.integers(2**31)), options={"drive": drive})
-    braking, braked_by_lease, steps = False, 0, 0
-    longest_s = LONGEST_HEAD_ON_S if mode == "head on" else LONGEST_EPISODE_S
-    while steps * HOLD_S < longest_s:
-        command = 1.0 if mode == "head on" else policy(drive, reading, braking)
-        braking = command < 0.0
-        reading, _, touched, _, info = env.step(np.array([command]))
-        steps += 1
-        braked_by_lease += int(info.get("lease/braking", False))
-        if touched or (cart.at_rest and (braking or drive.acceleration == 0.0)):
-            break
-    return {
-        "contact": cart.touched,
-        "lowest": cart.lowest - drive.margin,
-        "arrived": bool(cart.at_rest and braking),
-        "seconds": steps * HOLD_S,
-        "braked": braked_by_lease,
-        "steps": steps,
-    }
-
-
-def worst_case(longer: float, seed: tuple[int, ...]) -> dict[str, Any]:
-    """The policy sends one command and dies."""
-    drive = drawn(np.random.default_rng(seed), worst=True)
-    env, cart = stack("worst", drive, (1.0, 1.0))
-    env.reset(options={"drive": drive})
-    steps = 0
-    with mock.patch(
-        "safe_wrappers.wrappers.stopping_budget.longest_lease",
-        lambda *a, **k: longer * longest_lease(*a, **k),
-    ):
-        while not (cart.touched or cart.at_rest):
-            _, _, _, _, info = env.step(np.array([1.0]))
-            env.set_observation_time(None)
-            steps += 1
-            if steps == 1 and info["lease/braking"]:
-                raise AssertionError("the first command got no lease")
-    return {
-        "contact": cart.touched,
-        "lowest": cart.lowest,
-        "arrived": False,
-        "seconds": steps * HOLD_S,
-        "braked": 0,
-        "steps": steps,
-    }
 
 
 def run(job: Job) -> dict[str, Any]:
-    """All episodes of a block, summed up."""
+    """All episodes of a block, summed up; the same ones with and without the lease."""
     rows = []
-    for k in range(job.block * BLOCK, job.block * BLOCK + job.episodes):
+    for k in range(job.block * BLOCK, (job.block + 1) * BLOCK):
         if job.mode.startswith("worst"):
             rows.append(worst_case(1.0 if job.mode == "worst" else 1.05, (1, k)))
         else:
-            rows.append(episode(job.mode, (0, k)))  # the same episodes in all modes
-    arrived = [r["seconds"] for r in rows if r["arrived"]]
-    return {
-        "mode": job.mode,
-        "block": job.block,
-        "episodes": len(rows),
-        "contacts": sum(r["contact"] for r in rows),
-        "arrived": len(arrived),
-        "arrived_s": sum(arrived),
-        "lowest_m": min(r["lowest"] for r in rows),
-        "highest_m": max(r["lowest"] for r in rows),
-        "steps": sum(r["steps"] for r in rows),
-        "braked_steps": sum(r["braked"] for r in rows),
-    }
+            rows.append(episode(job.mode, (0, k)))
+    least = [row["lowest"] for row in rows]
+    sums = {"contacts": total(rows, "contact"), "arrived": total(rows, "arrived")}
+    sums |= {"steps": total(rows, "steps"), "braked": total(rows, "braked")}
+    sums["arrived_s"] = sum(row["seconds"] for row in rows if row["arrived"])
+    return asdict(job) | sums | {"episodes": BLOCK, "lowest_m": min(least), "highest_m": max(least)}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per mode."""
     lines = []
-    summed = ("episodes", "contacts", "arrived", "arrived_s", "steps", "braked_steps")
     for mode, title in MODES.items():
-        part = [r for r in rows if r["mode"] == mode]
-        if not part:
-            continue
-        total = {k: sum(r[k] for r in part) for k in summed}
-        contacts = f"{total['contacts']:,} ({total['contacts'] / total['episodes']:.1%})"
-        lowest = f"{1e3 * min(r['lowest_m'] for r in part):.2f}"
+        part = [row for row in rows if row["mode"] == mode]
+        count, contacts = total(part, "episodes"), total(part, "contacts")
+        lowest = f"{1e3 * min(row['lowest_m'] for row in part):.2f}"
         if mode == "worst":
-            lowest += f" to {1e3 * max(r['highest_m'] for r in part):.2f}"
-        if total["contacts"]:
-            lowest = "-"  # it ends at the wall
-        arrives = mode in ("alive", "no lease", "lease")
-        arrived = f"{total['arrived'] / total['episodes']:.1%}" if arrives else "-"
-        time = f"{total['arrived_s'] / total['arrived']:.2f}" if arrives and total["arrived"] else "-"
-        braked = f"{total['braked_steps'] / total['steps']:.1%}" if mode in ("lease", "head on") else "-"
-        lines.append([title, f"{total['episodes']:,}", contacts, lowest, arrived, time, braked])
-    return markdown(
-        "episodes | count | contacts | least clearance over the margin (mm) | arrived | mean time (s) | braked",
-        lines,
-    )
+            lowest += f" to {1e3 * max(row['highest_m'] for row in part):.2f}"
+        arrived, arrived_s = total(part, "arrived"), sum(row["arrived_s"] for row in part)
+        cells = [title, f"{count:,}", f"{contacts:,} ({contacts / count:.1%})", "-" if contacts else lowest]
+        cells += [f"{arrived / count:.1%}", f"{arrived_s / arrived:.2f}"] if arrived else ["-", "-"]
+        braked = f"{total(part, 'braked') / total(part, 'steps'):.1%}" if mode == "lease" else "-"
+        lines.append([*cells, braked])
+    head = "episodes | count | contacts | least clearance over the margin (mm) | arrived"
+    return markdown(f"{head} | mean time (s) | braked", lines)
 
 
 def main() -> None:
-    """Run what is missing, keep every block, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=10_000, help="per mode, in blocks of 500")
-    parser.add_argument("--mode", nargs="+", default=list(MODES), choices=list(MODES))
-    parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
-    arguments = parser.parse_args()
-    RESULTS.mkdir(exist_ok=True)
-    kept = RESULTS / "leases.json"
-    rows: list[dict[str, Any]] = json.loads(kept.read_text()) if kept.exists() else []
-    done = {(r["mode"], r["block"]) for r in rows}
-    blocks = range(math.ceil(arguments.episodes / BLOCK))
-    jobs = [Job(m, b) for b in blocks for m in arguments.mode if (m, b) not in done]
-    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
-        for row in pool.imap_unordered(run, jobs):
-            rows.append(row)
-            kept.write_text(json.dumps(rows, indent=1) + "\n")
-            (RESULTS / "leases.md").write_text(table(rows) + "\n")
-    print(table(rows))
-
-
-if __name__ == "__main__":
-    main()
+    """Run what is missing, print the table."""
+    given = options(__doc__, episodes=10_000, workers=multiprocessing.cpu_count(), folder=Path("runs/leases"))
+    blocks = range(math.ceil(given.episodes / BLOCK))
+    jobs = [Job(mode, block) for block in blocks for mode in MODES]
+    keep("leases", table(measured(given.folder / "leases.jsonl", jobs, run, given.workers)))

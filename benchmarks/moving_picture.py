@@ -1,6 +1,6 @@
 """The README's moving picture: two agents on the same map, one trained without a filter, one through it.
 
-    MUJOCO_GL=osmesa python -m benchmarks.moving_picture
+    MUJOCO_GL=osmesa python -m benchmarks moving_picture
 
 The policies are those of `configs/policies`, deterministic, each as it was trained. The film shows the first seconds
 of the episodes with seeds 0, 1 and 2, each from the same reset on both sides. Whole episodes of the first hundred
@@ -8,7 +8,6 @@ seeds are counted beside it, and the README's caption is made of the counts. Col
 renderer's alone; the physics is the env's.
 """
 
-import argparse
 import io
 import json
 from dataclasses import asdict, dataclass, replace
@@ -22,16 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from benchmarks.tables import RESULTS, options
 from safe_wrappers.envs.crossing.markers import MarkingRenderer
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack
 
 ROOT = Path(__file__).parents[1]
-FILM, COUNTS = (
-    ROOT / "docs" / "static" / "filter.webp",
-    Path(__file__).parent / "results" / "moving_picture.json",
-)
+FILM, COUNTS = ROOT / "docs" / "static" / "filter.webp", RESULTS / "moving_picture.json"
 POLICIES = ROOT / "configs" / "policies"
 SEEDS, SECONDS, SPEED, STRIDE = (0, 1, 2), 8.0, 2.0, 6
 """What is filmed: the first seconds of each seed's episode, times real time, a frame every so many steps."""
@@ -252,21 +249,11 @@ def caption(counts: dict[str, Any]) -> str:
 
 def main() -> None:
     """Film, count."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--frames", type=Path, help="a folder for PNGs of every fifth frame, to look at")
-    arguments = parser.parse_args()
+    options(__doc__)
     frames = film()
-    if arguments.frames is not None:
-        arguments.frames.mkdir(parents=True, exist_ok=True)
-        for k, frame in enumerate(frames[::5]):
-            frame.save(arguments.frames / f"{k:02}.png")
     FILM.write_bytes(encode(frames, 1000 * STRIDE * 0.02 / SPEED))
     counts = whole_episodes()
     COUNTS.write_text(json.dumps(counts, indent=1) + "\n")
     print(f"{FILM}: {len(frames)} frames, {FILM.stat().st_size / 1e6:.2f} MB")
     print(json.dumps(counts, indent=1))
     print(caption(counts))
-
-
-if __name__ == "__main__":
-    main()

@@ -11,10 +11,8 @@ import mujoco
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from benchmarks.drivers import Action, Driver, held
+from benchmarks.drivers import Action, Driver, Maker, held
 from benchmarks.judges import stepped, wall_geoms
-
-Maker = Callable[[Any, np.random.Generator], Driver]
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 

@@ -1,9 +1,8 @@
 """Every env that `protect` knows, under drivers that make life hard: violations, with the filter and without.
 
-    python -m benchmarks.protected                            # 10,000 steps per env with and without
-    python -m benchmarks.protected --envs Reacher Pusher      # of the envs whose id has one of these words
-    python -m benchmarks.protected --hard --steps 400000      # one row per driver; the envs with a hard limit
-    python -m benchmarks.protected --resume                   # go on where a killed run stopped
+    python -m benchmarks protected --steps 3000            # of each env with and without; goes on if stopped
+    python -m benchmarks protected --envs Reacher Pusher   # of the envs whose name has one of these words
+    python -m benchmarks protected --hard --steps 100000   # one row per driver; the envs with a hard limit
 
 A violation is a control step in which the env's own truth (`benchmarks/judges.py`) was broken at any physics
 substep; for a published speed, over the step as a whole. Unflagged is one in a step that the filter reported
@@ -12,7 +11,7 @@ longer the env's step takes with the filter, against a second env that makes the
 the filter changed the action.
 """
 
-import argparse
+import itertools
 import multiprocessing
 import time
 import warnings
@@ -22,10 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import chunks
 from benchmarks.cases import CASES, HARD, PROTECTED, Case
-from benchmarks.descriptions import constrained, promised, reserve
-from benchmarks.tables import RESULTS, markdown, total
+from benchmarks.tables import keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 CHUNK = 10_000
@@ -101,19 +98,15 @@ def _timings(ratios: dict[bool, list[float]]) -> dict[str, Any]:
     return row
 
 
-def jobs(cases: dict[str, Case], arguments: argparse.Namespace) -> list[Job]:
+def jobs(cases: dict[str, Case], steps: int) -> list[Job]:
     """What to run: the steps of each env are split between its drivers, and those of a driver into chunks."""
     found = []
-    for name, case in cases.items():
-        if arguments.envs and not any(word in name for word in arguments.envs):
-            continue
-        drivers = [d for d in case.drivers if not arguments.drivers or d in arguments.drivers]
-        for filtered in (False,) if arguments.off else (True, False):
-            for driver in drivers:
-                left, seed = max(arguments.steps // len(drivers), 1), arguments.seed
-                while left > 0:
-                    found.append(Job(name, driver, filtered, min(left, CHUNK), seed))
-                    left, seed = left - CHUNK, seed + 1
+    for (name, case), filtered in itertools.product(cases.items(), (True, False)):
+        for driver in case.drivers:
+            left, seed = max(steps // len(case.drivers), 1), 0
+            while left > 0:
+                found.append(Job(name, driver, filtered, min(left, CHUNK), seed))
+                left, seed = left - CHUNK, seed + 1
     return found
 
 
@@ -124,54 +117,41 @@ def _overhead(rows: list[dict[str, Any]], which: str) -> str:
     return f"{sum(r * n for r, n in timed) / steps:.1f}" if steps >= 20 else "-"
 
 
-def _per_driver(rows: list[dict[str, Any]]) -> list[tuple[tuple[str, str, bool], list[dict[str, Any]]]]:
-    groups: dict[tuple[str, str, bool], list[dict[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row["case"], row["driver"], row["filtered"]), []).append(row)
-    return list(groups.items())
-
-
 def table_of_envs(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per env, drivers pooled."""
     lines = []
-    for name, case in cases.items():
-        on = [r for r in rows if r["case"] == name and r["filtered"]]
-        off = [r for r in rows if r["case"] == name and not r["filtered"]]
-        if not on and not off:
-            continue
-        env = case.protect(case.make())
-        ids = ", ".join((name, *case.also))
-        cells = [ids, constrained(env), promised(env), reserve(env)]
-        if on:
-            cells += [f"{_overhead(on, 'inactive')} / {_overhead(on, 'active')}", _violations(on)]
-        else:
-            cells += ["-", "-"]
-        cells.append(f"{total(off, 'violations'):,}" if off else "-")
-        cells.append(f"{total(on or off, 'steps'):,}")
-        share = total(on, "intervened") / max(total(on, "steps"), 1)
-        cells += (
-            [f"{share:.1%}", f"{total(on, 'infeasible'):,}", f"{total(on, 'fallback'):,}"]
-            if on
-            else ["-"] * 3
+    for name in dict.fromkeys(row["case"] for row in rows):
+        on, off = (
+            [row for row in rows if row["case"] == name and row["filtered"] is kind] for kind in (True, False)
         )
-        lines.append(cells)
-    head = "env | what is constrained | class | reserve | step time, inactive / active | violations on | off"
+        env = cases[name].protect(cases[name].make())
+        kinds = dict.fromkeys(type(c).__name__ for c in env.constraints)
+        proved = all(getattr(c, "promise", "best effort") == "proved" for c in env.constraints)
+        times = f"{_overhead(on, 'inactive')} / {_overhead(on, 'active')}"
+        cells = [
+            ", ".join((name, *cases[name].also)),
+            ", ".join(kinds),
+            "proved" if proved else "best effort",
+        ]
+        cells += [times, _violations(on), f"{total(off, 'violations'):,}", f"{total(on, 'steps'):,}"]
+        cells.append(f"{total(on, 'intervened') / total(on, 'steps'):.1%}")
+        lines.append([*cells, *(f"{total(on, flag):,}" for flag in ("infeasible", "fallback"))])
+    head = "env | constraints | class | step time, inactive / active | violations on | off"
     return markdown(f"{head} | steps each | changed | infeasible | fallback", lines)
 
 
 def table_of_drivers(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per env, driver and filter."""
     lines = []
-    for (name, driver, filtered), part in _per_driver(rows):
+    groups: dict[tuple[str, str, bool], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["case"], row["driver"], row["filtered"]), []).append(row)
+    for (name, driver, filtered), part in groups.items():
         steps = total(part, "steps")
-        flags = (
-            [f"{total(part, 'intervened') / steps:.1%}"] + [f"{total(part, flag):,}" for flag in _FLAGS[1:]]
-            if filtered
-            else ["-"] * 4
-        )
-        worst = max(row["worst"] for row in part)
+        flags = [f"{total(part, 'intervened') / steps:.1%}", *(f"{total(part, f):,}" for f in _FLAGS[1:])]
         cells = [name, driver, "on" if filtered else "off", f"{steps:,}", _violations(part)]
-        lines.append([*cells, *flags, f"{worst:.3g}"])
+        worst = f"{max(row['worst'] for row in part):.3g}"
+        lines.append([*cells, *(flags if filtered else ["-"] * 4), worst])
     head = "env | driver | filter | steps | violations | changed | infeasible | fallback | unsafe | worst"
     skipped = f"Starts left out because they were unsafe: {total(rows, 'unsafe_starts'):,}."
     return "\n".join([markdown(head, lines), "", skipped])
@@ -184,36 +164,13 @@ def _violations(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run the jobs, write each row as it comes, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument(
-        "--steps", type=int, default=10_000, help="per env and arm, split between its drivers"
+    workers = multiprocessing.cpu_count()
+    given = options(
+        __doc__, steps=10_000, envs=[], hard=False, workers=workers, folder=Path("runs/protected")
     )
-    parser.add_argument("--envs", nargs="+", help="words; an env whose name has one of them is run")
-    parser.add_argument("--drivers", nargs="+", help="names; all by default")
-    parser.add_argument("--hard", action="store_true", help="the envs with a hard limit, one row per driver")
-    parser.add_argument("--off", action="store_true", help="without the filter only")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
-    parser.add_argument(
-        "--resume", action="store_true", help="keep the rows of a killed run of the same command"
-    )
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the rows and the table")
-    arguments = parser.parse_args()
-    cases = HARD if arguments.hard else PROTECTED
-    wanted = jobs(cases, arguments)
-    if not wanted:
-        parser.error(f"nothing to run; the envs are: {', '.join(cases)}")
-    name = "protected_hard" if arguments.hard else "protected"
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    path = arguments.results / f"{name}.jsonl"
-    found = chunks.known(path, Job) if arguments.resume else {}
-    kept = {job: found[job] for job in wanted if job in found}
-    rows = chunks.measured(path, wanted, run, arguments.workers, kept)
-    ordered = [rows[job] for job in wanted]
-    text = table_of_drivers(ordered) if arguments.hard else table_of_envs(cases, ordered)
-    (arguments.results / f"{name}.md").write_text(text + "\n")
-    print(text)
-
-
-if __name__ == "__main__":
-    main()
+    cases = HARD if given.hard else PROTECTED
+    named = {n: case for n, case in cases.items() if not given.envs or any(word in n for word in given.envs)}
+    wanted = jobs(named, given.steps)
+    name = "protected_hard" if given.hard else "protected"
+    rows = measured(given.folder / f"{name}.jsonl", wanted, run, given.workers)
+    keep(name, table_of_drivers(rows) if given.hard else table_of_envs(cases, rows), not given.envs)

@@ -1,8 +1,8 @@
 """Random MuJoCo models through MujocoPlant and a filter: supported, or refused by name, never a crash.
 
-    python -m benchmarks.random_models                   # 10,000 models; goes on where it was stopped
-    python -m benchmarks.random_models --models 200 --results DIR
-    python -m benchmarks.random_models --seed 17         # one of them: its XML, and what became of it
+    python -m benchmarks random_models                   # 10,000 models; goes on where it was stopped
+    python -m benchmarks random_models --models 200 --results DIR
+    python -m benchmarks random_models --seed 17         # one of them: its XML, and what became of it
 
 A model that MuJoCo compiles and can simulate becomes one of Gymnasium's MuJoCo envs, twice: one is filtered, the twin
 gets what was executed. It is *supported* if every forecast of an executed control is the env's step and the twin's to
@@ -293,7 +293,7 @@ def outcomes(first: int, last: int) -> Iterator[tuple[int, str, str]]:
     while first < last:
         seed, ours, why = first, False, "exit"
         with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes its log into the working directory
-            command = [sys.executable, "-m", "benchmarks.random_models", "--child", str(first), str(last)]
+            command = [sys.executable, "-m", "benchmarks", "random_models", "--child", str(first), str(last)]
             where = os.environ | {"PYTHONPATH": str(RESULTS.parents[1]), "MUJOCO_GL": "disabled"}
             process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, cwd=folder, env=where, text=True, bufsize=1
@@ -402,7 +402,3 @@ def table(counts: dict[str, Any]) -> str:
     lines += [f"| defect | {len(counts['defects']):,} |"]
     lines += [f"| (refused by MuJoCo itself) | {counts['mujoco']:,} |"]
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,24 +1,20 @@
 """Envs of other packages under drivers that look for violations, without the filter and with `protect`.
 
-    python -m benchmarks.shelf
-    python -m benchmarks.shelf --only Pendulum-v1 --steps 20000
-    python -m benchmarks.shelf --collect
+    python -m benchmarks shelf    # three hours on two cores; goes on where it was stopped
+    python -m benchmarks shelf --only Pendulum-v1
 
 Violations are judged on the env after every step, by functions of this file. Needs gymnasium's extra "box2d",
 gymnasium-robotics, panda-gym, highway-env and shimmy with dm_control for their rows, which are left out where they
-are not installed. The drivers: "random";
-"greedy", of eight random actions (of all discrete ones) that which earns most when it is held for five steps in a
-simulation; "attacking", that which comes nearest to a violation. Rows go to `benchmarks/results/shelf.csv`, the table
-to `shelf.md`.
+are not installed. The drivers: "random"; "greedy", of eight random actions (of all discrete ones) that which earns
+most when it is held for five steps in a simulation; "attacking", that which comes nearest to a violation.
 """
 
-import argparse
-import csv
 import importlib
+import importlib.util
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +22,11 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import markdown
+from benchmarks.tables import keep, markdown, measured, options
 from safe_wrappers.plants import View
 from safe_wrappers.shelf import PLANTS
-from safe_wrappers.train.files import write_rows
 
-RESULTS = Path(__file__).parent / "results" / "shelf.csv"
 DRIVERS = ("random", "greedy", "attacking")
-COLUMNS = (
-    "env", "driver", "steps", "violations_off", "violations_on", "unflagged", "changed", "infeasible",
-    "return_off", "return_on", "step_us_off", "step_us_on",
-)  # fmt: skip
 _TRIED, _HELD = 8, 5
 
 
@@ -48,7 +38,6 @@ class Case:
     h: Callable[[View], float]
     steps: int = 20_000
     needs: str = ""
-    options: dict[str, Any] = field(default_factory=dict)
 
 
 def _fallen(view: View, limit: float, angle: float) -> float:
@@ -118,7 +107,7 @@ def driven(case: Case, driver: str, env: gym.Env[Any, Any], plant: sw.plants.Rol
 def run(case: Case, driver: str, on: bool, steps: int) -> dict[str, float]:
     """Drive the env, and judge it after every step."""
     gym.register_envs(importlib.import_module(case.needs or "gymnasium"))
-    env = gym.make(case.env_id, **case.options)
+    env = gym.make(case.env_id)
     make_plant = PLANTS.get(case.env_id.rpartition("-v")[0], lambda env: sw.SimulatorPlant())
     plant: Any = make_plant(env)
     plant.bind(env)
@@ -147,69 +136,47 @@ def run(case: Case, driver: str, on: bool, steps: int) -> dict[str, float]:
     return found
 
 
-def row(case: Case, driver: str, steps: int) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Job:
     """A row of the table."""
-    off, on = (run(case, driver, filtered, steps) for filtered in (False, True))
-    return {
-        "env": case.env_id,
-        "driver": driver,
-        "steps": steps,
-        "violations_off": int(off["violations"]),
-        "violations_on": int(on["violations"]),
-        "unflagged": int(on["unflagged"]),
-        "changed": round(on["changed"] / steps, 4),
-        "infeasible": round(on["infeasible"] / steps, 5),
-        "return_off": round(off["return"] / steps, 4),
-        "return_on": round(on["return"] / steps, 4),
-        "step_us_off": round(1e6 * off["seconds"] / steps, 1),
-        "step_us_on": round(1e6 * on["seconds"] / steps, 1),
-    }
+
+    env: str
+    driver: str
+    steps: int
 
 
-def table_of(rows: list[dict[str, Any]]) -> str:
+def row(job: Job) -> dict[str, Any]:
+    """Its figures, per step where they are not counts."""
+    case = next(case for case in CASES if case.env_id == job.env)
+    off, on = (run(case, job.driver, filtered, job.steps) for filtered in (False, True))
+    found = asdict(job) | {"violations_off": off["violations"], "violations_on": on["violations"]}
+    found |= {"unflagged": on["unflagged"]} | {key: on[key] / job.steps for key in ("changed", "infeasible")}
+    for name, side in (("off", off), ("on", on)):
+        found |= {f"{key}_{name}": side[key] / job.steps for key in ("return", "seconds")}
+    return found
+
+
+def table(rows: list[dict[str, Any]]) -> str:
     """The table that the docs show."""
     lines = []
     for one in rows:
         counts = (f"{int(one[key]):,}" for key in ("steps", "violations_off", "violations_on", "unflagged"))
-        shares = (f"{100 * float(one[key]):.2g} %" for key in ("changed", "infeasible"))
-        returns = "; ".join(f"{float(one[key]):.3g}" for key in ("return_off", "return_on"))
-        times = "; ".join(f"{float(one[key]) / 1e3:.2g}" for key in ("step_us_off", "step_us_on"))
+        shares = (f"{100 * one[key]:.2g} %" for key in ("changed", "infeasible"))
+        returns = "; ".join(f"{one[key]:.3g}" for key in ("return_off", "return_on"))
+        times = "; ".join(f"{1e3 * one[key]:.2g}" for key in ("seconds_off", "seconds_on"))
         lines.append([one["env"], one["driver"], *counts, *shares, returns, times])
     head = "env | driver | steps | violations off | on | of these unflagged | changed | infeasible"
-    return markdown(f"{head} | reward per step off; on | step, ms off; on", lines) + "\n"
+    return markdown(f"{head} | reward per step off; on | step, ms off; on", lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    names = [case.env_id for case in CASES]
-    parser.add_argument("--only", nargs="+", choices=names, default=names, help="envs")
-    parser.add_argument("--drivers", nargs="+", choices=DRIVERS, default=DRIVERS)
-    parser.add_argument("--steps", type=int, help="of each row (default: as the case has it)")
-    parser.add_argument("--collect", action="store_true", help="measure nothing")
-    arguments = parser.parse_args()
+    """Measure what is missing and can be, print the table."""
+    given = options(__doc__, only=[], folder=Path("runs/shelf"))
     warnings.simplefilter("ignore")  # of unsafe states, which are counted
-    known: dict[tuple[str, str], dict[str, Any]] = {}
-    if RESULTS.exists():
-        with RESULTS.open() as file:
-            known = {(one["env"], one["driver"]): dict(one) for one in csv.DictReader(file)}
-    for case in CASES if not arguments.collect else ():
-        if case.env_id not in arguments.only:
-            continue
-        try:
-            importlib.import_module(case.needs or "gymnasium")
-        except ImportError:
+    jobs = []
+    for case in CASES:
+        if importlib.util.find_spec(case.needs or "gymnasium") is None:
             print(f"{case.env_id}: {case.needs} is not installed")
-            continue
-        for driver in arguments.drivers:
-            known[case.env_id, driver] = row(case, driver, arguments.steps or case.steps)
-            print(known[case.env_id, driver], flush=True)
-            write_rows(
-                RESULTS, COLUMNS, [known[name, d] for name in names for d in DRIVERS if (name, d) in known]
-            )
-    table = table_of([known[name, d] for name in names for d in DRIVERS if (name, d) in known])
-    RESULTS.with_suffix(".md").write_text(table)
-    print(table)
-
-
-if __name__ == "__main__":
-    main()
+        elif case.env_id in (given.only or [case.env_id]):
+            jobs += [Job(case.env_id, driver, case.steps) for driver in DRIVERS]
+    keep("shelf", table(measured(given.folder / "shelf.jsonl", jobs, row, 1)), not given.only)

@@ -1,15 +1,14 @@
 """What safety costs in return, task by task: SAC without a filter, through it, with it afterwards, and Lagrangian.
 
     make table
-    python -m benchmarks.table --only SafeCarGoal1_sac --arms filtered --seeds 0
-    python -m benchmarks.table --collect
+    python -m benchmarks table --only SafeCarGoal1_sac --arms filtered --seeds 0
+    python -m benchmarks table --collect
 
 Trains and evaluates what is missing: days on two cores; a killed command goes on where it was. Then writes
 `benchmarks/results/table.csv`, a row per run and condition, and `table.md`, which the docs show. A row stays until
 its run is found anew, so that several machines fill one table. `--collect` makes it of what is there.
 """
 
-import argparse
 import csv
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -19,13 +18,15 @@ from typing import Any
 
 from rich.console import Console
 
+from benchmarks.tables import RESULTS as FOLDER
+from benchmarks.tables import options
 from safe_wrappers.train.config import ExperimentConfig, parse_experiment, read_config
 from safe_wrappers.train.evaluation.summary import estimate, number, summarize
 from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
 from safe_wrappers.train.files import write_rows
 
 ROOT = Path(__file__).parents[1]
-RESULTS = Path(__file__).parent / "results" / "table.csv"
+RESULTS = FOLDER / "table.csv"
 VERSIONS = ("gymnasium", "mujoco", "stable-baselines3", "torch")
 
 
@@ -181,15 +182,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     names = [task.name for task in TASKS]
-    parser.add_argument("--only", nargs="+", choices=names, default=names, help="experiments")
-    parser.add_argument("--arms", nargs="+", choices=ARMS)
-    parser.add_argument("--seeds", nargs="+", type=int)
-    parser.add_argument("--workers", type=int, help="runs at a time (default: one per core)")
-    parser.add_argument("--output", default="runs", help="where the experiments lie")
-    parser.add_argument("--collect", action="store_true", help="train nothing")
-    arguments = parser.parse_args()
+    arguments = options(__doc__, only=names, arms=[], seeds=[], workers=int, output="runs", collect=False)
     rows = []
     for task in TASKS:
         whole = experiment_of(task, arguments.output)
@@ -197,7 +191,7 @@ def main() -> None:
             part = replace(
                 whole,
                 arms=tuple(arm for arm in whole.arms if arm.name in (arguments.arms or (arm.name,))),
-                seeds=[seed for seed in whole.seeds if seed in (arguments.seeds or (seed,))],
+                seeds=[seed for seed in whole.seeds if str(seed) in (arguments.seeds or (str(seed),))],
                 workers=arguments.workers,
             )
             train_experiment(part, Console())
@@ -206,7 +200,3 @@ def main() -> None:
     write_rows(RESULTS, COLUMNS, merged(read_table(), rows))
     RESULTS.with_suffix(".md").write_text(table := markdown(read_table()))
     print(table)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,22 +1,16 @@
 """A learner that is paid for violations, through the filter: does PPO find what the hand-written drivers do not?
 
-    python -m benchmarks.trained_adversary                      # every env, 300,000 steps
-    python -m benchmarks.trained_adversary --env Reacher-v5 --steps 20000 --seed 1
-    python -m benchmarks.trained_adversary --minutes 25         # a training ends then, wherever it stands
-    python -m benchmarks.trained_adversary --anew               # finished envs, too
+    python -m benchmarks trained_adversary            # every env, 300,000 steps; goes on where it was stopped
+    python -m benchmarks trained_adversary --steps 20000 --seed 1
 
 The reward is 1 for a control step in which the env's own truth (`benchmarks/judges.py`) was broken at any physics
 substep, and up to 0.1 for how near the state came to the limit, on a logarithmic scale, so that the last millimetre
-is worth as much as the last metre. The filter is `protect` with its defaults. Each env has a file of its own in
-`benchmarks/results`; one that was made by the same command is not trained again. The trained policy is then
-evaluated on episodes of other seeds, deterministic and stochastic, through the filter and, to see that it is after
-violations at all, without. Flagged is a violation in a step that the filter reported as infeasible or fallback, or
-as one that began unsafe.
+is worth as much as the last metre. The filter is `protect` with its defaults. The trained policy is then evaluated
+on episodes of other seeds, deterministic and stochastic, through the filter and, to see that it is after violations
+at all, without. Flagged is a violation in a step that the filter reported as infeasible or fallback, or as one that
+began unsafe.
 """
 
-import argparse
-import json
-import time
 import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -26,14 +20,12 @@ import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.cases import CASES
-from benchmarks.tables import markdown, total
+from benchmarks.tables import keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
-RESULTS: Final = Path(__file__).parent / "results"
 SCALES: Final = {
     "SafePointGoal1-v0": 1.0,  # m
     "SafeCarGoal1-v0": 1.0,  # m
@@ -140,18 +132,7 @@ def nearness(margin: float, scale: float) -> float:
     return float(-np.log10(share)) / DECADES
 
 
-class Deadline(BaseCallback):
-    """Ends the training between two steps when the time is up."""
-
-    def __init__(self, seconds: float) -> None:
-        super().__init__()
-        self._end = time.monotonic() + seconds
-
-    def _on_step(self) -> bool:
-        return time.monotonic() < self._end
-
-
-def run(job: Job, minutes: float | None = None, episodes: int = EPISODES) -> dict[str, Any]:
+def run(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
     """Train and evaluate the adversary of one env."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted
@@ -160,12 +141,11 @@ def run(job: Job, minutes: float | None = None, episodes: int = EPISODES) -> dic
     settings = {"n_steps": 512, "batch_size": 256, "n_epochs": 10, "learning_rate": 3e-4, "gamma": 0.99}
     policy = "MultiInputPolicy" if isinstance(envs.observation_space, gym.spaces.Dict) else "MlpPolicy"
     model = PPO(policy, envs, seed=job.seed, device="cpu", **settings)
-    begin = time.monotonic()
-    model.learn(job.steps, callback=None if minutes is None else Deadline(60.0 * minutes))
+    model.learn(job.steps)
     training = Tally()
     for env in made:
         training = training.plus(env.tally)
-    row: dict[str, Any] = asdict(job) | {"seconds": time.monotonic() - begin, "training": asdict(training)}
+    row: dict[str, Any] = asdict(job) | {"training": asdict(training)}
     for name, deterministic, filtered in (
         ("deterministic", True, True),
         ("stochastic", False, True),
@@ -215,38 +195,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Train what is not trained yet, print the table of all that is."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--env", nargs="+", default=list(SCALES), choices=list(SCALES), metavar="ID")
-    parser.add_argument("--steps", type=int, default=300_000, help="of training, per env")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--minutes", type=float, help="of training, per env, at most")
-    parser.add_argument("--episodes", type=int, default=EPISODES, help="of each evaluation")
-    parser.add_argument("--anew", action="store_true", help="train envs that are finished, too")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the rows and the table")
-    arguments = parser.parse_args()
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    for env in arguments.env:
-        job = Job(env, arguments.steps, arguments.seed)
-        path = _file(arguments.results, env)
-        limits = {"minutes": arguments.minutes, "episodes": arguments.episodes}
-        if arguments.anew or not _is_of(path, asdict(job) | limits):
-            row = run(job, **limits) | limits
-            path.write_text(json.dumps(row, indent=1) + "\n")
-    found = [_file(arguments.results, env) for env in SCALES]
-    text = table([json.loads(path.read_text()) for path in found if path.exists()])
-    (arguments.results / "trained_adversary.md").write_text(text + "\n")
-    print(text)
-
-
-def _file(folder: Path, env: str) -> Path:
-    return folder / f"trained_adversary_{env}.json"
-
-
-def _is_of(path: Path, settings: dict[str, Any]) -> bool:
-    """Whether the file is of these settings."""
-    return path.exists() and settings.items() <= json.loads(path.read_text()).items()
-
-
-if __name__ == "__main__":
-    main()
+    """Train what is not trained yet, print the table."""
+    given = options(__doc__, steps=300_000, seed=0, folder=Path("runs/trained_adversary"))
+    jobs = [Job(env, given.steps, given.seed) for env in SCALES]
+    keep("trained_adversary", table(measured(given.folder / "trained_adversary.jsonl", jobs, run, 1)))

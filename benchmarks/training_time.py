@@ -1,13 +1,12 @@
 """What the filter adds to a whole training: PPO with and without it, in turn, slice by slice.
 
-    python -m benchmarks.training_time
+    python -m benchmarks training_time
 
 Both arms of a config (same seed, same hyperparameters, the stack of the training scripts) collect and learn from
 one rollout after the other in turn, so that whatever else the machine does hits both alike. Reported: the sum of
 the filtered arm's wall time over the other's, and the median of the slices' ratios.
 """
 
-import argparse
 import statistics
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
+from benchmarks.tables import markdown, options
 from safe_wrappers.sb3 import InterventionCallback
 from safe_wrappers.train.config import ArmConfig, parse_experiment, read_config
 from safe_wrappers.train.config.algorithms import ALGORITHMS
@@ -53,38 +53,22 @@ class Training:
         self.seconds.append(time.perf_counter() - begin)
 
 
-def compare(experiment: str, steps: int) -> dict[str, float]:
-    """Train both arms of a config for so many steps each; ratios of filtered over unfiltered wall time."""
+def compare(experiment: str, steps: int) -> list[str]:
+    """Train both arms of a config for so many steps each: the cells of a row."""
     arms = {arm.name: arm for arm in parse_experiment(read_config(CONFIGS / f"{experiment}.yaml")).arms}
     without, filtered = (Training(arms[name], seed=0) for name in ("unfiltered", "filtered"))
     for _ in range(-(-steps // without.slice)):
         without.go_on()
         filtered.go_on()
     ratios = [b / a for a, b in zip(without.seconds, filtered.seconds, strict=True)]
-    return {
-        "steps": without.slice * len(ratios),
-        "without_s": sum(without.seconds),
-        "filtered_s": sum(filtered.seconds),
-        "median": statistics.median(ratios),
-    }
+    seconds = sum(without.seconds), sum(filtered.seconds)
+    cells = [f"{without.slice * len(ratios):,}", *(f"{s:.1f}" for s in seconds)]
+    return [*cells, f"{seconds[1] / seconds[0]:.2f}", f"{statistics.median(ratios):.2f}"]
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--steps", type=int, default=20_000, help="of each arm")
-    arguments = parser.parse_args()
+    given = options(__doc__, steps=20_000)
     torch.set_num_threads(1)
-    print("| PPO on | steps per arm | without (s) | with filter (s) | ratio | median of slices |")
-    print("|---|---|---|---|---|---|")
-    for experiment in EXPERIMENTS:
-        found = compare(experiment, arguments.steps)
-        print(
-            f"| {experiment} | {found['steps']:,.0f} | {found['without_s']:.1f} | {found['filtered_s']:.1f} "
-            f"| {found['filtered_s'] / found['without_s']:.2f} | {found['median']:.2f} |",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main()
+    head = "PPO on | steps per arm | without (s) | with filter (s) | ratio | median of slices"
+    print(markdown(head, [[name, *compare(name, given.steps)] for name in EXPERIMENTS]))

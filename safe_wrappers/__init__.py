@@ -9,11 +9,11 @@ Importing registers the ids of our tasks and changes nothing else; it imports ne
 
 from safe_wrappers import constraints, plants
 from safe_wrappers.control.handover.seam_limits import SeamLimits
+from safe_wrappers.control.numerics.projection import project
 from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
-from safe_wrappers.filter.projection import project
 from safe_wrappers.plants import AnalyticPlant, IdentifiedPlant, MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers import faults, occlusion, teleop

@@ -4,13 +4,15 @@ import difflib
 import inspect
 import textwrap
 from collections.abc import Callable
-from typing import Any, overload
+from typing import Any, Final, NamedTuple, overload
 
 import gymnasium as gym
 
-from safe_wrappers.by_hand import remedy_for
+from safe_wrappers.constraints import JointSpeedLimit, PredictiveShield
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.plants.env_checks import check_actions
+from safe_wrappers.plants.simulator.plant import SimulatorPlant
 from safe_wrappers.recipes import RECIPES
 from safe_wrappers.shelf import PLANTS, SHELF
 from safe_wrappers.stack import refuse_order
@@ -20,6 +22,12 @@ from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilte
 
 _EVERY = {**RECIPES, **SHELF}
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
+_SHIELD: Final = (
+    "It can be simulated. Say by h(observation) what must stay positive, by backup(observation) which action keeps "
+    "it so, and by horizon how many steps to look ahead; then these lines protect it"
+)
+_LIMIT_LINE: Final = "limit = sw.constraints.JointSpeedLimit(limit=4.0)  # rad/s, m/s; or another constraint"
+_SHIELD_LINE: Final = "shield = sw.constraints.PredictiveShield(h, horizon, backup)"
 
 
 def protect_options() -> frozenset[str]:
@@ -54,10 +62,10 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
     Args:
         env: Made by `gymnasium.make`; its id without the version selects the recipe. Or a `SyncVectorEnv` of one id.
         options: Those of `CBFActionFilter`, with `margin` added to the recipe's own. SafePointGoal also takes
-            `detour` (go around a hazard instead of stopping before it, default True), `brake` (count on the drive to
-            stop, default True) and `uncertainty` (of mass and damping, a fraction, default 0); SafeCarGoal takes
-            `detour`; Fetch takes `low` and `high` (corners of the gripper's box, m), `keep_out` (obstacles for its
-            fingers) and `table` (keep the fingers off it, default True).
+            `detour` (go around a hazard instead of stopping before it, default True) and `uncertainty` (of mass and
+            damping, a fraction, default 0); SafeCarGoal takes `detour`; Fetch takes `low` and `high` (corners of the
+            gripper's box, m), `keep_out` (obstacles for its fingers) and `table` (keep the fingers off it, default
+            True).
 
     Raises:
         UnsupportedEnvError: No env, or no recipe for it; the message has the lines that protect it by hand.
@@ -118,6 +126,54 @@ def _recommended(
             known = ", ".join(of_filter + of_recipe)
             raise UnknownNameError(f"protect has no option {name!r} for {_family(env_id)}; it has {known}")
     return recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
+
+
+class Remedy(NamedTuple):
+    """Lines that protect an env, and the text that introduces them."""
+
+    says: str
+    code: str
+    """Makes the filtered env out of `env`, with this library as `sw`."""
+    is_open: bool = False
+    """Whether the user has to give h, horizon and backup."""
+
+
+def remedy_for(env: Any, single: gym.Env[Any, Any]) -> Remedy:
+    """The first filter that can be made of an env: a speed limit by MuJoCo's model, else a simulation of the env.
+
+    Args:
+        env: What is to be filtered. The filters are made to be tried, and some of them reset it.
+        single: The env itself, or one of a vector env's.
+
+    Raises:
+        ConfigurationError: None can be made; the message says why.
+    """
+    discrete = isinstance(single.action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
+    vector = isinstance(env, gym.vector.VectorEnv)
+    kind: Any = ActionShield if discrete else VectorCBFActionFilter if vector else CBFActionFilter
+    if not discrete:
+        check_actions(single)
+        if _is_made(kind, env, JointSpeedLimit(4.0)) is None:
+            return Remedy("These lines protect it", f"{_LIMIT_LINE}\nenv = sw.{kind.__name__}(env, [limit])")
+    shield = PredictiveShield(lambda seen: 1.0, 2, "hold")
+    code = f"{_SHIELD_LINE}\nenv = sw.{kind.__name__}(env, [shield])"
+    if _is_made(kind, env, shield) is None:
+        return Remedy(_SHIELD, code, is_open=True)
+    refused = _is_made(kind, env, shield, plant=SimulatorPlant("fork"))
+    if refused is None:
+        return Remedy(_SHIELD, f'{code[:-1]}, plant=sw.SimulatorPlant("fork"))', is_open=True)
+    if isinstance(refused, ConfigurationError):
+        raise refused
+    raise UnsupportedEnvError(f"{type(refused).__name__}: {refused}") from refused
+
+
+def _is_made(kind: Any, env: Any, constraint: Constraint, **plant: Any) -> Exception | None:
+    """What refuses the filter, or None."""
+    try:
+        kind(env, [constraint], **plant)
+    except Exception as error:  # whatever the step of an env raises that cannot be copied
+        return error
+    return None
 
 
 def _without_recipe(env: gym.Env[Any, Any] | VectorEnv, single: gym.Env[Any, Any]) -> str:

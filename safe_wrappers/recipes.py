@@ -25,7 +25,7 @@ from safe_wrappers.constraints import (
     Workspace,
 )
 from safe_wrappers.constraints.limits.joints import driven_joints
-from safe_wrappers.control.numerics.rectangles import merged
+from safe_wrappers.control.numerics.planar import merged
 from safe_wrappers.envs.goal.car import CAR
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADIUS
 from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
@@ -43,13 +43,11 @@ VASE_HULL_RADIUS_M = 0.1415
 """Around a vase's centre: the corners of a square of side 0.2, rounded up."""
 
 
-def _point_goal(env: Env, detour: bool = True, brake: bool = True, uncertainty: float = 0.0) -> Recommended:
+def _point_goal(env: Env, detour: bool = True, uncertainty: float = 0.0) -> Recommended:
     obstacles: list[Any] = [Discs("hazard_positions", radius=0.2)]
     if env.unwrapped.level.vases_cost:  # type: ignore[attr-defined]
         obstacles.append(Discs("vase_positions", radius=POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M))
-    return [
-        HeadingDriveClearance(obstacles, margin=0.004, detour=detour, brake=brake, uncertainty=uncertainty)
-    ]
+    return [HeadingDriveClearance(obstacles, margin=0.004, detour=detour, uncertainty=uncertainty)]
 
 
 def _car_goal(env: Env, detour: bool = True) -> Recommended:

@@ -1,10 +1,11 @@
 """Short formulas, written a second time, to hold the library against."""
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.control.estimation.covariance import discretise
-from safe_wrappers.control.legged.support import common_plane, support_polygon
+from safe_wrappers.control.legged.support import common_plane
 
 
 def blind_covariance(start, a, q, time_s):
@@ -48,8 +49,10 @@ def margin_inside(point, corners):
 def support_margin(points, normals, forces):
     """Distance of the zero moment point from the edge of the support polygon; NaN where one of them is none."""
     ground = common_plane(points, normals)
-    corners = None if ground is None else support_polygon(ground.flat(points))
-    if ground is None or len(corners) < 3:
+    try:
+        flat = ground.flat(points)
+        corners = flat[ConvexHull(flat).vertices]
+    except (AttributeError, QhullError, ValueError):  # no common plane; on a line; too few
         return np.nan
     return margin_inside(ground.flat(zero_moment_point(points, forces, ground)), corners)
 

@@ -38,7 +38,7 @@ MAY_USE = {
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
     "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
     "envs": {"control", "constraints", "envs", *COMMON},
-    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "by_hand", "", *BELOW_WRAPPERS},
+    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {

@@ -1,7 +1,6 @@
 """The default profile draws the same in every run; `make fuzz` draws others, and tells what failed."""
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -42,19 +41,3 @@ def test_a_second_run_draws_the_same_or_not(profile, server, again, tmp_path):
         for _ in range(2)
     }
     assert (len(runs) == 1) == again
-
-
-@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
-@pytest.mark.parametrize("minutes, codes, rounds", [(0, "0", 1), (0, "1", 1), (1, "2", 1), (1, "02", 2)])
-def test_it_goes_on_until_the_time_is_up_and_stops_where_nothing_ran(minutes, codes, rounds, tmp_path):
-    """The exit codes of pytest, one per round: 0 passed, 1 failed, 2 interrupted."""
-    told, stub = tmp_path / "told", tmp_path / "python"
-    stub.write_text(f"#!/bin/sh\necho x >> {told}\nexit $(echo {codes} | cut -c $(wc -l < {told}))\n")
-    stub.chmod(0o755)
-    made = subprocess.run(
-        ["make", "-o", ".venv/installed", "fuzz", f"MINUTES={minutes}", f"BIN={tmp_path}"],
-        cwd=ROOT,
-        capture_output=True,
-    )
-    assert (made.returncode == 0) == (codes == "0")
-    assert len(told.read_text().split()) == rounds

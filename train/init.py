@@ -15,9 +15,8 @@ import gymnasium as gym
 from rich.console import Console
 
 import safe_wrappers
-from safe_wrappers.by_hand import remedy_for
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.protect import recipe_names, recipe_of
+from safe_wrappers.protect import recipe_names, recipe_of, remedy_for
 
 from .config import parse_experiment, read_config
 from .config.algorithms import DETERMINISTIC, DISCRETE, MASKED, OFF_POLICY, ON_POLICY

@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.filtering import cbf
+from safe_wrappers.control.numerics.projection import keeps_rows
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize
-from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant
 
 _ROUNDING = 1e-9  # round-off, as a share of h's size: of its value and its gradient together
@@ -20,7 +20,7 @@ _NO_EFFECT = 1e-7  # error of differences, as a share of h's size and of the con
 
 @dataclass
 class Barrier(Constraint):
-    """Keep `h(x) >= 0` by `Lf h + Lg h u >= -alpha (h - margin) + curvature * hold / 2`.
+    """Keep `h(x) >= 0` by `Lf h + Lg h u >= -alpha (h - margin)`.
 
     Best effort: a held control that is not flagged keeps `h >= 0` at the half and at the end of the hold
     (AnalyticPlant) or at every physics substep (MujocoPlant), for a plant and an integration that are right.
@@ -31,7 +31,6 @@ class Barrier(Constraint):
         gradient: Takes the state, returns dh/dx (n,). None differentiates by central differences.
         alpha: Decay gain in 1/s, at most `1 / hold`; or an extended class K function of h, in h units per second.
         margin: Reserve for errors of state, model and integration, in units of h.
-        curvature: Bound on -h'' while a control is held, in units of h per s^2.
 
     Source: appendix "Lie derivatives and forward invariance" and footnote 1.
     """
@@ -40,7 +39,6 @@ class Barrier(Constraint):
     gradient: Callable[[Array], ArrayLike] | None = None
     alpha: float | Callable[[float], float] = 1.0
     margin: float = 0.0
-    curvature: float = 0.0
 
     def __post_init__(self) -> None:
         if not callable(self.h):
@@ -58,7 +56,6 @@ class Barrier(Constraint):
         else:
             self.alpha = positive("alpha", self.alpha, "1/s")
         self.margin = non_negative("margin", self.margin, "units of h")
-        self.curvature = non_negative("curvature", self.curvature, "units of h per s^2")
 
     def bind(self, plant: Plant) -> "BoundBarrier":
         return BoundBarrier(self, plant)
@@ -107,9 +104,8 @@ class BoundBarrier(BoundConstraint):
         self._rounding = _ROUNDING * (abs(self._now) + max(map(abs, gradient.tolist()), default=0.0))
         room, alpha = self._now - self.spec.margin, self.spec.alpha
         decay = alpha(room) if callable(alpha) else alpha * room
-        bend = 0.5 * self.spec.curvature * self.plant.control_dt
         drift, effect = gradient @ self.plant.f, gradient @ self.plant.g
-        return HalfSpaces(-effect[None, :], np.array([drift + (decay - bend)]))
+        return HalfSpaces(-effect[None, :], np.array([drift + decay]))
 
     def slack(self, control: Array) -> float:
         """Not measured: whether a control is admitted is all that is known."""

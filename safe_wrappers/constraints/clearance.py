@@ -19,9 +19,8 @@ from safe_wrappers.control.backup.stopping import (
     approach_rows,
     approach_rows_of,
     approaches,
-    out_of_reach,
 )
-from safe_wrappers.control.numerics.nearest_discs import squashed
+from safe_wrappers.control.numerics.planar import squashed
 from safe_wrappers.drawing.marks import Mark, segment
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
@@ -90,9 +89,7 @@ class BoundClearance(BoundConstraint):
         super().__init__(spec, plant)
         named = {"body": spec.bodies, "site": spec.sites, "geom": spec.geoms}
         self._points = Points(plant, named, spec.position, spec.velocity)
-        self._none = HalfSpaces.none(plant.lower.size)
         self._still: Array | None = None
-        self._was_far = False  # a guess of what saves time
         if all(isinstance(o, Plain) and o.still for o in spec.obstacles):
             self._still = np.concatenate([o.surfaces(plant) for o in spec.obstacles])
             size = self._points.coordinates
@@ -112,31 +109,17 @@ class BoundClearance(BoundConstraint):
         if self._observed is None:
             plant, spec = self.plant, self.spec
             limits = plant.lower, plant.upper, plant.delay_s, plant.control_dt
-            machine = *limits, spec.radius, spec.braking, spec.state_error + spec.margin
-            self._observed = (self._far(machine) if self._was_far else None) or self._near(machine)
-            self._was_far = not self._observed[1].offsets.size
+            machine: Machine = *limits, spec.radius, spec.braking, spec.state_error + spec.margin
+            found = [
+                approach_rows(*self._surfaces(p), v, drift, effect, machine)
+                if self._still is None
+                else approach_rows_of(self._still, p, v, drift, effect, machine)
+                for p, v, drift, effect in self._points.accelerations()
+            ]
+            parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
+            rooms, normals, offsets = parts
+            self._observed = rooms, HalfSpaces(normals, offsets)
         return self._observed
-
-    def _far(self, machine: Machine) -> tuple[Array, HalfSpaces] | None:
-        """The rooms where no control can matter; None: it may."""
-        if self._still is None or not self._points.of_machine:
-            return None
-        found = [out_of_reach(self._still, reach, machine) for reach in self._points.reaches()]
-        if not all(certain for _, certain in found):
-            return None
-        rooms = found[0][0] if len(found) == 1 else np.concatenate([rooms for rooms, _ in found])
-        return rooms, self._none
-
-    def _near(self, machine: Machine) -> tuple[Array, HalfSpaces]:
-        found = [
-            approach_rows(*self._surfaces(p), v, drift, effect, machine)
-            if self._still is None
-            else approach_rows_of(self._still, p, v, drift, effect, machine)
-            for p, v, drift, effect in self._points.accelerations()
-        ]
-        parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
-        rooms, normals, offsets = parts
-        return rooms, HalfSpaces(normals, offsets)
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""

@@ -289,17 +289,6 @@ class TrackedDiscs:
         variances = np.diagonal(covariances, axis1=-2, axis2=-1)
         return positions, self.sigmas * np.sqrt(np.maximum(variances, 0.0))
 
-    def distances(self, points: Array, plant: Plant) -> Array:
-        """Shape (k, n), m, at the present bound."""
-        tracks = self.tracks(plant)
-        d, n = tracks.coordinates, len(tracks.mean)
-        offsets = points[:, None, :d] - tracks.positions
-        shapes = np.tile(self.sigmas**2 * tracks.position_covariances, (len(points), 1, 1))
-        flat = offsets.reshape(-1, d)
-        if not (np.isfinite(flat).all() and np.isfinite(shapes).all()):
-            return np.full((len(points), n), np.nan)
-        return ellipsoid_gap(flat, shapes)[0].reshape(len(points), n) - self.radius
-
 
 def _deviation(covariances: Array, normal: Array) -> Array:
     """Standard deviations along the normals, shape (..., n)."""

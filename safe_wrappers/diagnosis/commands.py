@@ -94,10 +94,9 @@ def treatment_of_energy(env: Env, recording: Recording) -> Treatment:
         for name, given in (("uplink", env.uplink), ("downlink", env.downlink))
     }
     impedance = env.port.feedthrough or 1.0  # that of the coupling reflects least
-    inner = wrapped(TeleopChannel, advice, **link, coding="wave", impedance=impedance)
-    make = inner.wrap
-    assert make is not None
-    return Treatment(inner.code.replace("(env,", "(env.env,"), lambda outer: make(env.env), advice)
+    waves = {**link, "coding": "wave", "impedance": impedance}
+    code = wrapped(TeleopChannel, **waves).code.replace("(env,", "(env.env,")
+    return Treatment(code, lambda outer: TeleopChannel(outer.env, **waves), advice)
 
 
 STEPS = Symptom(

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
-from safe_wrappers.errors import UnknownNameError
-
 
 class Evidence(NamedTuple):
     """One measured number."""
@@ -104,11 +102,8 @@ class Diagnosis:
         return [finding for finding in self.findings if finding.present]
 
     def finding(self, symptom: str) -> Finding:
-        """That of one symptom."""
-        found = {finding.symptom: finding for finding in self.findings}
-        if symptom not in found:
-            raise UnknownNameError(f"no symptom {symptom!r} was looked for; there are {', '.join(found)}")
-        return found[symptom]
+        """That of one symptom; `KeyError` where it was not looked for."""
+        return {finding.symptom: finding for finding in self.findings}[symptom]
 
     def as_json(self) -> str:
         """All of it."""

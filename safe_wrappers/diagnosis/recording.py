@@ -56,7 +56,8 @@ def policy_driver(policy: Any) -> Driver:
             "policy is a function of the observation, or has predict(observation, deterministic=True); "
             f"got {policy!r}"
         )
-    return policy
+    driver: Driver = policy
+    return driver
 
 
 def box(env: Env) -> tuple[Array, Array]:

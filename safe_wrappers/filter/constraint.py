@@ -3,18 +3,17 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.nearest_discs import squashed
+from safe_wrappers.control.numerics.planar import squashed
 from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
-if TYPE_CHECKING:
-    from safe_wrappers.filter.constraint_batch import ConstraintBatch
 Promise = Literal["proved", "best effort"]
 Memory = Any
 """What a bound constraint keeps from one control step to the next; None if nothing."""
@@ -216,3 +215,39 @@ class BoundConstraint:
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys of its own, always the same; None: nothing was judged yet, or the state is not a number."""
         return {}
+
+
+class ConstraintBatch(ABC):
+    """The bound constraints of n envs with one action box; `BoundConstraint.batch` makes it.
+
+    It gives the same controls, bit for bit, as the constraints one by one.
+    """
+
+    @abstractmethod
+    def restart(self, env: int, memory: Memory) -> None:
+        """Take an env's new episode, or the memory that its own constraint was left with."""
+
+    @abstractmethod
+    def memory(self, env: int) -> Memory:
+        """What the constraint of an env remembers, as its own `start` and `executed` give it."""
+
+    @abstractmethod
+    def decide(
+        self, proposals: Array, judged: NDArray[np.bool_], controls: Array
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """Take every env's present state and decide.
+
+        Args:
+            proposals: Inside the action box, shape (n, m); rows with NaN get an arbitrary answer.
+            judged: Which envs to decide, shape (n,).
+            controls: Written for those: what to execute, exact in the action space's dtype, shape (n, m). An admitted
+                proposal is written as it is.
+
+        Returns:
+            The smallest h of each, shape (n,), NaN if one is not a number; and the `Stage` that found each control,
+            shape (n,). Stage.FALLBACK: none was found, decide this env by its own constraint.
+        """
+
+    @abstractmethod
+    def executed(self, envs: NDArray[np.bool_]) -> None:
+        """Remember that the decisions for these envs, shape (n,), are executed; they are among those decided."""

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from safe_wrappers.checks import Array
+from safe_wrappers.control.numerics.projection import load_solvers
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
-from safe_wrappers.filter.projection import load_solvers
 from safe_wrappers.filter.search import Decision, SafeActionSearch
 from safe_wrappers.plants.plant import Plant
 

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, float_array
+from safe_wrappers.control.numerics.projection import box_least_squares
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import BoundConstraint
-from safe_wrappers.filter.projection import box_least_squares
 from safe_wrappers.plants.plant import Plant
 
 FallbackFunction = Callable[[Plant], ArrayLike]

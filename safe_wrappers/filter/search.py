@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
-from safe_wrappers.filter.fallback import Fallback
-from safe_wrappers.filter.projection import (
+from safe_wrappers.control.numerics.projection import (
     Projection,
     Status,
     cast_inside,
     keeps_rows,
     project_unchecked,
 )
+from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
+from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.plants.plant import Plant
 
 Rows = tuple[Array, Array]
@@ -357,3 +357,17 @@ def _joined(first: Rows, second: Rows) -> Rows:
     if not second[1].size:
         return first
     return np.concatenate([first[0], second[0]]), np.concatenate([first[1], second[1]])
+
+
+class DiscreteSearch(SafeActionSearch):
+    """The first candidate that every constraint admits, else what violates least; nothing lies between actions."""
+
+    def _search(self, proposal: Array, strict: Rows, last: Array) -> Decision:
+        least = self.least_violation(self._fallback_control(None, last), strict)
+        return Decision(least, Stage.LEAST_VIOLATION, fallback=True, infeasible=True)
+
+    def unreadable(self, last: Array) -> Decision:
+        """The last action goes on, as there is no zero, unless the fallback is the user's own."""
+        if self._fallback.custom:
+            return super().unreadable(last)
+        return Decision(last, Stage.FALLBACK, fallback=True)

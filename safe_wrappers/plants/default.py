@@ -8,7 +8,7 @@ import gymnasium as gym
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.displacement import DisplacementPlant
-from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
+from safe_wrappers.plants.mujoco.binding import moves_by_displacement
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.simulator.plant import SimulatorPlant

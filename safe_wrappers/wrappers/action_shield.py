@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import numbers_of, shown
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.filter.discrete import DiscreteSearch
 from safe_wrappers.filter.fallback import FallbackFunction
+from safe_wrappers.filter.search import DiscreteSearch
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.layer import Env, Step

@@ -13,7 +13,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.control.contact.impact import complementarity_residuals
-from safe_wrappers.control.legged.support_distances import support_distances
+from safe_wrappers.control.legged.support import support_distances
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.contacts import (
     ContactForecast,
@@ -24,7 +24,7 @@ from safe_wrappers.plants.mujoco.contacts import (
 )
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.replay import Replay
-from safe_wrappers.plants.queries.momentum import MomentumReader
+from safe_wrappers.plants.queries.floating_base import MomentumReader
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
 
@@ -300,7 +300,7 @@ class _Robot:
             raise UnsupportedEnvError(f"no body {which} can touch the fixed world with friction")
         self._massive = np.flatnonzero(moving)
         self.contacts = ContactReader(model)
-        self.momentum = MomentumReader(model, self._massive)
+        self.momentum = MomentumReader(model, self._own)
 
     def weight_n(self) -> float:
         """Now: an env may change masses."""

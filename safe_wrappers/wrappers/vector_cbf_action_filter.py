@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.filter.constraint_batch import ConstraintBatch
+from safe_wrappers.filter.constraint import Constraint, ConstraintBatch
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.plant import Plant

@@ -5,7 +5,6 @@ import pytest
 
 import safe_wrappers as sw
 from benchmarks.cases import HARD, PROTECTED
-from benchmarks.descriptions import constrained, promised, reserve
 from benchmarks.judges import Reported, Worst
 from safe_wrappers.constraints.limits.joints import scalar_joints
 from safe_wrappers.recipes import RECIPES
@@ -127,44 +126,3 @@ def test_drivers_are_deterministic_by_seed_and_inside_the_box(name):
         assert np.array_equal(first, actions(driver, 5)), driver
         if driver in BLIND:
             assert any(not np.array_equal(first, actions(driver, seed)) for seed in (6, 7, 8)), driver
-
-
-TABLE = "inside (-0.2, -1.2, -0.3) to (0.9, 0.15, 0.4) m"
-DISCS = "hazard_positions (0.2 m) and vase_positions (0.3 m)"
-
-
-@pytest.mark.parametrize("name, words, promise, margin", [
-    ("SafePointGoal2-v0", f"stopping path clear of {DISCS}", "proved", "4 mm"),
-    ("SafeCarGoal1-v0", "on all the way to rest, centre clear of hazard_positions (0.2 m)", "proved", "5 mm"),
-    ("SafeCarGoal2-v0", "on all the way to rest, centre clear of hazard_positions (0.2 m) and outline clear of "
-     "vase_positions (0.1415 m)", "proved", "5 mm"),
-    ("InvertedPendulum-v5, on after the fall",
-     "cart clear of the end at -0.95 m and the end at 0.95 m, with room to brake", "best effort", "10 mm"),
-    ("Reacher-v5", "joint speeds below 5 rad/s", "best effort", "0.01 rad/s"),
-    ("Pusher-v5", f"joint speeds below 6 rad/s; tips_arm {TABLE}", "best effort", "0.05 rad/s, 5 mm"),
-    ("SafeHumanoidVelocity-v0", "speed of the centre of mass (xy) below 1.4149 m/s", "best effort", "0.02 m/s"),
-    ("PointMaze_UMaze-v3", "braking path clear of the walls", "proved", "1 mm"),
-    ("OccludedCrossing-v0", "a way out clear of tracking (0.4 m and 3 sigma) and pillar_positions (0.35 m)",
-     "best effort", "50 mm"),
-    ("PatrolledPointMaze-v0", "braking path clear of the walls; a way out clear of tracking (0.15 m and 3 sigma)",
-     "best effort", "1 mm, 30 mm"),
-    ("SafeRover-v0", "slip of 4 wheels within 0.15", "best effort", "0"),
-    ("AdroitHandDoor-v1", "speeds of 27 joint(s) below 10 rad/s; speeds of 1 joint(s) below 1 m/s", "best effort",
-     "0.1 rad/s, 0.02 m/s"),
-    ("Reacher-v5, with a disc",
-     "joint speeds below 5 rad/s; fingertip clear of a disc of 0.05 m at (-0.1, 0.1) m", "best effort",
-     "0.01 rad/s, 1 mm"),
-])  # fmt: skip
-def test_a_filter_in_words(name, words, promise, margin):
-    case = CASES[name]
-    env = case.protect(make(case))
-    assert (constrained(env), promised(env), reserve(env)) == (words, promise, margin)
-
-
-def test_every_constraint_of_a_case_has_words():
-    for case in CASES.values():
-        if "Maze" not in case.env_id:
-            words = constrained(case.protect(case.make()))
-            assert "sw." not in words and not any(
-                word in words for word in ("Limit", "Clearance", "Workspace")
-            )

@@ -114,24 +114,6 @@ def test_a_reach_that_is_broken_is_dropped_with_a_warning():
     assert constraint.max_decrease is None
 
 
-def test_what_stands_still_is_forecast_once():
-    env, constraint, plant = bound([[0.212, 0.0]])
-    for _ in range(40):
-        env.unwrapped.step(NONE)
-    plant.observe()
-    constraint.admits(FULL)
-    run, calls = constraint.coasting.run, []
-    constraint.coasting.run = lambda *arguments: calls.append(arguments) or run(*arguments)
-    env.unwrapped.step(NONE)
-    plant.observe()
-    answer = constraint.admits(FULL)
-    assert not calls
-    env.unwrapped._hazards[:] += 0.5  # it still stands, but the hazard has gone
-    plant.observe()
-    assert constraint.admits(FULL) and not answer
-    assert calls
-
-
 def test_from_inside_it_drives_out():
     options = {"keep_out": [sw.constraints.Discs("hazard_positions", 0.2)], "robot_model_attr": "robot_model"}
     env = sw.CBFActionFilter(gym.make("SafeCarGoal1-v0"), [sw.constraints.CoastingClearance(**options)])
@@ -156,19 +138,6 @@ def test_the_value_is_what_coasting_leaves(gap, speed_up):
         plant.observe()
         left = min(least_way(env, NONE, hazard) - 0.2, gap)
         assert constraint.value() == pytest.approx(left, abs=1e-3)
-
-
-def test_a_detour_leads_around():
-    """Blind drive at a hazard a little off the middle: without a detour it stands in front of it."""
-    reached = {}
-    for detour in (True, False):
-        env, _, _ = bound([[0.8, 0.02]], detour=detour)
-        for _ in range(200):
-            raw = env.unwrapped
-            bearing = -raw.agent_heading  # keep to the heading 0
-            env.step(np.clip(0.02 * np.array([1 + 2 * bearing, 1 - 2 * bearing]), 0, 1).astype(np.float32))
-        reached[detour] = env.unwrapped.agent_position[0]
-    assert reached[False] < 0.62 and reached[True] > 1.2
 
 
 def test_from_inside_the_best_way_out_is_admitted_and_the_way_in_is_not():

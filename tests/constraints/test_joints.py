@@ -104,22 +104,6 @@ def test_joints_that_are_tied_to_driven_ones_are_not_left_out(tmp_path, equality
     assert str(caught.value).endswith("joints=['crank', 'rod', 'rocker', 'loose']")
 
 
-LEG = """
-<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body name="trunk" pos="0 0 .5"><freejoint/>
-  <geom size=".1" mass="1"/><body name="leg"><joint name="hip" range="-1 1" limited="true" axis="0 1 0"/>
-  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.4"/><body pos="0 0 -.4">{ankle}
-  <geom name="foot" size=".05"/></body></body></body></worldbody>
-  <tendon><fixed name="t">{tendon}</fixed></tendon>
-  <actuator><motor joint="hip" ctrlrange="-1 1"/>{motor}</actuator></mujoco>
-"""
-ANKLE = '<joint name="ankle" range="-1 1" limited="true" axis="0 1 0"/>'
-LEGS = {
-    "tendon": (ANKLE, '<joint joint="ankle" coef="1"/>', '<motor tendon="t" ctrlrange="-1 1"/>'),
-    "ball": ('<joint name="ankle" type="ball" range="0 1" limited="true"/>', '<joint joint="hip" coef="1"/>',
-             '<motor joint="ankle" gear="0 1 0" ctrlrange="-1 1"/>'),
-}  # fmt: skip
-
-
 class Leg(MujocoEnv):
     """A trunk on a leg; the ankle's actuator is not on a hinge."""
 
@@ -135,6 +119,27 @@ class Leg(MujocoEnv):
     def step(self, action):
         self.do_simulation(action, self.frame_skip)
         return np.zeros(1), 0.0, False, False, {}
+
+
+# JointSpeedLimit: adversarial closed loops judged at every physics substep on the env's own data
+
+
+LEG = """
+<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body name="trunk" pos="0 0 .5"><freejoint/>
+  <geom size=".1" mass="1"/><body name="leg"><joint name="hip" range="-1 1" limited="true" axis="0 1 0"/>
+  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.4"/><body pos="0 0 -.4">{ankle}
+  <geom name="foot" size=".05"/></body></body></body></worldbody>
+  <tendon><fixed name="t">{tendon}</fixed></tendon>
+  <actuator><motor joint="hip" ctrlrange="-1 1"/>{motor}</actuator></mujoco>
+"""
+
+ANKLE = '<joint name="ankle" range="-1 1" limited="true" axis="0 1 0"/>'
+
+LEGS = {
+    "tendon": (ANKLE, '<joint joint="ankle" coef="1"/>', '<motor tendon="t" ctrlrange="-1 1"/>'),
+    "ball": ('<joint name="ankle" type="ball" range="0 1" limited="true"/>', '<joint joint="hip" coef="1"/>',
+             '<motor joint="ankle" gear="0 1 0" ctrlrange="-1 1"/>'),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", LEGS)
@@ -153,9 +158,6 @@ def test_stops_that_would_not_be_guarded_are_refused(tmp_path, kind, contacts):
     with pytest.raises(ConfigurationError, match="Name those that you mean") as caught:
         sw.CBFActionFilter(Leg(path), [sw.constraints.JointSpeedLimit(3.0)])
     assert listed(caught) == [["hip"], ["ankle"]]
-
-
-# JointSpeedLimit: adversarial closed loops judged at every physics substep on the env's own data
 
 
 class SpeedJudge:

@@ -105,22 +105,6 @@ def test_whole_numbers_are_one_action_of_many_parts_or_several_of_one():
     np.testing.assert_array_equal(one.filter.bound[0].backup(), [0.0, 2.0])
 
 
-def test_the_survivor_of_the_last_step_is_asked_first():
-    calls = []
-
-    def named(name, action):
-        return lambda observation: calls.append(name) or [action]
-
-    constraint = shield(backup=[named("go", 1.0), named("stop", -1.0)], terminal=None, horizon=12)
-    found = asked(constraint, (WALL - 0.8, 1.0))
-    assert found.admits(np.zeros(1)) and calls[0] == "go" and calls[-1] == "stop"
-    found.executed(np.zeros(1))
-    found.plant.observe()
-    calls.clear()
-    found.admits(np.array([-1.0]))
-    assert set(calls) == {"stop"}  # it survives: nobody else is asked
-
-
 @pytest.mark.parametrize(
     ("backup", "expected"),
     [("zero", 0.0), ("hold", 0.5), (np.array([-0.25]), -0.25), (lambda o: [-0.75], -0.75)],
@@ -278,22 +262,6 @@ def test_functions_may_see_a_view():
     same = asked(shield(), (WALL - 0.66, 1.0))
     for u in np.linspace(-1, 1, 21):
         assert found.admits(np.array([u])) == same.admits(np.array([u]))
-
-
-def test_margin_and_max_decrease():
-    assert asked(shield(margin=0.5), (0.0, 0.0)).slack(np.zeros(1)) == pytest.approx(4.5)
-    env = sw.CBFActionFilter(Cart(), [shield()], margin=0.25)
-    assert env.constraints[0].margin == 0.25
-    counted = []
-    far = asked(shield(h=lambda o: counted.append(o) or wall(o), max_decrease=2.0, terminal=None))
-    assert far.admits(np.ones(1)) and len(counted) == 1
-    reserved = asked(
-        shield(h=lambda o: counted.append(o) or wall(o), max_decrease=2.0, margin=0.5), (2.8, 0.0)
-    )
-    counted.clear()
-    assert reserved.admits(np.zeros(1)) and len(counted) == 2
-    near = asked(shield(h=lambda o: counted.append(o) or wall(o), max_decrease=2.0), (3.5, 0.0))
-    assert near.admits(np.zeros(1)) and len(counted) > 2
 
 
 @pytest.mark.parametrize(

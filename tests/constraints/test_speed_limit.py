@@ -171,27 +171,6 @@ def test_a_speed_that_is_kept_only_to_be_exceeded_next_is_refused_now():
     assert admitted == {1: [True, True], 2: [True, False], 3: [False, False]}
 
 
-def test_under_a_delay_only_the_predicted_states_count():
-    env = sliders(range_="-20 20")
-    plant = sw.MujocoPlant(delay_s=0.1)
-    limit = sw.constraints.SpeedLimit(1.0, direction="x", horizon=1)
-    filtered = sw.CBFActionFilter(env, [limit], plant=plant)
-    filtered.reset(seed=0)
-    fastest = 0.0
-    queue = [0.0, 0.0]
-    for k in range(60):
-        position = float(env.data.qpos[0])
-        filtered.filter.observe()
-        assert filtered.filter.bound[0].room(plant.forecast(np.zeros(1))).shape == (1, 1)
-        decision = filtered.filter.filter(np.array([20.0 * (-1.0) ** (k // 20)]))
-        filtered.filter.executed(decision.control)
-        queue.append(float(decision.control[0]))
-        env.step(np.array([queue.pop(0)]))  # it acts 0.1 s after it was sent
-        fastest = max(fastest, abs(env.data.qpos[0] - position) / 0.05)
-        assert not decision.infeasible
-    assert 0.98 < fastest <= 1.0 + 1e-9
-
-
 # Closed loops, and forecasts that are spared ------------------------------------------------------------------
 
 

@@ -11,7 +11,6 @@ from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import BoundConstraint
 
 LEGS = [(x, y) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
 FRICTION = 0.8
@@ -159,33 +158,6 @@ def test_joints_are_predicted_to_stay_in_range():
             stance.plant.observe()
             answers.append(stance.admits(np.zeros(4)))
         assert answers == [fits, True]
-
-
-class Refusing(sw.Constraint):
-    """Refuses a large first control, before `Stance` is asked."""
-
-    def bind(self, plant):
-        return BoundRefusing(self, plant)
-
-
-class BoundRefusing(BoundConstraint):
-    predicts = True
-
-    def admits(self, control):
-        return bool(abs(control[0]) < 0.9)
-
-
-def test_behind_a_constraint_that_refuses_first_it_offers_the_programs_answer():
-    env = table()
-    env.reset()
-    filtered = sw.CBFActionFilter(env, [Refusing(), sw.constraints.Stance(0.3, **STANCE)])
-    filtered.reset()
-    for _ in range(60):
-        filtered.step(np.zeros(4))
-    expected = whole_program(env, np.array([1.0, 1.0, -1.0, -1.0]), 0.3, 8, 0.05)
-    info = filtered.step(np.array([1.0, 1.0, -1.0, -1.0]))[4]
-    np.testing.assert_allclose(info["executed_action"], expected, atol=1e-4)
-    assert not flagged(info) and info["cbf/refused"].all()
 
 
 @pytest.mark.parametrize("env_id", ["Humanoid-v5", "Ant-v5", "HalfCheetah-v5"])

@@ -105,20 +105,6 @@ def test_a_wheel_in_the_air_keeps_the_ground_speed():
     assert before is env.constraints[0]
 
 
-def test_a_wheel_that_is_braked_locked_is_let_go():
-    """Locked at 3 m/s on ice by the state: outside the limit, and back inside as fast as the drives can."""
-    env = rover()
-    env.reset(seed=0, options={"layout": OPEN | {"ground": "ice", "speed": 3.0}})
-    raw = env.unwrapped
-    qvel = raw.data.qvel.copy()
-    qvel[raw.wheel_dofs] = 0.0
-    raw.set_state(raw.data.qpos.copy(), qvel)
-    infos = [env.step(-FULL)[4] for _ in range(30)]
-    assert (infos[0]["executed_action"][:4] == 1.0).all()
-    assert np.abs(infos[12]["slip"]).max() < 0.12
-    assert not any(info["cbf/infeasible"] for info in infos)
-
-
 def test_a_policy_that_is_not_finite_is_braked_for_within_the_limit():
     env = rover()
     env.reset(seed=0, options={"layout": OPEN | {"ground": "wet", "speed": 3.0}})
@@ -131,20 +117,6 @@ def test_a_policy_that_is_not_finite_is_braked_for_within_the_limit():
         with warnings.catch_warnings(action="ignore"):
             env.step(np.full(5, np.nan, dtype=np.float32))
     assert abs(env.unwrapped.forward_speed) < 0.02
-
-
-def test_in_one_list_with_others():
-    env = gym.make("SafeRover-v0", max_episode_steps=100_000)
-    wheels = list(env.unwrapped.wheels)
-    both = sw.CBFActionFilter(
-        env, [sw.constraints.Traction(wheels), sw.constraints.JointSpeedLimit(8.0, joints=wheels, margin=0.5)]
-    )
-    infos = drive(both, FULL, 200)
-    assert max(info["slip_max"] for info in infos) < 0.16
-    # Its forecast holds the tyres' forces as they are, which the margin has to cover.
-    assert not any(info["cbf/unsafe"] for info in infos)
-    assert (both.unwrapped.data.qvel[both.unwrapped.wheel_dofs] > 6.0).all()
-    assert infos[-1]["slip/ratio"].shape == (4,)
 
 
 # Other vehicles: MuJoCo's own friction, wheels as cylinders, one actuator for two wheels ---------------------------

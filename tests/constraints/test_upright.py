@@ -91,16 +91,6 @@ def test_an_upright_robot_is_left_alone_bit_for_bit():
     check_inactive("Humanoid-v5", sw.constraints.Upright("torso", lowest=-5.0, tilt=np.pi), 0.4, 15)
 
 
-def test_a_fall_that_nothing_stops_is_infeasible():
-    env = Scene(BOX)
-    env.start = [0.0, 0.0, 1.02, 1.0, 0.0, 0.0, 0.0, 0.0], np.zeros(7)
-    filtered = sw.CBFActionFilter(env, [sw.constraints.Upright("box", lowest=1.0, horizon=2)])
-    filtered.reset(seed=0)
-    info = filtered.step(np.array([0.3]))[4]
-    assert info["cbf/infeasible"] and info["cbf/refused"].all() and not info["cbf/unsafe"]
-    assert np.isfinite(info["executed_action"]).all()
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 from asking import asked
-from judged_loops import DRIVERS, Judge, Scene, check_inactive, drive, flagged
+from judged_loops import DRIVERS, Scene, check_inactive, drive
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
@@ -145,30 +145,6 @@ def test_far_inside_the_actions_pass_bit_for_bit():
         [-9.0] * 3, [9.0] * 3, [sw.constraints.Sphere([9.0, 0.0, 0.0], 1.0)], bodies=["tips_arm"]
     )
     check_inactive("Pusher-v5", limit, 2.0, 30)
-
-
-def test_from_inside_an_obstacle_it_goes_out():
-    disc = sw.constraints.Disc([0.21, 0.0], 0.04)  # Reacher starts with its arm along x, the tip at 0.21
-    filtered = sw.CBFActionFilter(
-        gym.make("Reacher-v5"), [sw.constraints.Workspace(keep_out=[disc], bodies=["fingertip"], horizon=10)]
-    )
-    raw = filtered.unwrapped
-    judge = Judge(
-        filtered, lambda model, data: np.linalg.norm(data.body("fingertip").xpos[:2] - [0.21, 0.0]) - 0.04
-    )
-    with pytest.warns(sw.UnsafeStateWarning):
-        filtered.reset(seed=0)
-        qpos = raw.data.qpos.copy()
-        qpos[:2] = [0.1, -0.05]
-        raw.set_state(qpos, np.zeros(4))
-        rooms = [judge.at(raw.data)]
-        assert rooms[0] < -0.01
-        for _ in range(60):
-            least, end, _, info = judge.step(filtered, np.array([0.0, 0.02], np.float32))
-            assert least >= min(rooms[-1], 0.0) - 1e-6 or flagged(info)
-            rooms.append(end)
-    assert np.argmax(np.array(rooms) >= -1e-6) in range(1, 25)
-    assert rooms[-1] >= -1e-6
 
 
 # Plain data, and what is refused ------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ CONSTRAINTS = [
     of.CoastingClearance([DISC], [of.Discs("vases", 0.1)], SQUARE, "car", "model", 0.01, 20, 0.1, 0.5, True),
     of.ContactFeasibility(0.6, 0.02, ["torso"], 0.01),
     of.EscapeClearance("robot", [OBSTACLES[5], DISCS, OBSTACLES[3]], 0.2, 0.1, 2.0),
-    of.HeadingDriveClearance([of.Discs("hazards", 0.2)], "robot", 0.004, 0.01, 0.1, False, True),
+    of.HeadingDriveClearance([of.Discs("hazards", 0.2)], "robot", 0.004, 0.01, 0.1, True),
     of.ImpactSpeedLimit(["body1"], ["sideE"], None, "hands and fingers", True, 1e4, 1.0, 4),
     of.ImpactSpeedLimit(["fingertip"], ["sideE"], force_limit=100.0, stiffness=1e4),
     of.JointPositionLimit([-1.0, -math.inf], 2.0, ["joint1", "joint0"], 0.1, 7, 0.5),
@@ -38,7 +38,7 @@ CONSTRAINTS = [
     of.SingularityMargin(
         0.003, body="fingertip", directions="xy", joints=["joint0", "joint1"], margin=0.1, max_decrease=2.0
     ),
-    of.SingularityMargin(geom="tip", rotations="z", length=0.2, task_speed=0.1, rate_limit=6.0, horizon=7),
+    of.SingularityMargin(geom="tip", task_speed=0.1, rate_limit=6.0, horizon=7),
     of.SingularityMargin(0.003, site="grip"),
     of.SpeedLimit(1.5, "torso", "-x", "substep", 0.1, 4, 0.7, 0.6, True),
     of.Stance(0.6, "exact", 0.2, 0.02),

@@ -58,11 +58,3 @@ def test_relative_degree_does_not_depend_on_the_units_of_h_and_of_the_control(sc
     assert relative_degree(lambda x: scale * (1.0 - x[0]), drift, effect, [0.3, 0.2]) is None
     assert relative_degree(lambda x: scale * np.cos(x[0]), drift, effect, [0.3, 0.2]) is None
     assert relative_degree(lambda x: scale, drift, effect, [0.3, 0.2]) is None
-
-
-def test_an_uncontrollable_state_has_none():
-    drift = lambda x: np.array([-x[0], x[1]])  # noqa: E731
-    effect = lambda x: np.array([[0.0], [1.0]])  # noqa: E731
-    assert relative_degree(lambda x: 1.0 - x[0], drift, effect, [0.3, 0.2]) is None
-    assert relative_degree(lambda x: 1.0, drift, effect, [0.3, 0.2]) is None
-    assert relative_degree(lambda x: 1.0 - x[0], *chain(3), [0.1, 0.2, 0.3], max_degree=2) is None

@@ -5,9 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.numerics.conic_program import Program, by_clarabel, by_daqp
-
-FREE = np.full(3, np.inf)
+from safe_wrappers.control.legged.whole_body_program import Program, by_clarabel, by_daqp
 
 
 def nearest(point, **parts):
@@ -88,28 +86,3 @@ def test_what_has_no_answer_is_said_to_have_none():
     one_only = contradictory.softened(1)  # the second row stays: y >= 1
     for found in (by_daqp(one_only), by_clarabel(one_only)):
         assert found.y == pytest.approx([1.0, 2.0], abs=1e-6)
-
-
-def test_what_is_not_finite_is_no_answer():
-    poisoned = nearest([np.nan, 0.0], rows=np.ones((1, 2)), limits=np.zeros(1))
-    assert by_daqp(poisoned).y is None
-    assert by_clarabel(poisoned).y is None
-
-
-@given(st.integers(0, 100))
-def test_given_the_first_unknowns_the_others_are_what_they_were(seed):
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(5, 5))
-    rows = rng.normal(size=(4, 5))
-    program = Program(
-        root @ root.T + np.eye(5), rng.normal(size=5), rows, rng.uniform(0.1, 1.0, 4), -np.ones(5), np.ones(5),
-        rng.normal(size=(1, 3, 5)) * 0.2, np.array([[1.0, 0.0, 0.0]]),
-    )  # fmt: skip
-    whole = by_clarabel(program)
-    assert whole.y is not None
-    rest = by_clarabel(program.with_first(whole.y[:2]))
-    assert rest.y == pytest.approx(whole.y[2:], abs=1e-5)
-    scaled, scale = program.scaled()
-    assert scaled.hessian.diagonal() == pytest.approx(np.ones(5))
-    assert by_clarabel(program.softened(2)).y is not None
-    assert scale.shape == (5,)

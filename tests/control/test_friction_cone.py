@@ -23,19 +23,6 @@ def unit(v):
     return np.array(v) / np.linalg.norm(v)
 
 
-@pytest.mark.parametrize("degrees", [0.0, 10.0, 30.0, 60.0])
-@pytest.mark.parametrize("friction", [0.2, 0.7, 1.5])
-def test_a_block_on_a_slope_uses_the_tangent_of_its_angle(degrees, friction):
-    slope = math.radians(degrees)
-    normal = np.array([-math.sin(slope), 0.0, math.cos(slope)])
-    holds = np.array([0.0, 0.0, 9.81 * 2.0])  # what keeps 2 kg at rest
-    along, rest = normal_and_tangential(holds, normal)
-    assert along == pytest.approx(19.62 * math.cos(slope))
-    assert np.linalg.norm(rest) == pytest.approx(19.62 * math.sin(slope))
-    missed = 19.62 * (math.sin(slope) - friction * math.cos(slope))
-    assert cone_excess(holds, normal, friction) == pytest.approx(max(missed, -19.62 * math.cos(slope)))
-
-
 @given(directions, directions)
 def test_tangents_are_a_right_handed_frame(normal, first):
     n = unit(normal)

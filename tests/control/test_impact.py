@@ -88,15 +88,6 @@ def test_braking_that_starts_at_the_peak_or_later_is_too_late(v, m, k, a):
     assert (np.diff(falling) < 0.0).all() and (falling > 0.0).all() and (falling < 1.0).all()
 
 
-def test_what_recedes_counts_as_at_rest():
-    v = np.array([-3.0, 0.0])
-    for found in (peak_force(v, 2.0, 1e4), braked_deflection(v, 2.0, 1e4, 5.0)):
-        np.testing.assert_array_equal(found, 0.0)
-    np.testing.assert_array_equal(attenuation_after_delay(v, 2.0, 1e4, 5.0, 0.0), 0.0)
-    # A push on a spring at rest goes twice as deep as it would rest.
-    np.testing.assert_allclose(pushed_peak_force(v, 2.0, 1e4, 10.0), 20.0)
-
-
 def test_springs_and_masses_in_series():
     assert in_series(2.0, np.inf) == pytest.approx(2.0) and in_series(np.inf, np.inf) == np.inf
     k = np.array([40e3, 15e3, 8e3])  # under one force the deflections add up

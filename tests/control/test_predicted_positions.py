@@ -1,14 +1,11 @@
 """Joint ranges kept until the end of a step, against parabolas looked at everywhere."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.legged.predicted_positions import largest_acceleration, predicted_position_rows
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.control.legged.whole_body_problem import largest_acceleration, predicted_position_rows
 
 
 def top(speed, acceleration, horizon):
@@ -64,31 +61,3 @@ def test_rows_name_the_right_joints_and_leave_unlimited_ones_out():
     assert limits == pytest.approx(np.array(expected))
     nothing, none = predicted_position_rows(np.zeros(0, int), [], [], [], [], 0.1, 4)
     assert nothing.shape == (0, 4) and none.shape == (0,)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"horizon_s": 0.0}, "horizon_s"),
-        ({"horizon_s": math.inf}, "horizon_s"),
-        ({"positions": [math.nan]}, "positions must be finite"),
-        ({"dofs": [3]}, "indices from 0 to 2"),
-        ({"dofs": [-1]}, "indices"),
-        ({"dofs": [0.5]}, "indices"),
-        ({"lower": [2.0]}, "lower must not exceed"),
-        ({"lower": [math.nan]}, "lower must not exceed"),
-        ({"upper": [1.0, 2.0]}, "one shape"),
-    ],
-)
-def test_bad_input_is_refused(change, said):
-    given_input = {
-        "dofs": [0],
-        "positions": [0.0],
-        "velocities": [0.0],
-        "lower": [-1.0],
-        "upper": [1.0],
-        "horizon_s": 0.1,
-        "nv": 3,
-    }
-    with pytest.raises(ConfigurationError, match=said):
-        predicted_position_rows(**(given_input | change))

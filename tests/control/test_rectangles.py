@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.numerics.rectangles import apart, closer, gaps, merged, nearest
+from safe_wrappers.control.numerics.planar import apart, closer, gaps, merged, nearest
 
 NUMBERS = st.floats(-3.0, 3.0).map(lambda x: round(x, 3))
 SIDES = st.lists(NUMBERS, min_size=2, max_size=2, unique=True).map(sorted)
@@ -79,10 +79,3 @@ def test_merged_covers_the_same_cells_and_nothing_else(cells, size):
         for j in range(6):
             centre = ((i + 0.5) * size, (j + 0.5) * size)
             assert any(from_point(centre, r) == 0.0 for r in joined) == ((i, j) in cells)
-
-
-def test_a_row_of_cells_becomes_one_rectangle_and_a_frame_four():
-    row = [(float(i), i + 1.0, 0.0, 1.0) for i in range(7)]
-    assert merged(row) == [(0.0, 7.0, 0.0, 1.0)]
-    frame = [(float(i), i + 1.0, float(j), j + 1.0) for i in range(5) for j in range(5) if {i, j} & {0, 4}]
-    assert len(merged(frame)) == 4

@@ -1,7 +1,5 @@
 """The slip ratio, and the window of a slip limit."""
 
-import math
-
 import mujoco
 import numpy as np
 import pytest
@@ -114,15 +112,3 @@ def test_the_observer_reads_the_mean_of_a_force_that_changes():
         rate += 0.002 / 0.05 * (1.0 - 0.1 * force)
     found = wheel.traction(response, np.array([3.0]), np.array([rate]), np.array([1.0]))
     assert found[0] == pytest.approx(forces.mean())
-
-
-@pytest.mark.parametrize(
-    ("constants", "says"),
-    [
-        ((0.0, 0.05, 0.0), "radius must be finite and > 0 m"),
-        ((math.nan, 0.05, 0.0), "radius"),
-    ],
-)
-def test_bad_constants_are_refused(constants, says):
-    with pytest.raises(ConfigurationError, match=says):
-        Wheel(*(np.array([c]) for c in constants))

@@ -10,10 +10,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from safe_wrappers.control.estimation.dead_reckoning import (
     centre_acceleration,
+    from_sensor,
     lever_arm_acceleration,
+    lever_arm_velocity,
     rigid_transform,
+    to_sensor,
 )
-from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError
 
 SPINNING = """

@@ -6,41 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from oracles import margin_inside, support_margin
-from scipy.spatial import ConvexHull
+from oracles import support_margin
 
-from safe_wrappers.control.legged.support import common_plane, plane, support_polygon, support_rows
+from safe_wrappers.control.legged.support import Plane, common_plane, support_rows
 from safe_wrappers.errors import ConfigurationError
 
 UP = np.array([0.0, 0.0, 1.0])
-GROUND = plane([0.0, 0.0, 0.0], UP)
+GROUND = Plane(np.zeros(3), UP, np.eye(3)[:2])
 CORNERS = np.array([[0.2, 0.1, 0.0], [-0.2, 0.1, 0.0], [-0.2, -0.1, 0.0], [0.2, -0.1, 0.0]])
-flat_points = st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=3, max_size=12)
-
-
-@given(flat_points)
-def test_the_polygon_is_the_convex_hull(points):
-    given_points = np.array(points)
-    centred = given_points - given_points.mean(axis=0)
-    assume(np.linalg.svd(centred, compute_uv=False)[-1] > 1e-3)
-    polygon = support_polygon(given_points)
-    hull = ConvexHull(given_points)
-    x, y = polygon.T
-    area = 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())  # positive: anticlockwise
-    assert area == pytest.approx(hull.volume, abs=1e-9)
-    margins = [margin_inside(p, polygon) for p in given_points]
-    assert min(margins) > -1e-9
-
-
-def test_a_grid_has_four_corners():
-    grid = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), axis=-1).reshape(-1, 2) * 0.1
-    assert sorted(map(tuple, support_polygon(grid).round(12))) == [(0, 0), (0, 0.2), (0.2, 0), (0.2, 0.2)]
-
-
-def test_a_line_or_a_point_of_support_has_no_third_corner():
-    line = support_polygon([[0.0, 0.0], [1.0, 0.0], [0.5, 0.0]])
-    assert line.tolist() == [[0.0, 0.0], [1.0, 0.0]]
-    assert support_polygon([[1.0, 1.0], [1.0, 1.0]]).tolist() == [[1.0, 1.0]]
 
 
 def test_contacts_at_several_heights_have_no_common_plane():
@@ -63,7 +36,6 @@ def test_contacts_at_several_heights_have_no_common_plane():
     assert shared.normal == pytest.approx(slope)
     within = CORNERS + np.array([0.004, 0.0, 0.0, 0.0])[:, None] * UP
     assert common_plane(within, normals) is not None
-    assert common_plane(within, normals, tolerance_m=0.001) is None
 
 
 @given(
@@ -78,7 +50,7 @@ def test_rows_on_the_forces_say_what_the_margin_says(pressures, sideways, inset,
     forces = np.concatenate([np.array(sideways), np.array(pressures)[:, None]], axis=1)
     assume(sum(pressures) > 0.1)
     margin = support_margin(points, np.tile(UP, (5, 1)), forces) - inset
-    excess = (support_rows(points, plane([0.0, 0.0, 0.0], UP), inset) @ forces.ravel()).max()
+    excess = (support_rows(points, GROUND, inset) @ forces.ravel()).max()
     # In newtons times metres over newtons: the inside margin itself.
     if margin >= 0.0:
         assert -excess / sum(pressures) == pytest.approx(margin, abs=1e-9)
@@ -86,21 +58,15 @@ def test_rows_on_the_forces_say_what_the_margin_says(pressures, sideways, inset,
         assert excess > 0.0 or margin > -1e-12
 
 
-def test_a_line_allows_no_pressure_once_an_inset_is_asked_for():
-    ground = plane([0.0, 0.0, 0.0], UP)
-    rows = support_rows(CORNERS[:2], ground, 0.05)
-    assert (rows @ np.tile(UP, (2, 1)).ravel()).max() > 0.0
-    assert (rows @ np.zeros(6)).max() <= 0.0
-    assert (support_rows(CORNERS[:2], ground, 0.0) @ np.tile(UP, (2, 1)).ravel()).max() <= 0.0
+def test_a_line_of_support_has_no_rows():
+    assert support_rows(CORNERS[:2], GROUND, 0.05) is None
+    assert support_rows(np.array([CORNERS[0], CORNERS[2], np.zeros(3)]), GROUND, 0.05) is None
 
 
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: support_polygon(np.zeros((0, 2))), "at least one"),
-        (lambda: support_polygon(np.zeros((3, 3))), "shape"),
         (lambda: support_rows(CORNERS, GROUND, math.nan), "inset"),
-        (lambda: plane([0, 0, 0], [0, 0, 2]), "length 1"),
         (lambda: common_plane(np.zeros((2, 2)), np.zeros((2, 2))), "shape"),
     ],
 )

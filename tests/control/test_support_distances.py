@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from oracles import support_margin
 
 from safe_wrappers.control.contact.friction_cone import tangents
-from safe_wrappers.control.legged.support_distances import support_distances
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.control.legged.support import support_distances
 
 UP = np.array([0.0, 0.0, 1.0])
 CORNERS = np.array([[0.2, 0.1, 0.0], [-0.2, 0.1, 0.0], [-0.2, -0.1, 0.0], [0.2, -0.1, 0.0]])
@@ -87,27 +86,3 @@ def test_as_one_by_one(seed, instants, contacts, coarse, rough):
     np.testing.assert_allclose(
         support_distances(instant, points, normals, forces), expected, rtol=1e-6, atol=1e-9
     )
-
-
-def test_instants_beyond_what_fits_in_memory_at_once_give_the_same():
-    rng = np.random.default_rng(0)
-    instants, each = 70, 40
-    instant = np.repeat(np.arange(instants), each)
-    points = np.column_stack([rng.uniform(-1.0, 1.0, (instant.size, 2)), np.zeros(instant.size)])
-    normals, forces = np.tile(UP, (instant.size, 1)), np.outer(rng.uniform(0.0, 1.0, instant.size), UP)
-    whole = support_distances(instant, points, normals, forces)
-    alone = [
-        support_distances(instant[s], points[s], normals[s], forces[s])
-        for s in (slice(i, i + each) for i in range(0, instant.size, each))
-    ]
-    assert whole.shape == (instants,)
-    np.testing.assert_array_equal(whole, np.concatenate(alone))
-
-
-def test_bad_input_is_refused_in_words():
-    with pytest.raises(ConfigurationError, match=r"expected instants \(n,\) and points \(n, 3\)"):
-        support_distances(np.zeros(3), CORNERS, UPRIGHT, UPRIGHT)
-    with pytest.raises(ConfigurationError, match=r"expected instants"):
-        support_distances(np.zeros(4), CORNERS[:, :2], UPRIGHT[:, :2], UPRIGHT[:, :2])
-    with pytest.raises(ConfigurationError, match="forces must be finite"):
-        support_distances(np.zeros(4), CORNERS, UPRIGHT, np.full((4, 3), np.nan))

@@ -206,10 +206,6 @@ def test_a_simulation_that_diverges_is_found_though_mujoco_resets_it():
     assert finding.present and finding.figure == math.inf and not finding.code
     assert finding.evidence[0].value >= 1.0 and "timestep" in finding.advice
     assert json.loads(Diagnosis("x", 60, [], [finding]).as_json())["findings"][0]["present"] is True
-    with pytest.raises(
-        UnknownNameError, match="no symptom 'limits' was looked for; there are contact_forces"
-    ):
-        Diagnosis("x", 60, [], [finding]).finding("limits")
 
 
 class Model:

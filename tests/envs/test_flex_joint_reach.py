@@ -7,16 +7,16 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from oracles import damping_ratios
-from scipy.stats import kstest
-
-from benchmarks.flexible_joint import (
+from flexible_joint import (
     manifold,
     resonances,
     smoothstep_energy,
     step_energies,
     torque_slew_limit,
 )
+from oracles import damping_ratios
+from scipy.stats import kstest
+
 from safe_wrappers.envs import FLEX_JOINT_REACH_ID, REACH_EPISODE_STEPS
 from safe_wrappers.envs.flex_joint_reach import SUCCESS_RADIUS, TORQUE_RATING
 from safe_wrappers.errors import ActionError, ConfigurationError

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import safe_wrappers as sw
-from benchmarks.patrol_drivers import corridor, patrol_seeking
-from benchmarks.tracked import patrolled
+from benchmarks.cases import patrolled
+from benchmarks.drivers import corridor, patrol_seeking
 from safe_wrappers.envs import PATROLLED_MAZE_ID
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 

@@ -29,19 +29,6 @@ for k in range(300):
 print(changed > 0, sorted(ready() - before))
 """
 
-HYPOT = """
-import itertools, time
-from safe_wrappers.control.numerics.compiled import compiled, hypot
-
-@compiled
-def of_a_user(x):
-    return x + 1.0
-
-time.monotonic = itertools.count(step={step}).__next__  # a clock that this machine's speed does not change
-of_a_user(1.0)
-hypot(3.0, 4.0), hypot(3, 4)
-"""
-
 
 def run(script, *arguments, **environment):
     command = [sys.executable, "-c", script, *arguments]
@@ -63,10 +50,3 @@ def test_no_later_step_of_a_vector_env_compiles():
     script = script.replace("env.reset(seed=0)", "env.reset(seed=0), env.step(0.0 * env.action_space.high)")
     script = script.replace('["cbf/intervened"]', '["cbf/intervened"].sum()')
     assert run(script, "SafePointGoal1-v0")[0] == "True []"
-
-
-@pytest.mark.parametrize(("step", "lines"), [(0, 0), (3, 1)])
-def test_a_long_wait_for_the_compiler_is_told_once(step, lines, tmp_path):
-    told = run(HYPOT.format(step=step), NUMBA_CACHE_DIR=str(tmp_path))[1].splitlines()
-    assert len(told) == lines
-    assert all("compiling for this machine" in line for line in told)

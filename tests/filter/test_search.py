@@ -70,13 +70,6 @@ def test_an_admitted_proposal_is_executed_bit_for_bit():
     assert decision.stage is Stage.PROPOSAL and not decision.changed and decision.refused is None
 
 
-def test_rows_alone_are_projected_on():
-    decision = decide((1.0, 0.5), LEFT, Rows(((0.0, 1.0), 0.2)))
-    keeps(decision, 0.0, 0.2)
-    assert decision.stage is Stage.ROWS and decision.changed and not decision.fallback
-    assert decision.refused.tolist() == [True, True]
-
-
 def test_rows_that_a_prediction_admits_are_not_guessed_at():
     # The proposal is refused by rows alone: the guess of what predicts does not count.
     decision = decide((1.0, 0.5), LEFT, Predicting(lambda u: 1.0, guess=[((1.0, 0.0), -0.5)]))
@@ -130,14 +123,6 @@ def test_a_candidate_keeps_the_rows_and_every_prediction():
     assert search(Predicting(only(), candidates=candidates)).candidate(np.ones(2), NONE) is None
 
 
-def test_any_constraint_may_have_the_candidate():
-    decision = decide(
-        (1.0, 1.0), Predicting(lambda u: 0.5 - u[0]), Predicting(lambda u: 1.0, candidates=[(0.2, 1.0)])
-    )
-    keeps(decision, 0.2, 1.0)
-    assert decision.stage is Stage.CANDIDATE
-
-
 # Linearising anew -------------------------------------------------------------------------------------------------
 
 
@@ -159,18 +144,6 @@ def test_and_not_seven_times():
     assert not admitted and len(rows[1]) == 6
     np.testing.assert_allclose(control, [0.4, 1.0])
     assert decide((1.0, 0.5), found).infeasible
-
-
-def test_what_cannot_be_linearised_ends_it():
-    admitted, control, rows = search(Predicting(only())).relinearize(np.ones(2), np.ones(2), NONE, NONE)
-    assert not admitted and not rows[1].size
-    np.testing.assert_array_equal(control, [1.0, 1.0])
-
-
-def test_only_those_that_refuse_are_linearised():
-    right = Predicting(lambda u: 0.5 + u[0], tangents=lambda u: [((-1.0, 0.0), -0.9)])
-    decision = decide((1.0, 0.5), creeping(lambda u: 0.8001 - u[0]), right)
-    keeps(decision, 0.8, 0.5)
 
 
 def test_tangents_that_are_no_numbers_end_it():
@@ -212,31 +185,6 @@ def test_a_fallback_that_is_admitted_is_shortened_before_it_is_executed():
     )
     keeps(decision, 0.475, 0.5)  # by 5 % of the violation beyond the boundary
     assert decision.stage is Stage.BLEND and not decision.fallback
-
-
-def test_where_room_is_not_in_proportion_it_goes_halfway():
-    asked = []
-
-    def slack(u):
-        asked.append(float(u[0]))
-        return 1.0 if u[0] <= 0.2 else -0.1
-
-    found = search(Predicting(slack)).shorten(np.ones(2), np.array([-1.0, 1.0]), NONE)
-    # By the secant a tenth of the way, then half of what is left, then half of that.
-    assert set(np.round(asked, 9)) == {1.0, -1.0, 0.8, -0.1, 0.35}
-    assert found[0] == pytest.approx(-0.1)
-
-
-def test_a_correction_that_cannot_be_shortened_by_much_is_not_tried_again():
-    asked = []
-
-    def slack(u):
-        asked.append(float(u[0]))
-        return 0.02 - u[0]
-
-    control = np.array([0.0, 1.0])
-    assert search(Predicting(slack)).shorten(np.ones(2), control, NONE) is control
-    assert set(asked) == {1.0, 0.0}
 
 
 def test_what_is_shortened_keeps_the_rows():
@@ -372,12 +320,6 @@ def test_blend_leaves_one_component(component):
     assert found[component] == 1.0 and found[other] == -1.0
 
 
-def test_blend_keeps_the_rows():
-    strict = np.array([[1.0, 0.0]]), np.array([-0.4])
-    np.testing.assert_allclose(search(Predicting(lambda u: 1.0)).blend(np.ones(2), -np.ones(2), strict), -0.5)
-    assert search(Predicting(only())).blend(np.ones(2), -np.ones(2), NONE) is None
-
-
 # The fallback and the least violation -----------------------------------------------------------------------------
 
 
@@ -421,13 +363,6 @@ def test_the_least_violation_keeps_the_rows():
     decision = decide((1.0, 0.0), Predicting(lambda u: u[0] - 2.0), LEFT)
     keeps(decision, 0.0, 0.0)
     assert decision.infeasible
-
-
-def test_what_was_tried_is_forgotten_after_the_decision():
-    worse = [1.0]
-    found = search(Predicting(lambda u: -1.0 + worse[0] * 0.1 * u[0]))
-    assert found.decide(np.array([1.0, 0.0]), LAST).control[0] == 1.0
-    assert found.decide(np.array([0.5, 0.0]), LAST).control[0] == 0.5
 
 
 # What the wrapper reports -----------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 
 PENDULUM = """
 <mujoco><compiler autolimits="true"/><option timestep="0.005"/><worldbody>
@@ -75,65 +74,6 @@ def test_a_filter_keeps_a_limit_of_a_machine_two_levels_down(env):
     assert 1.9 < fastest <= 2.0 and changed
 
 
-def test_how_long_a_step_lasts_is_not_guessed():
-    with pytest.raises(UnsupportedEnvError, match=r"how long a step lasts.*MujocoPlant\(control_dt=\.\.\.\)"):
-        nested_plant(control_dt=None).bind(Nested())
-    env = Nested()
-    env.frame_skip = 7  # may be a count of somebody else's steps
-    with pytest.raises(UnsupportedEnvError, match="how long a step lasts"):
-        nested_plant(control_dt=None).bind(env)
-    env.dt = 0.02
-    plant = nested_plant(control_dt=None)
-    plant.bind(env)
-    assert plant.substeps == 4
-    with pytest.raises(
-        ConfigurationError, match=r"is 8 physics steps of 0\.005 s, but .* takes 4 with one action"
-    ):
-        nested_plant(control_dt=0.04).bind(env)
-    with pytest.raises(ConfigurationError, match=r"not a whole number of physics steps of 0\.005 s: 4\.2"):
-        nested_plant(control_dt=0.021).bind(Nested())
-    with pytest.raises(ConfigurationError, match="control_dt"):
-        nested_plant(control_dt=-0.02).bind(Nested())
-    with pytest.raises(ConfigurationError, match="takes 2 with one action: leave control_dt out"):
-        sw.MujocoPlant(control_dt=0.5).bind(gym.make("Reacher-v5"))
-
-
-@pytest.mark.parametrize(
-    ("changed", "says"),
-    [
-        (
-            {"model": lambda env: env.sim.model},
-            r"returns its mujoco\.MjModel; of .* it returned types.SimpleNamespace",
-        ),
-        ({"data": lambda env: None}, r"returns its mujoco\.MjData; of .* it returned builtins\.NoneType"),
-        ({"model": None}, r"MujocoPlant\(model=\.\.\.\) is a function"),
-        ({"data": None}, r"MujocoPlant\(data=\.\.\.\) is a function"),
-        ({"model": 3}, "model is a mujoco.MjModel or a function"),
-        ({"data": mujoco.MjData(mujoco.MjModel.from_xml_string(PENDULUM))}, "data is a function of the env"),
-    ],
-)
-def test_functions_that_do_not_find_them(changed, says):
-    with pytest.raises(ConfigurationError, match=says):
-        nested_plant(**changed).bind(Nested())
-
-
-def test_an_env_without_a_model_is_told_of_the_functions():
-    with pytest.raises(UnsupportedEnvError, match=r"say where it keeps them: MujocoPlant\(model=lambda env"):
-        sw.MujocoPlant().bind(Nested())
-
-
-def test_a_model_of_the_filter_s_own_goes_with_a_function_for_the_data():
-    env = gym.make("Reacher-v5")
-    heavy = mujoco.MjModel.from_xml_string(PENDULUM)
-    with pytest.raises(ConfigurationError, match="the env's joints and actuators"):
-        sw.MujocoPlant(heavy, data=lambda raw: raw.data, control_dt=0.02).bind(env)
-    plant = sw.MujocoPlant(env.unwrapped.model, data=lambda raw: raw.data)
-    plant.bind(env)
-    env.reset(seed=0)
-    plant.observe()
-    assert np.array_equal(plant.qpos, env.unwrapped.data.qpos) and plant.substeps == 2
-
-
 class FromDmControl(gym.Env):
     """A user's own env around one of dm_control's."""
 
@@ -195,21 +135,3 @@ def test_a_step_of_a_dm_control_task_is_its_forecast(task, scale):
     plant = dm_plant(env, lambda raw: raw.inner)
     assert (plant.action_map is None) == (scale == 1.0)
     assert missed(env, plant, env.physics.data.ptr) <= 1e-9  # 0.0 with dm_control 1.0.44 and MuJoCo 3.11
-
-
-def test_a_dm_control_task_through_shimmy():
-    suite = pytest.importorskip("dm_control.suite")
-    shimmy = pytest.importorskip("shimmy.dm_control_compatibility")
-    env = shimmy.DmControlCompatibilityV0(suite.load("reacher", "easy", task_kwargs={"random": 0}))
-    assert missed(env, dm_plant(env, lambda raw: raw._env), env._env.physics.data.ptr) <= 1e-9
-    limit = sw.constraints.JointSpeedLimit(limit=4.0, margin=0.05)
-    plant = sw.MujocoPlant(
-        model=lambda raw: raw._env.physics.model.ptr, data=lambda raw: raw._env.physics.data.ptr
-    )
-    filtered = sw.CBFActionFilter(env, [limit], plant=plant)
-    filtered.reset(seed=0)
-    fastest = 0.0
-    for _ in range(200):
-        filtered.step(env.action_space.high)
-        fastest = max(fastest, float(np.abs(env._env.physics.data.qvel).max()))
-    assert 3.5 < fastest <= 4.0

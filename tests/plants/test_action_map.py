@@ -8,12 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 from asking import bound
-from hypothesis import given
-from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.mujoco.action_map import ActionMap, duplicate
 
 HANDS = ["HandReach-v3", *(f"AdroitHand{task}-v1" for task in ("Door", "Hammer", "Pen", "Relocate"))]
 MACHINE = """
@@ -140,45 +137,6 @@ def test_acceleration_and_acting_range_are_those_of_the_twin_in_other_units(serv
         np.testing.assert_allclose(longer, plain.forecast(control, 3).path, atol=1e-12)
 
 
-def test_brakes_of_a_forecast_are_no_stronger_than_actions():
-    env = Machine(scale=[0.1, 0.2], offset=[0.0, -0.5])
-    env.data.qvel[:] = [5.0, 5.0]
-    plant = bound(env)
-    plant.observe()
-    action = np.array([0.3, 0.3])
-    path = plant.forecast(action, 2).path
-    env.step(action)
-    plant.observe()
-    env.step(plant.braking())
-    assert (np.abs(plant.braking()) <= 1.0).all()
-    np.testing.assert_allclose(path[-1], env.observed(), atol=1e-12)
-
-
-def test_an_action_beyond_the_control_range_does_not_act():
-    env = Machine(scale=[6.0, 1.5], offset=[0.5, -0.5])  # half of the actions saturate the motor
-    plant = bound(env)
-    plant.observe()
-    low, high = plant.acting_range
-    np.testing.assert_allclose([low, high], [[-0.5, -1.0], [0.5, 1.0]], atol=1e-12)
-
-
-def test_commands_on_their_way_are_actions():
-    env = Machine()
-    env.reset(seed=0)
-    plant = bound(env, delay_s=0.05)
-    actions = np.random.default_rng(1).uniform(-1.0, 1.0, (3, 2))
-    plant.executed(None)
-    start = duplicate(env)
-    for action in actions:
-        plant.executed(action)
-    plant.observe()
-    start.data.ctrl[:] = OFFSET + SCALE * actions[0]  # half of its time has passed
-    mujoco.mj_step(start.model, start.data, 2)
-    for action in actions[1:]:
-        start.step(action)
-    np.testing.assert_allclose(plant.state, start.observed(), atol=1e-12)
-
-
 @pytest.mark.parametrize(
     "constraint",
     [
@@ -258,13 +216,6 @@ def test_what_is_no_map_is_refused(env, says):
         bound(env)
 
 
-def test_more_actions_than_controls_are_refused():
-    env = Machine()
-    env.action_space = gym.spaces.Box(-1.0, 1.0, (3,), np.float64)
-    with pytest.raises(UnsupportedEnvError, match="not one action for each control"):
-        bound(env)
-
-
 def test_a_map_may_be_given_and_is_tried_where_that_can_be_done():
     assert np.array_equal(bound(Machine(), action_map=(OFFSET, SCALE)).action_map.scale, SCALE)
     assert np.array_equal(bound(Frozen(), action_map=(OFFSET, -2)).action_map.scale, [-2.0, -2.0])
@@ -290,59 +241,3 @@ def test_a_map_may_be_given_and_is_tried_where_that_can_be_done():
 def test_what_reads_controls_off_the_model_is_refused(constraint):
     with pytest.raises(UnsupportedEnvError, match="needs actions that are the model's controls"):
         sw.CBFActionFilter(Machine(), [constraint])
-
-
-def test_a_lease_does_not_take_other_units_for_setpoints():
-    with pytest.raises(ConfigurationError, match="in other units than the lengths of the actuators"):
-        budget = sw.StoppingBudget(lambda env: 1.0, braking=1.0, acceleration=1.0)
-        sw.LeaseExpiry(Machine(), budget, fallback="zero", motion_limits={"max_acceleration": 1.0})
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_probe_that_diverges_says_nothing_of_the_actions():
-    """MuJoCo then resets the state, and the control with it."""
-    wide = {"push": "", "low": [-1e10, -2.0], "high": [1e10, 1.0]}
-    assert bound(Machine(0.0, 1.0, **wide)).action_map is None
-    np.testing.assert_allclose(bound(Machine(0.0, [2.0, 1.0], **wide)).action_map.scale, [2.0, 1.0])
-    with pytest.raises(UnsupportedEnvError, match=r"in 102 of 102 steps its simulation diverged"):
-        bound(Machine([9e9, 0.0], [1e-3, 1.0], push='ctrlrange="-1e10 1e10"'))
-
-
-class MovedWall(Machine):
-    """Every episode has its wall elsewhere."""
-
-    def reset(self, *, seed=None, options=None):
-        found = super().reset(seed=seed)
-        self.model.body("wall").pos[0] = 0.25
-        mujoco.mj_forward(self.model, self.data)
-        return found
-
-
-def test_the_plant_follows_what_a_reset_places_anew():
-    env = MovedWall()
-    plant = bound(env)
-    version = plant.model_version
-    env.reset(seed=0)
-    plant.executed(None)
-    assert plant.model_version == version + 1
-    env.data.qvel[0] = 3.0
-    for _ in range(10):  # it hits the wall
-        plant.observe()
-        end = plant.forecast(np.array([-1.0, 0.0])).path[-1]
-        env.step(np.array([-1.0, 0.0]))
-        assert np.array_equal(end, env.observed())
-    assert env.data.qpos[0] < 0.1 and env.data.ncon
-    plant.executed(None)
-    assert plant.model_version == version + 1
-
-
-numbers = st.floats(-100.0, 100.0)
-
-
-@given(numbers, st.floats(1e-3, 1e3), st.booleans(), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
-def test_a_map_and_its_inverse_cancel(offset, scale, negative, one, other):
-    found = ActionMap(offset, -scale if negative else scale, np.full(1, -1.0), np.full(1, 1.0))
-    first, last = (found.control(np.array([a])) for a in sorted((one, other)))
-    np.testing.assert_allclose(found.action(first), min(one, other), atol=1e-9)
-    low, high = found.actions_between(np.minimum(first, last), np.maximum(first, last))
-    np.testing.assert_allclose([low[0], high[0]], sorted((one, other)), atol=1e-9)

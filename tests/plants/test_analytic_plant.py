@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError
 
 PENDULUM = {
     "f": lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
@@ -41,15 +41,6 @@ def test_pendulum_state_f_and_g():
             before[1] + 0.05 * (plant.f + plant.g @ u)[1], abs=1e-12
         )
     assert isinstance(plant, sw.Plant)
-
-
-def test_bounds_default_to_the_action_space_and_broadcast():
-    env = gym.make("Pendulum-v1")
-    env.reset(seed=0)
-    plant = plant_on(env)
-    np.testing.assert_array_equal([plant.lower, plant.upper], [[-2.0], [2.0]])
-    plant = plant_on(env, lower=-1.0, upper=[0.5])
-    np.testing.assert_array_equal([plant.lower, plant.upper], [[-1.0], [0.5]])
 
 
 class Slow(gym.Env):
@@ -94,17 +85,6 @@ def test_a_step_of_unknown_length_is_asked_for_and_not_assumed():
             assert filtered.unwrapped.v[0] <= 1.5
 
 
-def test_the_envs_own_time_step_is_taken():
-    env = gym.make("Pendulum-v1")
-    assert plant_on(env, control_dt=None).control_dt == 0.05 == env.unwrapped.dt
-
-
-@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan])
-def test_a_senseless_time_step_of_the_env_is_refused(dt):
-    with pytest.raises(ConfigurationError, match="the env's dt must be a finite number > 0 in s"):
-        on_cart(Slow(dt=dt))
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -122,54 +102,6 @@ def test_a_senseless_time_step_of_the_env_is_refused(dt):
 def test_what_does_not_fit_is_refused(changes, message):
     with pytest.raises(ConfigurationError, match=message):
         plant_on(gym.make("Pendulum-v1"), **changes)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"f": lambda x: np.zeros(3)}, r"f must return the shape of the state \(2,\), got \(3,\)"),
-        ({"f": lambda x: 0.0}, r"f must return the shape of the state \(2,\), got \(\)"),
-        ({"g": lambda x: np.zeros(2)}, r"g must return shape .* \(2, 1\), got \(2,\)"),
-        ({"g": lambda x: np.zeros((2, 2))}, r"g must return shape .* \(2, 1\), got \(2, 2\)"),
-    ],
-)
-def test_wrong_shapes_are_named_when_they_are_first_asked_for(changes, message):
-    env = gym.make("Pendulum-v1")
-    env.reset(seed=0)
-    plant = plant_on(env, **changes)
-    plant.observe()
-    with pytest.raises(ConfigurationError, match=message):
-        _ = plant.f, plant.g
-
-
-def test_mountain_car_has_no_dt_so_any_hold_is_taken_at_its_word():
-    env = gym.make("MountainCarContinuous-v0")
-    env.reset(seed=0)
-    plant = plant_on(
-        env,
-        f=lambda x: np.array([x[1], -0.0025 * np.cos(3 * x[0])]),
-        g=lambda x: np.array([[0.0], [0.0015]]),
-        control_dt=1.0,
-    )
-    for _ in range(20):
-        plant.observe()
-        predicted = plant.state[1] + (plant.f + plant.g @ [1.0])[1]
-        env.step(np.ones(1, np.float32))
-        assert env.unwrapped.state[1] == pytest.approx(min(predicted, 0.07), abs=1e-7)
-
-
-def test_the_state_is_a_copy():
-    env = gym.make("Pendulum-v1")
-    env.reset(seed=0)
-    plant = plant_on(env)
-    plant.observe()
-    kept = plant.state
-    value = kept.copy()
-    env.step(np.ones(1, np.float32))
-    plant.observe()
-    np.testing.assert_array_equal(kept, value)
-    kept[:] = 9.0
-    assert not (env.unwrapped.state == 9.0).any()
 
 
 def test_integration_agrees_with_scipy():
@@ -217,17 +149,3 @@ def test_delay_of_whole_holds(delay):
 @pytest.mark.parametrize("delay", [0.02, 0.07, 0.13])
 def test_delay_of_fractions_of_a_hold(delay):
     delayed(delay, [0.3, -0.7, 1.0, 0.4])
-
-
-@pytest.mark.parametrize("sent", [0, 1])
-def test_delay_while_few_commands_have_been_sent(sent):
-    delayed(0.1, [0.3][:sent])
-
-
-def test_attributes_come_from_the_env():
-    env = gym.make("Pendulum-v1")
-    env.reset(seed=0)
-    plant = plant_on(env)
-    assert plant.attribute("max_torque") == 2.0
-    with pytest.raises(UnknownNameError, match=r"no attribute 'max_speeed'; it has: .*max_speed"):
-        plant.attribute("max_speeed")

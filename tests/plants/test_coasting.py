@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.queries.coasting import Coasting
 
 RADIUS = 0.22
@@ -64,25 +63,6 @@ def test_rest_is_rest():
         assert np.linalg.norm(long.places[k:] - course.places[-1], axis=1).max(initial=0.0) < 1e-3
 
 
-def test_too_few_holds_are_not_rest():
-    env, plant, coasting = car(0)
-    for _ in range(40):
-        env.step(np.ones(2))
-    plant.observe()
-    assert not coasting.run(np.ones(2), 2, RADIUS).rests
-    assert coasting.run(np.ones(2), 12, RADIUS).rests
-
-
-def test_start_and_speed_are_the_env_s():
-    env, plant, coasting = car(0)
-    gather_speed(env, plant, 30)
-    np.testing.assert_array_equal(coasting.start().places[0], env.agent_position)
-    linear, angular = env.data.qvel[:3], env.data.qvel[3:6]
-    expected = np.linalg.norm(linear[:2]) + 0.3 * np.linalg.norm(angular)
-    assert coasting.speed(0.3) == pytest.approx(expected)
-    np.testing.assert_array_equal(coasting.state(), np.r_[env.data.qpos, env.data.qvel])
-
-
 @pytest.mark.parametrize("level", [1, 2])
 def test_the_machine_alone_moves_as_in_the_whole_model(level):
     vases = [[5.0, float(i)] for i in range(1 if level == 1 else 10)]
@@ -105,31 +85,3 @@ def test_the_machine_alone_takes_over_what_the_plant_has_wrong_on_purpose():
     assert np.abs(right[:k] - wrong[:k]).max() > 5e-3
     whole = Coasting(plant, "agent").run(np.ones(2), 12, RADIUS).places
     np.testing.assert_allclose(wrong, whole, rtol=0, atol=1e-5)
-
-
-def stranger(first, second):
-    """Another machine; its motors are named from the second to the first."""
-    return mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="0.004"/>
-        <worldbody><body name="agent"><freejoint name="agent"/><geom size="0.1"/>
-        <body><joint name="wheel"/><geom size="0.1"/></body></body></worldbody>
-        <actuator><motor name="{second}" joint="wheel"/><motor name="{first}" joint="wheel"/></actuator>
-        </mujoco>"""
-    )
-
-
-def test_what_does_not_fit_is_refused():
-    _, plant, _ = car(1)
-    point = gym.make("SafePointGoal1-v0")
-    other = sw.MujocoPlant()
-    other.bind(point)
-    with pytest.raises(UnsupportedEnvError, match="must move freely"):
-        Coasting(other, "agent")
-    with pytest.raises(UnknownNameError, match="no body 'robot'"):
-        Coasting(plant, "robot")
-    with pytest.raises(ConfigurationError, match=r"physics steps of 0\.004 s, it has 0\.002 s"):
-        Coasting(plant, "agent", point.unwrapped.model)
-    with pytest.raises(ConfigurationError, match="the env's actuators, in their order"):
-        Coasting(plant, "agent", stranger("left", "right"))
-    with pytest.raises(UnknownNameError, match="no joint 'wheel'"):
-        Coasting(plant, "agent", stranger("right", "left"))

@@ -11,7 +11,6 @@ from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
 from safe_wrappers.plants.mujoco.replay import Replay
 
 ROBOTS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5")
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 class Legs(Scene):
@@ -203,47 +202,6 @@ def test_the_forces_are_those_that_move_the_robot(env_id):
     assert heaviest > 0.5 * weight
 
 
-@pytest.mark.parametrize(
-    "make", [lambda: gym.make("Ant-v5"), lambda: Legs("Euler"), lambda: gym.make("Hopper-v5")]
-)
-def test_asking_changes_nothing(make):
-    env, twin = make(), make()
-    plant, other = bound(env), bound(twin)
-    env.reset(seed=5), twin.reset(seed=5)
-    rng = np.random.default_rng(5)
-    nu = env.unwrapped.model.nu
-
-    def whole(raw):
-        state = np.zeros(mujoco.mj_stateSize(raw.model, int(STATE)))
-        mujoco.mj_getState(raw.model, raw.data, state, int(STATE))
-        return state.tobytes() + raw.data.efc_force.tobytes() + raw.data.xpos.tobytes()
-
-    def answers(p, u):
-        drift, effect = p.acceleration
-        return [
-            a.tobytes() for a in (p.f, p.g, drift, effect, p.state, p.forecast(u, 2).qpos, p.forward().xpos)
-        ]
-
-    for _ in range(12):
-        action, asked = rng.uniform(-0.4, 0.4, (2, nu))
-        plant.observe(), other.observe()
-        before = whole(env.unwrapped)
-        first = plant.contact_forecast(asked)
-        mine = answers(plant, asked)
-        under = plant.under(asked)
-        np.testing.assert_array_equal(under.ctrl, asked)
-        again = plant.contact_forecast(np.array(asked))
-        assert again is first  # kept until the next observation
-        plant.contact_forecast(action)
-        assert mine == answers(plant, asked) == answers(other, asked)
-        assert whole(env.unwrapped) == before
-        plant.observe()
-        fresh = plant.contact_forecast(asked)
-        assert all(np.array_equal(a, b) for a, b in zip(fresh, first, strict=True))
-        env.step(action), twin.step(action)
-        assert whole(env.unwrapped) == whole(twin.unwrapped)
-
-
 def test_what_moves_is_no_ground_and_either_geom_may_come_first():
     # The load lies on the trunk; the floor's geom comes before the legs' and the ledge's after them.
     ledge = '<body pos="0 0 .3"><geom name="ledge" type="box" size=".2 .2 .07"/></body>'
@@ -262,41 +220,6 @@ def test_what_moves_is_no_ground_and_either_geom_may_come_first():
             for b, z in zip(found.body, found.normal[:, 2], strict=True)
         }
     assert inside and ("trunk", 1.0) in seen and ("load", 1.0) not in seen
-
-
-def test_a_plant_with_other_masses_forecasts_its_own_contacts():
-    env = gym.make("HalfCheetah-v5")
-    plant = bound(env)
-    env.reset(seed=0)
-    for _ in range(50):
-        env.step(np.zeros(6))
-    plant.observe()
-    weight, right = plant.weight_n, plant.contact_forecast(np.zeros(6))
-    assert weight == pytest.approx(env.unwrapped.model.body_mass[1:].sum() * 9.81)
-    plant.perturb(mass=2.0)
-    assert plant.weight_n == pytest.approx(2.0 * weight)
-    wrong = plant.contact_forecast(np.zeros(6))
-    # At rest the ground carries the weight, whoever's it is.
-    assert right.force[right.step == 4, 2].sum() == pytest.approx(weight, rel=0.02)
-    assert wrong.force[wrong.step == 4, 2].sum() != pytest.approx(weight, rel=0.2)
-
-
-def test_under_a_delay_it_starts_where_the_commands_in_flight_lead():
-    env, twin = gym.make("Hopper-v5"), gym.make("Hopper-v5")
-    plant = bound(env, delay_s=env.unwrapped.dt)
-    env.reset(seed=2), twin.reset(seed=2)
-    rng = np.random.default_rng(2)
-    sent = rng.uniform(-1, 1, (20, 3))
-    plant.observe()
-    for k in range(1, 20):
-        plant.executed(sent[k - 1])
-        plant.observe()
-        found = plant.contact_forecast(sent[k])
-        twin.reset(seed=2)
-        for action in sent[:k]:
-            twin.unwrapped.step(action)
-        same(found, happened(twin.unwrapped, sent[k]))
-        env.unwrapped.step(sent[k - 1])
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])
@@ -348,25 +271,6 @@ def test_the_weaker_of_two_directions_counts_and_so_do_declared_pairs():
             frictions.setdefault(env.model.body(body).name, set()).add(friction)
         same(found, happened(env, np.zeros(2)))
     assert frictions["front"] - {0.6} == {0.3} and frictions["back"] == {0.6}
-
-
-def test_soft_things_that_move_are_no_ground():
-    cloth = """<flexcomp name="cloth" type="grid" count="4 4 1" spacing=".1 .1 .1" pos=".0 0 .5" radius=".01"
-      mass=".3" dim="2"><contact selfcollide="none"/></flexcomp>"""
-    env = Legs(more=cloth.replace('pos=".0 0 .5"', 'pos="0 0 .62"'))
-    plant = bound(env)
-    env.reset()
-    flexible = 0
-    for _ in range(25):
-        plant.observe()
-        found = plant.contact_forecast(np.zeros(2))
-        assert found.finite and (found.body > 0).all()
-        env.step(np.zeros(2))
-        soft = [c for c in env.data.contact if -1 in c.geom]
-        flexible += len(soft)
-        rigid = {env.model.body(b).name for b in found.body}
-        assert "load" not in rigid
-    assert flexible
 
 
 def names(model, found):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from dropped_ball import DroppedBall
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.mujoco.contacts import Contacts
 
 
@@ -83,34 +82,3 @@ def test_only_what_is_named_is_read():
     assert pairs(["puck", "box"]) == {(world, box), (hand, puck)}
     assert pairs(["puck", "box"], ["world"]) == {(world, box)}
     assert pairs(["ball"], ["box"]) == pairs(["ball"], ["ball"]) == set()
-
-
-def test_what_is_flexible_counts_as_everything_and_has_no_name():
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><geom type="plane" size="2 2 .1"/>
-        <flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".2 .2 .2" pos="0 0 .02" radius=".03"
-        mass="1"/></worldbody></mujoco>"""
-    )
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert data.ncon > 0 and (data.contact.geom == -1).any()
-    found = Contacts(model).read(data)
-    assert {c.bodies for c in found} == {(0, model.nbody)}
-    assert len(Contacts(model, None, ["world"]).read(data)) == len(found)
-    assert not Contacts(model, [model.body(1).name], [model.body(2).name]).read(data)
-
-
-@pytest.mark.parametrize(
-    ("given", "error", "said"),
-    [
-        ({"bodies": ["ball", "bal"]}, UnknownNameError, "bodies: .* no body 'bal'; it has: world, ball, box"),
-        ({"against": ["wall"]}, UnknownNameError, "against: .* no body 'wall'"),
-        ({"bodies": [3]}, ConfigurationError, "bodies is a list of names"),
-        ({"bodies": "ball"}, ConfigurationError, "bodies is a list of names"),
-        ({"bodies": 3}, ConfigurationError, "bodies is a list of names"),
-        ({"against": []}, ConfigurationError, "against is a list of names"),
-    ],
-)
-def test_names_that_cannot_be_meant_are_refused(given, error, said):
-    with pytest.raises(error, match=said):
-        Contacts(DroppedBall().model, **given)

@@ -1,7 +1,6 @@
 """Forecasts that brake by Euler steps, sketches, and forecasts in plain Python."""
 
 import copy
-import hashlib
 
 import gymnasium as gym
 import mujoco
@@ -71,15 +70,3 @@ def test_poses_published_by_euler_steps_do_not_lag():
     ends = own.poses(plant.substeps)
     moved = np.abs(np.diff(own.qpos, axis=0)).max()
     assert np.abs(own.published_frames - ends.frames).max() < 0.1 * moved
-
-
-def forecast_digest():
-    """Forecasts and sketches of two robots, to the last bit."""
-    digest = hashlib.sha256()
-    for env_id in ("Hopper-v5", "HalfCheetah-v5"):
-        _, plant = started(env_id)
-        for found in (plant.forecast(0.8 * plant.upper, 3, euler=True), plant.sketch(-0.3 * plant.upper, 2)):
-            for part in (found.path, found.published, found.poses(2).axes):
-                assert np.abs(part).max() > 0.0
-                digest.update(part.tobytes())
-    return digest.hexdigest()

@@ -1,24 +1,17 @@
 """Floating-base terms against MuJoCo: its forces, its subtree momentum, its motion over small steps."""
 
-import math
-
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 from asking import bound
-from oracles import in_cone, support_margin, zero_moment_point
+from oracles import in_cone
 
-from safe_wrappers.control.contact.friction_cone import friction_pyramid
 from safe_wrappers.control.legged.centroidal import centroidal_momentum
-from safe_wrappers.control.legged.support import common_plane
-from safe_wrappers.control.legged.whole_body import rigid_forces, solve_cone, solve_pyramid
+from safe_wrappers.control.legged.whole_body import solve_cone, solve_pyramid
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.queries.floating_base import (
-    contact_points,
-    equations_of_motion,
-)
+from safe_wrappers.plants.queries.floating_base import MomentumReader, contact_points, equations_of_motion
 
 ZOO = """
 <mujoco>
@@ -106,132 +99,6 @@ def test_they_hold_for_servos_limits_equalities_dry_friction_and_pushes_from_out
         assert not terms.contacts.friction.any()
 
 
-def test_the_bias_does_not_hang_on_the_control():
-    model, data = zoo()
-    one = equations_of_motion(model, data)
-    mujoco.mj_forward(model, data)
-    one = equations_of_motion(model, data)
-    no_dry_friction = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
-    own = np.zeros(model.nv)
-    mujoco.mj_mulJacTVec(model, data, own, np.where(no_dry_friction, 0.0, data.efc_force))
-    data.ctrl[:] = [0.7, -0.4]
-    mujoco.mj_forward(model, data)
-    other = equations_of_motion(model, data)
-    own_other = np.zeros(model.nv)
-    mujoco.mj_mulJacTVec(model, data, own_other, np.where(no_dry_friction, 0.0, data.efc_force))
-    # Only what other constraints give may differ.
-    assert one.bias + own == pytest.approx(other.bias + own_other, abs=1e-10)
-    assert one.actuation == pytest.approx(other.actuation)
-    assert one.actuation[6] == pytest.approx([3.0, 0.0])
-    assert one.actuation[7] == pytest.approx([0.0, 5.0])
-
-
-def test_torsional_and_rolling_friction_are_in_the_moments():
-    model, data = zoo("elliptic", 6)
-    mujoco.mj_forward(model, data)
-    contacts = contact_points(model, data)
-    assert np.abs(contacts.moments).max() > 1e-6
-    turning = np.zeros((len(contacts.points), 3, model.nv))
-    for row, (body, other) in enumerate(zip(contacts.pushed, contacts.pushed_by, strict=True)):
-        for which, sign in ((body, 1.0), (other, -1.0)):
-            jac = np.zeros((3, model.nv))
-            mujoco.mj_jac(model, data, None, jac, contacts.points[row], which)
-            turning[row] += sign * jac
-    terms = equations_of_motion(model, data)
-    right = terms.actuation @ data.ctrl + pushed(terms) + np.einsum("kiv,ki->v", turning, contacts.moments)
-    assert terms.inertia @ data.qacc + terms.bias == pytest.approx(right, abs=1e-8)
-
-
-def test_the_world_is_never_the_pushed_one_and_pairs_push_each_other():
-    model, data = zoo(settle=0.0)
-    data.qpos[[9, 10, 11]] = [0.0, 0.0, 1.14]  # the ball on the box, both in the air
-    data.qpos[2] = 1.0
-    mujoco.mj_forward(model, data)
-    contacts = contact_points(model, data)
-    assert len(contacts.points) == 1
-    assert {int(contacts.pushed[0]), int(contacts.pushed_by[0])} == {1, 4}
-    upwards = 1.0 if contacts.pushed[0] == 4 else -1.0
-    assert contacts.normals[0] == pytest.approx([0.0, 0.0, upwards])
-    assert contacts.gaps[0] == pytest.approx(-0.01)
-    # What pushes one way on the one pushes the other way on the other: no change of the sum.
-    of_the_centre = np.zeros((3, model.nv))
-    mujoco.mj_jacSubtreeCom(model, data, of_the_centre, 0)
-    force = np.linalg.solve(
-        equations_of_motion(model, data).inertia, pushed(equations_of_motion(model, data))
-    )
-    assert np.abs(force).max() > 1.0
-    assert of_the_centre @ force == pytest.approx(np.zeros(3), abs=1e-9)
-    # A geom of the world that comes second in MuJoCo's order is still the world.
-    slab = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><body pos='0 0 0.099'><freejoint/><geom type='sphere' size='0.1'/></body>"
-        "<geom type='box' size='1 1 0.1' pos='0 0 -0.1'/></worldbody></mujoco>"
-    )
-    resting = mujoco.MjData(slab)
-    mujoco.mj_forward(slab, resting)
-    assert slab.geom_bodyid[resting.contact.geom[0]].tolist() == [1, 0]  # MuJoCo's normal points down here
-    found = contact_points(slab, resting)
-    assert found.pushed.tolist() == [1] and found.pushed_by.tolist() == [0]
-    assert found.normals[0] == pytest.approx([0, 0, 1])
-    assert found.forces[0, 2] > 0.0
-
-
-def test_forces_are_what_mujocos_own_friction_allows(walker):
-    seen = 0
-    for plant in walker(40):
-        contacts = equations_of_motion(plant.model, plant.forward(), plant.actuators).contacts
-        assert in_cone(contacts.forces, contacts.normals, contacts.friction, 1e-6).all()
-        # Its pyramid, edge on its first tangent.
-        sides = friction_pyramid(contacts.normals, contacts.friction, 4, contacts.first_tangents)
-        assert (np.einsum("kei,ki->ke", sides, contacts.forces) <= 1e-6).all()
-        pressed = np.einsum("ki,ki->k", contacts.normals, contacts.forces)
-        sideways = np.linalg.norm(contacts.forces - pressed[:, None] * contacts.normals, axis=1)
-        seen += int((sideways > 0.1 * contacts.friction * pressed).sum())
-    assert seen > 5
-
-
-def relative_velocity(model, start, data, contacts, row):
-    """Of the two material points that touch at the start, wherever their bodies are now."""
-    total = np.zeros(3)
-    for body, sign in ((contacts.pushed[row], 1.0), (contacts.pushed_by[row], -1.0)):
-        local = start.xmat[body].reshape(3, 3).T @ (contacts.points[row] - start.xpos[body])
-        point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
-        jac = np.zeros((3, model.nv))
-        mujoco.mj_jac(model, data, jac, None, point, body)
-        total += sign * (jac @ start.qvel)
-    return total
-
-
-def test_a_drift_is_of_both_bodies_that_touch():
-    model, data = zoo(settle=0.0)
-    data.qpos[[2, 9, 10, 11]] = [1.0, 0.0, 0.0, 1.14]  # the ball on the box, both in the air
-    data.qvel[:] = np.random.default_rng(4).normal(size=model.nv) * 3.0
-    mujoco.mj_forward(model, data)
-    contacts = contact_points(model, data)
-    assert len(contacts.points) == 1 and contacts.pushed_by[0] > 0
-    moved = mujoco.MjData(model)
-    moved.qpos[:], dt = data.qpos, 1e-6
-    mujoco.mj_integratePos(model, moved.qpos, data.qvel, dt)
-    mujoco.mj_forward(model, moved)
-    before, later = (relative_velocity(model, data, d, contacts, 0) for d in (data, moved))
-    assert (later - before) / dt == pytest.approx(contacts.drift[0], abs=1e-3)
-    assert np.abs(contacts.drift).max() > 0.5
-
-
-def test_what_is_near_but_gives_no_force_is_no_contact():
-    near = 0
-    for margin in (0.0, 0.05):  # MuJoCo has changed from which distance on the gap counts
-        model = mujoco.MjModel.from_xml_string(
-            f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 0.11"><freejoint/>
-            <geom type="sphere" size="0.1" margin="{margin}" gap="0.05"/></body></worldbody></mujoco>"""
-        )
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        if data.nefc == 0 and data.ncon:
-            near += 1
-            assert contact_points(model, data).points.shape == (0, 3)
-    assert near
-
-
 def momentum(model, data):
     """Centroidal, from the bodies' Jacobians."""
     ids = [body for body in range(1, model.nbody) if model.body_mass[body] > 0.0]
@@ -240,15 +107,17 @@ def momentum(model, data):
         mujoco.mj_jacBodyCom(model, data, linear[row], angular[row], body)
     axes = data.ximat[ids].reshape(-1, 3, 3)
     inertias = np.einsum("nij,nj,nkj->nik", axes, model.body_inertia[ids], axes)
-    return centroidal_momentum(
-        model.body_mass[ids], data.xipos[ids], linear @ data.qvel, inertias, angular @ data.qvel
-    )
+    spins = np.einsum("nij,nj->ni", inertias, angular @ data.qvel)
+    return centroidal_momentum(model.body_mass[ids], data.xipos[ids], linear @ data.qvel, spins)
 
 
 def test_momentum_is_mujocos_subtree_momentum(walker):
     for plant in walker(20):
         model, data = plant.model, plant.forward()
         found = momentum(model, data)
+        read = MomentumReader(model, np.ones(model.nbody, dtype=bool)).read(data)
+        for mine, other in zip(read, found, strict=True):
+            np.testing.assert_allclose(mine, other, rtol=1e-9, atol=1e-9)
         mujoco.mj_subtreeVel(model, data)
         assert found.com == pytest.approx(data.subtree_com[0])
         assert found.linear == pytest.approx(found.mass * data.subtree_linvel[0])
@@ -275,69 +144,6 @@ def test_over_small_steps_the_momentum_changes_as_the_wrenches_say():
         assert change == pytest.approx(expected, abs=2e-2 + 1e-3 * np.abs(expected).max())
         compared += bool(world.any())
     assert compared > 50
-
-
-def stance(slope=0.0, friction=1.0):
-    """A settled 2 kg box on a plane that is tilted about y."""
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="0.002" gravity="{-9.81 * math.sin(slope)} 0 {-9.81 * math.cos(slope)}"/>
-        <worldbody><geom type="plane" size="5 5 1" friction="{friction} 0 0"/>
-        <body pos="0 0 0.0999"><freejoint/><geom type="box" size="0.2 0.15 0.1" mass="2" friction="{friction} 0 0"/>
-        </body></worldbody></mujoco>"""
-    )
-    data = mujoco.MjData(model)
-    for _ in range(1000):
-        mujoco.mj_step(model, data)
-    mujoco.mj_forward(model, data)
-    return model, data
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.1, 0.25])
-def test_a_box_on_a_slope_is_held_by_the_weight_it_has(slope):
-    _, data = model_and_data = stance(slope)
-    contacts = contact_points(*model_and_data)
-    total = contacts.forces.sum(axis=0)
-    assert total == pytest.approx([19.62 * math.sin(slope), 0, 19.62 * math.cos(slope)], abs=1e-3)
-    # Its weight's line meets the plane downhill of the middle, by h tan(slope) with h the height of the centre.
-    ground = common_plane(contacts.points, contacts.normals)
-    x = data.qpos[0] - data.qpos[2] * math.tan(slope)
-    zmp = zero_moment_point(contacts.points, contacts.forces, ground)
-    assert zmp[:2] == pytest.approx([x, 0.0], abs=1e-3)
-    margin = support_margin(contacts.points, contacts.normals, contacts.forces)
-    assert margin == pytest.approx(min(0.15, 0.2 - 0.1 * math.tan(slope)), abs=2e-3)
-
-
-def test_the_rigid_forces_of_a_standing_ant_are_its_weight_and_need_next_to_no_change():
-    env = gym.make("Ant-v5")
-    plant = bound(env)
-    env.reset(seed=0)
-    for _ in range(60):
-        env.step(np.zeros(8, np.float32))
-    plant.observe()
-    terms = equations_of_motion(plant.model, plant.forward(), plant.actuators)
-    c = terms.contacts
-    assert len(c.points) >= 3
-    problem = WholeBodyProblem(
-        terms.inertia, terms.bias, terms.actuation, c.jacobians, c.drift, c.normals, c.friction,
-        plant.lower, plant.upper, np.zeros(8),
-    )  # fmt: skip
-    forces, acceleration = rigid_forces(problem, np.zeros(8))
-    weight = 9.81 * plant.model.body_subtreemass[0]
-    assert forces[:, 2].sum() == pytest.approx(weight, rel=0.02)
-    assert forces[:, 2].sum() == pytest.approx(c.forces[:, 2].sum(), rel=0.02)
-    assert np.abs(acceleration[:3]).max() < 0.2
-    # Four rigid feet share the load in another way than soft ones, one beyond its friction: a thousandth of the
-    # torque is enough to share it as the ground can give it. MuJoCo 4.0's Runge-Kutta puts the ant down in another
-    # pose: there the shares are inside their cones as they are, but not inside the pyramids in these.
-    inside = mujoco.mj_version() >= 4_000_000
-    assert in_cone(forces, c.normals, c.friction, 1e-6).all() == inside
-    pyramid, cone = solve_pyramid(problem), solve_cone(problem)
-    assert (pyramid.status, cone.status) == ("solved", "inactive" if inside else "solved")
-    for found in (pyramid, cone):
-        assert np.abs(found.control).max() < 2e-3
-        assert in_cone(found.forces, c.normals, c.friction, 1e-6).all()
-        assert found.forces[:, 2].sum() == pytest.approx(weight, rel=0.02)
-    assert support_margin(c.points, c.normals, forces) > 0.05
 
 
 def test_every_answer_on_a_struggling_robot_is_inside_its_cones_whatever_its_status(walker):
@@ -373,15 +179,3 @@ def test_something_flexible_in_contact_is_refused():
     assert data.ncon > 0
     with pytest.raises(UnsupportedEnvError, match="flexible"):
         contact_points(model, data)
-
-
-def test_in_the_air_there_are_no_contacts():
-    model, data = zoo(settle=0.0)
-    data.qpos[2] += 1.0
-    data.qpos[11] += 1.0
-    mujoco.mj_forward(model, data)
-    terms = equations_of_motion(model, data)
-    assert terms.contacts.points.shape == (0, 3)
-    assert terms.contacts.jacobians.shape == (0, 3, model.nv)
-    assert terms.contacts.friction.shape == (0,)
-    assert terms.inertia @ data.qacc + terms.bias == pytest.approx(terms.actuation @ data.ctrl, abs=1e-9)

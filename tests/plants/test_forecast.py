@@ -1,7 +1,5 @@
 """Forecasts against MuJoCo itself: every substep of the env's own step, its poses, and braking after it."""
 
-import copy
-
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 from scenes import Scene
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Recorder
 
 ROBOTS = [
@@ -120,16 +117,6 @@ def test_every_integrator_through_contact_and_under_applied_forces(integrator):
     assert touched > 10
 
 
-def test_poses_of_every_nth_substep_are_a_part_of_all():
-    env = make("HalfCheetah")
-    env.reset(seed=0)
-    forecast = bound(env).forecast(np.full(6, 0.3), 3)
-    every, ends = forecast.poses(), forecast.poses(5)
-    for one, other in zip(ends, every, strict=True):
-        np.testing.assert_array_equal(one, other[4::5])
-    assert forecast.poses() is every and forecast.poses(5) is ends  # computed once
-
-
 def test_bodies_that_the_env_moves_by_hand_stay_where_they_are():
     hand = '<body name="hand" mocap="true" pos="1 0 0"><geom size=".1" mass="2" contype="0" conaffinity="0"/></body>'
     env = Scene(FALLING.format("Euler").replace("</worldbody>", f"{hand}</worldbody>"))
@@ -141,20 +128,6 @@ def test_bodies_that_the_env_moves_by_hand_stay_where_they_are():
 
 
 # What is kept, and what is left alone -------------------------------------------------------------------------
-
-
-def test_a_short_forecast_is_the_beginning_of_a_long_one():
-    env = make("Ant")
-    env.reset(seed=0)
-    env.step(env.action_space.high)
-    plant, other = bound(env), bound(env)
-    for u in (np.full(8, 0.5), np.full(8, -1.0)):
-        long = plant.forecast(u, 4)
-        for horizon in (1, 2, 4):
-            short, alone = long.first(horizon), other.forecast(u, horizon)
-            for name in ("qpos", "qvel", "published_frames", "published_centres"):
-                assert getattr(short, name).tobytes() == getattr(alone, name).tobytes()
-            np.testing.assert_array_equal(short.poses().frames, alone.poses().frames)
 
 
 def simulated(monkeypatch):
@@ -209,30 +182,6 @@ def test_the_present_state_is_as_before_a_forecast():
     np.testing.assert_array_equal(plant.acceleration[0], drift)
     assert plant.time == time == env.unwrapped.data.time
     np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
-
-
-def test_a_pose_after_a_forecast_is_still_that_of_the_state():
-    env = make("Ant")
-    env.reset(seed=0)
-    plant = bound(env)
-    plant.forward()
-    plant.forecast(np.ones(8), 3)
-    np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
-    plant.forward()
-    plant.path(np.ones(8))
-    np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
-
-
-def test_the_braking_of_a_forecast_is_told():
-    env = make("Pusher")
-    env.reset(seed=0)
-    plant = bound(env)
-    env.step(env.action_space.high)
-    plant.observe()
-    braking, before = plant.braking(), plant.qvel.copy()
-    slower = plant.forecast(braking).qvel[-1]
-    assert np.abs(slower[:7]).sum() < 0.7 * np.abs(before[:7]).sum()
-    assert (braking >= env.action_space.low).all() and (braking <= env.action_space.high).all()
 
 
 def fresh(raw):
@@ -308,15 +257,6 @@ def test_under_a_delay_it_starts_where_the_commands_in_flight_lead(delay_s):
         env.step(u)
 
 
-def test_a_model_of_another_timestep_is_refused():
-    # A control step would be another stretch of time for the forecast than for the env.
-    env = make("HalfCheetah")
-    model = copy.copy(env.unwrapped.model)
-    model.opt.timestep = 0.02
-    with pytest.raises(ConfigurationError, match=r"expected a timestep of 0.01 s, got 0.02 s"):
-        bound(env, model=model)
-
-
 # Braking ------------------------------------------------------------------------------------------------------
 
 SLIDER = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
@@ -350,24 +290,6 @@ def test_braking_halves_the_speed_of_a_driven_slide_in_every_control_step(kind, 
         assert (speeds / speeds[0] > -0.01).all(), speeds  # nor does it turn back
 
 
-@pytest.mark.parametrize(
-    "actuator",
-    [
-        '<velocity joint="x" kv="8" ctrlrange="-1 1"/>',
-        '<position joint="x" kp="20" kv="8" ctrlrange="-9 9"/>',
-        '<general joint="x" gainprm="4" biastype="affine" biasprm="1 -20 -8" ctrlrange="-9999 9999"/>',
-    ],
-)
-def test_a_servo_is_left_to_its_own_damping(actuator):
-    env = Scene(SLIDER.format(mass=1.0, actuator=actuator))
-    env.data.qpos[0], env.data.qvel[0] = 0.3, 1.0
-    held = bound(env).forecast(np.zeros(1), 12)
-    speeds = np.abs(held.qvel[4::5, 0])
-    assert speeds[-1] < 0.1 * speeds[0]
-    after = held.qpos[5:, 0]
-    assert np.ptp(after) < 0.2  # it stays where it is instead of returning to where it is zero
-
-
 def test_braking_stays_in_the_control_range(monkeypatch):
     given, simulate = [], Recorder.simulate
 
@@ -387,32 +309,6 @@ def test_braking_stays_in_the_control_range(monkeypatch):
             given.clear()
             plant.forecast(np.array([high]), 3)
             assert given == [high] + [low if speed > 0 else high] * 2
-
-
-@pytest.mark.parametrize("robot", ["Reacher", "Pusher"])
-def test_braking_stops_the_driven_joints_of_an_arm(robot):
-    env = make(robot)
-    rng = np.random.default_rng(0)
-    driven = [int(j) for j in env.unwrapped.model.jnt_dofadr[env.unwrapped.model.actuator_trnid[:, 0]]]
-    for seed in range(4):
-        env.reset(seed=seed)
-        for _ in range(5):
-            env.step(rng.choice([-0.4, 0.4], env.action_space.shape).astype(np.float32))
-        plant = bound(env)
-        held = plant.forecast(np.zeros(env.action_space.shape), 25)
-        speeds = np.abs(held.qvel[:, driven])
-        first, last = speeds[env.unwrapped.frame_skip - 1], speeds[-1]
-        assert first.max() > 0.3
-        assert last.max() < 0.15 * first.max(), (first, last)
-
-
-def test_braking_knows_of_a_perturbed_mass():
-    env = Scene(SLIDER.format(mass=1.0, actuator=MOTORS["motor"]))
-    env.data.qvel[0] = 1.0
-    plant = bound(env)
-    plant.perturb(mass=50.0)
-    speeds = plant.forecast(np.zeros(1), 6).qvel[4::5, 0]
-    assert (speeds[1:] < 0.62 * speeds[:-1]).all()
 
 
 # A simulation that breaks down --------------------------------------------------------------------------------

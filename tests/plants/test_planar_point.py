@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers  # noqa: F401 (registers the crossing)
-from safe_wrappers.control.backup.damped_axis import step
-from safe_wrappers.errors import UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.queries.planar_point import planar_point, walls
 
@@ -60,15 +59,6 @@ def test_the_point_is_found():
         assert (axis.low, axis.high, axis.clip, axis.substeps, axis.timestep) == (low, high, 4.0, 2, 0.01)
 
 
-def test_slides_and_motors_may_come_in_any_order():
-    other = '<joint name="y" type="slide" axis="0 1 0"/><joint name="x" type="slide" axis="1 0 0"/>'
-    point = planar_point(bound(xml(slides=other)), 5.0)
-    assert (point.joints, point.actuators) == ((1, 0), (0, 1))
-    motors = '<motor joint="y" ctrlrange="-3 1" gear="5"/><motor joint="x" ctrlrange="-1 2" gear="10"/>'
-    point = planar_point(bound(xml(motors=motors)), 5.0)
-    assert (point.joints, point.actuators, point.axes[0].high) == ((0, 1), (1, 0), 2.0)
-
-
 def test_a_clamp_of_the_force_is_the_end_of_what_acts():
     motors = MOTORS.replace('gear="10"', 'gear="10" forcerange="-0.5 0.5"')
     axis = planar_point(bound(xml(motors=motors)), 5.0).axes[0]
@@ -119,11 +109,6 @@ def test_a_box_is_a_wall_and_reach_is_where_a_contact_is_reported():
         assert data.ncon == contacts
 
 
-def test_touching_walls_are_one():
-    both = WALL + '<geom type="box" pos="2 2 0" size="0.5 1 0.2"/>'
-    assert found(both)[0] == [pytest.approx((1.5, 2.5, -1.0, 3.0))]
-
-
 @pytest.mark.parametrize(
     "world",
     [
@@ -136,15 +121,6 @@ def test_touching_walls_are_one():
 )
 def test_what_cannot_be_run_into_is_left_out(world):
     assert found(world)[0] == []
-
-
-def test_a_box_turned_by_a_quarter_is_aligned():
-    assert found(WALL.replace("<geom", '<geom euler="0 0 90"'))[0] == [pytest.approx((1.0, 3.0, -0.5, 0.5))]
-    assert found(WALL.replace("<geom", '<geom euler="90 0 0"'))[0] == [pytest.approx((1.5, 2.5, -0.2, 0.2))]
-
-
-def test_a_box_on_a_fixed_body_is_a_wall_where_the_body_is():
-    assert found(f'<body pos="1 1 0">{WALL}</body>')[0] == [pytest.approx((2.5, 3.5, 0.0, 2.0))]
 
 
 @pytest.mark.parametrize(
@@ -161,52 +137,9 @@ def test_what_is_no_wall_along_x_and_y_is_refused_by_name(world, says):
         found(world)
 
 
-def test_the_reach_covers_every_geom_of_the_point():
-    offset = BALL + '<geom type="box" pos="0.3 0.4 0" size="0.03 0.04 0.01" margin="0.01"/>'
-    reach = found(WALL, ball=offset)[1]
-    assert reach == pytest.approx(0.5 + np.linalg.norm([0.03, 0.04, 0.01]) + 0.01 + 0.002)
-
-
-def test_a_point_without_a_colliding_geom_is_refused():
-    with pytest.raises(UnsupportedEnvError, match="'point' has no geom that collides"):
-        found(WALL, ball='<geom size="0.1" contype="0" conaffinity="0"/>')
-
-
 # A point among other things that move ------------------------------------------------------------------------------
 
 YAW = '<joint name="yaw" type="hinge" axis="0 0 1"/>'
-CAR = '<body name="car" pos="0 3 0"><joint name="drive" type="slide" axis="1 0 0"/><geom size="0.3"/></body>'
-TOP = '<body name="top" pos="0 5 0"><joint name="spin" type="hinge" axis="0 0 1"/><geom size="0.3"/></body>'
-
-
-def test_a_point_named_by_its_body_is_found_among_others():
-    motors = '<motor joint="drive" ctrlrange="-1 1"/>' + MOTORS + '<motor joint="yaw" ctrlrange="-1 1"/>'
-    plant = bound(xml(slides=SLIDES + YAW, world=WALL + CAR + TOP, motors=motors))
-    point = planar_point(plant, np.inf, "point")
-    names = [plant.model.joint(j).name for j in range(plant.model.njnt)]
-    assert [names[j] for j in point.joints] == ["x", "y"] and point.actuators == (1, 2)
-    assert point.origin == (0.5, -0.25) and plant.model.body(point.body).name == "point"
-    alone = planar_point(bound(xml()), np.inf)
-    for axis, expected in zip(point.axes, alone.axes, strict=True):
-        assert (axis.keep, axis.add) == pytest.approx((expected.keep, expected.add), rel=1e-12)
-
-
-def test_it_is_the_crossing_s_robot():
-    env = gym.make("OccludedCrossing-v0")
-    plant = MujocoPlant()
-    plant.bind(env)
-    point = planar_point(plant, np.inf, "robot")
-    env.reset(seed=0)
-    raw = env.unwrapped
-    x, v = raw.agent_position, raw.agent_velocity
-    for control in ([1.0, 0.5, 1.0], [-0.3, 1.0, -1.0], [0.0, 0.0, 0.0]):
-        env.step(np.array(control))
-        now = [
-            step(axis, *state)
-            for axis, state in zip(point.axes, zip(x, v, control, strict=False), strict=True)
-        ]
-        x, v = np.transpose(now)
-        np.testing.assert_allclose([raw.agent_position, raw.agent_velocity], [x, v], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -235,8 +168,3 @@ def test_it_is_the_crossing_s_robot():
 def test_what_acts_on_the_named_point_is_found_out(changed, says):
     with pytest.raises(UnsupportedEnvError, match=f"(?s){says}.*Use Clearance"):
         planar_point(bound(xml(**changed)), np.inf, "point")
-
-
-def test_a_body_that_is_not_there_is_named_with_those_that_are():
-    with pytest.raises(UnknownNameError, match=r"pint.*point"):
-        planar_point(bound(xml()), np.inf, "pint")

@@ -1,6 +1,7 @@
 """A tiny goal task and a tiny filter, so that runs of the whole machinery take a second."""
 
 import os
+import signal
 import sys
 import time
 
@@ -10,6 +11,7 @@ from gymnasium.spaces import Box
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.train.processes import RunStoppedError
 
 HAZARD = np.array([0.5, 0.0])
 
@@ -117,6 +119,18 @@ def fail(progress):
 def crash(progress):
     """A job with a mistake in it."""
     raise ValueError("nobody expected this")
+
+
+def vanish(progress):
+    """A job whose process is killed."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def until_stopped(progress):
+    """A job that works until it is to stop."""
+    while not progress.stopping():
+        time.sleep(0.05)
+    raise RunStoppedError("stopped")
 
 
 class FilmedGoal(FakeGoal):

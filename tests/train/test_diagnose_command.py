@@ -92,13 +92,3 @@ def test_what_is_no_policy_is_refused(run, tmp_path, capsys):
             of_file(path)
     assert main(["diagnose", "Swimer-v5"]) == 1
     assert "Swimmer" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("words", [
-    ["train", "a.yaml", "--policy", "runs/a"], ["compare", "a.yaml", "--steps", "2000"],
-    ["diagnose", "Swimmer-v5", "Reacher-v5"], ["diagnose", "Swimmer-v5", "--report"],
-])  # fmt: skip
-def test_options_of_other_commands_are_refused(words, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(words)
-    assert stop.value.code == 2 and "diagnose" in capsys.readouterr().err

@@ -6,8 +6,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps
-from safe_wrappers.train.evaluation.scene import load_scene
-from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.files import read_json, read_rows
 from safe_wrappers.train.run import Progress, train_run
 
 SILENT = Progress(lambda steps: None, pytest.fail)
@@ -30,11 +29,11 @@ def test_every_arm_sees_the_same_episodes_with_the_filter_off_and_on(fake_experi
         for condition in ("filter_off", "filter_on"):
             rows = read_rows(folder / f"{condition}.csv")
             assert [row["episode_seed"] for row in rows] == [100, 101, 102]
-            scenes = [load_scene(folder / f"{condition}.npz", seed) for seed in (100, 101, 102)]
-            starts.append([scene.agent[0].tolist() for scene in scenes])
+            log = evaluated_steps(folder.parent, condition)
+            starts.append(log.coordinates[log.step == 0].tolist())
             assert all(("intervention_rate" in row) == (condition == "filter_on") for row in rows)
             intervened = sum(row.get("intervention_rate", 0) for row in rows)
-            assert sum(scene.intervened.sum() for scene in scenes) == pytest.approx(20 * intervened)
+            assert log.intervened.sum() == pytest.approx(20 * intervened)
             if condition == "filter_off":
                 assert intervened == 0
             else:
@@ -43,14 +42,13 @@ def test_every_arm_sees_the_same_episodes_with_the_filter_off_and_on(fake_experi
     assert len({tuple(start) for start in starts[0]}) == 3
 
 
-def test_scenes_hold_what_the_picture_needs(fake_experiment):
-    scene = load_scene(evaluate(fake_experiment(), 1) / "filter_on.npz", 100)
-    assert scene.agent.shape == (21, 2)
-    assert scene.intervened.shape == scene.violated.shape == (20,)
-    assert scene.goals.tolist() == [[1.0, 0.0]]
-    assert scene.hazards.tolist() == [[0.5, 0.0]]
-    assert (scene.hazard_radius, scene.goal_radius) == (0.2, 0.1)
-    assert scene.vases.tolist() == [[0.5, 0.6]]
+def test_what_stands_where_is_kept(fake_experiment):
+    folder = evaluate(fake_experiment(), 1)
+    places = read_json(folder / "filter_on_places.json")
+    assert sorted(places) == ["100", "101", "102"]
+    assert places["100"] == {
+        "goal": [[1.0, 0.0]], "hazard": [[0.5, 0.0]], "vase": [[0.5, 0.6]], "goal_radius": 0.1, "hazard_radius": 0.2,
+    }  # fmt: skip
 
 
 def test_the_steps_agree_with_the_table(fake_experiment):
@@ -69,9 +67,6 @@ def test_the_steps_agree_with_the_table(fake_experiment):
             assert log.violated[at].sum() == row["violations"]
             assert log.cost[at].sum() == row["cost"]
             changed += log.intervened[at].sum()
-        # Where the steps began is where the scenes were.
-        scene = load_scene(folder / f"{condition}.npz", 100)
-        assert log.coordinates[:20, :2] == pytest.approx(scene.agent[:-1], abs=1e-6)
     assert list(log.coordinate_names[:2]) == ["x (m)", "y (m)"]
     assert changed > 0
 
@@ -116,15 +111,14 @@ def test_without_any_filter_only_one_condition(fake_experiment):
     assert sorted(path.name for path in folder.iterdir()) == [
         "evaluation.json",
         "filter_off.csv",
-        "filter_off.npz",
+        "filter_off_places.json",
         "filter_off_steps.npz",
     ]
 
 
-def test_a_task_that_publishes_no_positions_has_no_scenes(fake_experiment):
+def test_a_task_that_publishes_no_positions_has_no_places(fake_experiment):
     folder = evaluate(fake_experiment("env=InvertedPendulum-v5", "arms={unfiltered: {filter: none}}"), 0)
-    assert load_scene(folder / "filter_off.npz", 100) is None
-    assert load_scene(folder / "never_written.npz", 100) is None
+    assert read_json(folder / "filter_off_places.json") == {}
     row = read_rows(folder / "filter_off.csv")[0]
     assert "goals_reached" not in row
     assert np.isfinite(row["return"])

@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up import fill, steps
 
-from safe_wrappers.train.evaluation.scene import Scene
 from safe_wrappers.train.evaluation.summary import Curve, summarize
 from safe_wrappers.train.report.figures import curve_picture, over_the_episode, plane_picture, refusals
-from safe_wrappers.train.report.where import place_pictures, scene_picture, telling_pair
+from safe_wrappers.train.report.where import Scene, place_pictures, scene_pictures, telling_pair
 
 ARMS = ["bare", "safe"]
 EVENTS = {"infeasible": ("were infeasible", "-"), "fallback": ("ran the fallback", ":")}
@@ -107,15 +106,19 @@ def test_many_steps_are_thinned_but_rare_flags_are_kept():
 
 
 def test_a_scene_from_above():
-    path = np.linspace([0.0, 0.0], [1.0, 0.0], 11)
-    none = np.zeros((0, 2))
-    scene = Scene(path, flags(10, 3, 4), flags(10, 5), path[-1:], np.array([[0.5, 0.2]]), none, 0.2, 0.1)
-    picture = scene_picture("One", scene, "#000000", [scene])
+    path = np.linspace([0.0, 0.0, 9.0], [1.0, 0.0, 9.0], 20)
+    log = steps(20, coordinates=path, intervened=flags(20, 3, 4, 12), violated=flags(20, 5))
+    places = {
+        "hazard": [[0.5, 0.2, 0.0]],
+        "goal": [[1.0, 0.0]],
+        "vase": [],
+        "hazard_radius": 0.2,
+        "goal_radius": 0.1,
+    }
+    (picture,) = scene_pictures([Scene("One", "#000000", log, log.episode_seed == 100, places)])
     assert picture.reading == "1 of 10 steps in violation, 2 changed by the filter."
-    assert {"path", "start", "changed by the filter", "in violation", "hazard", "goals, in order"} <= texts(
-        picture
-    )
-    assert "vase" not in texts(picture)
+    assert {"path", "start", "changed by the filter", "in violation", "hazard", "goal"} <= texts(picture)
+    assert "vase" not in texts(picture) and scene_pictures([]) == []
 
 
 def test_return_against_cost(fake_experiment):

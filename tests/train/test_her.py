@@ -15,7 +15,7 @@ from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.files import read_rows
-from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, resume
 from safe_wrappers.train.run.model import check_task
 from safe_wrappers.train.run.stack import make_stack, make_vec_env
 from safe_wrappers.train.run.training import train_run
@@ -87,7 +87,7 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, re
     check_task(arm, make_stack(arm.env, arm.filter, arm.learner))
     folder = run_killed_after(experiment, 1, monkeypatch, arm=0)
     checkpoint = latest_checkpoint(folder / "checkpoints")
-    buffer = checkpoint.load_model("SAC", make_vec_env(arm), "cpu").replay_buffer
+    buffer = resume(checkpoint.folder, "SAC", make_vec_env(arm), "cpu", 100).replay_buffer
     assert type(buffer) is (HerReplayBuffer if kind in SB3S_BUFFER else ExecutedActionHerReplayBuffer)
     assert getattr(buffer, "mode", kind) == kind
     assert (buffer.size(), buffer.n_sampled_goal) == (64, 2)

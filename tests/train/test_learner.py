@@ -21,7 +21,7 @@ from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_fol
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import stack as stack_module
 from safe_wrappers.train.run import training as run_module
-from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, resume
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.videos import record as record_module
@@ -244,7 +244,7 @@ def test_a_killed_run_goes_on_with_its_two_transitions(fake_experiment, monkeypa
     folder = run_killed_after(experiment, 2, monkeypatch, arm=0)
     checkpoint = latest_checkpoint(folder / "checkpoints")
     envs = DummyVecEnv([lambda: make_stack(arm.env, arm.filter, arm.learner)])
-    buffer = checkpoint.load_model("SAC", envs, "cpu").replay_buffer
+    buffer = resume(checkpoint.folder, "SAC", envs, "cpu", 100).replay_buffer
     assert type(buffer) is ExecutedActionReplayBuffer and buffer.mode == "both"
     assert buffer.size() == checkpoint.timesteps == 128
     assert buffer.changed[:128].any()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from stable_baselines3.common.save_util import load_from_zip_file
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.cli import main
@@ -50,7 +51,9 @@ def learned(experiment):
         for seed in experiment.seeds:
             folder = experiment.run_folder(arm, seed)
             found[arm.name, seed] = (
-                (folder / "policy" / "model.npz").read_bytes(),
+                load_from_zip_file(folder / "policy" / "model.zip")[1]["policy"][
+                    "action_net.weight"
+                ].tolist(),
                 (folder / "episodes.csv").read_text(),
                 (folder / "evaluation" / "filter_on.csv").read_text(),
             )

@@ -109,6 +109,8 @@ def test_what_the_page_says(report):
         "with the filter, of 1,080 of training and evaluation",
         "Trained without the filter, filter on",
         "return per episode range",
+        "without: ",
+        "where no action was admissible, of training and evaluation fallback: 0 steps",
         "mean over 2 seeds [their range, not an interval]",
         "trained through the filter, learner naive",
         "policies of training seed 0: ",
@@ -166,7 +168,7 @@ def test_one_seed_no_interval(fake_experiment):
 def test_training_alone_and_a_task_without_a_filter(fake_experiment):
     experiment = fake_experiment("seeds=[0]", "env=InvertedPendulum-v5", "arms={unfiltered: {filter: none}}")
     said = words(run_all(experiment, evaluate=False))
-    assert "There is no filter to compare with yet. unfiltered: return" in said
+    assert "There is no filter to compare with yet." in said
     assert "Violations are not judged: the task reports no cost." in said and "0 of" not in said
     assert "Training, all episodes" in said
     assert "No recorded steps with a filter on." in said
@@ -192,7 +194,7 @@ def test_infeasible_steps_constraints_and_what_was_left_out(fake_experiment):
         "of 400 steps 100 were infeasible and 0 ran the fallback",
         "Where violations were: unfiltered, filter off",
         "Where the filter stepped in: filtered",
-        "From the first 10,000 steps of each run; 28 more were evaluated but not kept.",
+        "From the first 20,000 steps of each run; 28 more were evaluated but not kept.",
         "In training 20 steps were infeasible and 20 ran the fallback, of 2,000.",
         "filtered trained through the filter, learner adaption_penalty",
         "TMLR 2023: filtered adaption_penalty",
@@ -205,6 +207,7 @@ def test_a_task_without_a_cost_shows_none(fake_experiment):
     fill(experiment, JUDGES_NOTHING | {"return": 20}, JUDGES_NOTHING | {"return": 10})
     said = reported(experiment)
     assert "Violations are not judged: the task reports no cost." in said
+    assert said.count("violations not judged") == 4 and "violations: not judged" in said  # of the cards
     table = said.partition("In numbers")[2].partition("The same episode")[0]
     assert (
         table.count("not judged") == 1 + 2 * 6
@@ -225,7 +228,7 @@ def test_arms_of_several_tasks_are_reported_without_being_mixed_up(fake_experime
             write_evaluation(experiment, arm, 0, condition, [episode()] * 2, log)
     said = reported(experiment)
     assert "PPO on fake_task:FakeGoal-v0, PPO on Pendulum-v1, 64 to 512 steps" in said
-    assert "filtered, filter off" in said and "Trained without the filter" not in said
+    assert "The policy, filter off" in said and "Trained without the filter" not in said
 
 
 def test_nothing_to_report_yet(fake_experiment):

@@ -24,7 +24,7 @@ ROBOTS = {
 
 
 def filmed(env_id, monkeypatch):
-    """An env as films have it, without GL; and what tells where a frame has the robot, and the camera's lookat."""
+    """An env as films have it, without GL; and what tells where a frame has the robot."""
     env = for_film(gym.make(env_id, render_mode="rgb_array"))
     renderer = find_renderer(env)
     model, data, camera = renderer.model, renderer.data, mujoco.MjvCamera()
@@ -51,7 +51,7 @@ def filmed(env_id, monkeypatch):
     def frame():
         mujoco.mj_forward(model, data)
         env.render()
-        return places[-1], camera.lookat.copy()
+        return places[-1]
 
     monkeypatch.setattr(renderer, "_get_viewer", lambda mode: SimpleNamespace(cam=camera, scn=scene))
     monkeypatch.setattr(renderer, "render", render)
@@ -62,11 +62,8 @@ def filmed(env_id, monkeypatch):
 def test_the_robot_stays_in_sight_wherever_it_goes(env_id, monkeypatch):
     env, data, frame = filmed(env_id, monkeypatch)
     env.reset(seed=0)
-    start, home = data.qpos[0], frame()[1]
-    for away in (3.0, -8.0, 20.0):
+    start = data.qpos[0]
+    for away in (0.0, 3.0, -8.0, 20.0):
         data.qpos[0] = start + away
-        place, _ = frame()
-        assert (np.abs(place) < 0.8).all()
-    data.qpos[0] = start
-    np.testing.assert_array_equal(frame()[1], home)  # back at its start the picture is as at the start
+        assert (np.abs(frame()) < 0.8).all()
     env.close()

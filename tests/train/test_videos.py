@@ -9,15 +9,14 @@ from rich.console import Console
 
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train.evaluation.episode_selection import shown_episode
-from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
-from safe_wrappers.train.evaluation.scene import load_scene
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.videos import film
 from safe_wrappers.train.videos import record as videos
 from safe_wrappers.train.videos.film import HEIGHT, TITLE, WIDTH
-from safe_wrappers.train.videos.record import load_video, record_videos, video_path, video_problem
+from safe_wrappers.train.videos.record import load_video, record_videos, video_path
 from safe_wrappers.train.videos.rendering import Rendering
 
 SILENT = Progress(lambda steps: None, pytest.fail)
@@ -84,7 +83,7 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             video = load_video(video_path(experiment, arm, condition))
             rows = read_rows(evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.csv")
             frames = Image.open(io.BytesIO(video.animation))
-            scenes = evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.npz"
+            log = evaluated_steps(experiment.run_folder(arm, 0), condition)
             seeds = (shown.episode_seed, shown.worst_seed)
             for side, ((said_title, length, count), seed) in enumerate(
                 zip(video.episodes, seeds, strict=True)
@@ -102,7 +101,10 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
                 dot = np.argwhere(red - green > 100).mean(axis=0)[::-1]
                 # Where this episode starts, to half a pixel of the task's.
                 start = (
-                    ((load_scene(scenes, seed).agent[0] * (20, 15) + (40, 30)).astype(int) + 0.5)
+                    (
+                        (log.coordinates[log.episode_seed == seed][0, :2] * (20, 15) + (40, 30)).astype(int)
+                        + 0.5
+                    )
                     * HEIGHT
                     / 60
                 )
@@ -113,7 +115,6 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             assert background == pytest.approx([5 * 19] * 3, abs=6)
             assert video.speed == 0.5  # 20 steps at 10 a second take 2 s; shown in 4
     assert changed > 0
-    assert video_problem(experiment) == ""
 
 
 def test_a_film_is_made_once_and_again_for_another_episode(evaluated, inline):
@@ -137,14 +138,12 @@ def test_films_of_another_episode_are_gone_even_where_none_can_be_made(evaluated
     again = evaluated("evaluation.seed=500")
     assert said(again) == "No videos: no screen\n"
     assert load_video(video_path(again, again.arms[0], "filter_off")) is None
-    assert video_problem(again) == "no screen"
 
 
 def test_a_task_without_frames_is_not_asked_for_any(evaluated, inline):
     experiment = evaluated("env=fake_task:FakeGoal-v0")
     line = "fake_task:FakeGoal-v0 draws no frames (it has no render mode rgb_array)."
     assert said(experiment) == f"No videos: {line}\n"
-    assert video_problem(experiment) == line
     assert inline == []
 
 

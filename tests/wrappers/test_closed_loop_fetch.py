@@ -7,8 +7,7 @@ import pytest
 import safe_wrappers as sw
 
 gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-from benchmarks.fetch_drivers import drivers, obstacles  # noqa: E402 (the benchmark needs gymnasium_robotics)
-from benchmarks.fetch_judge import FetchJudge  # noqa: E402
+from benchmarks.fetch import FetchJudge, drivers, obstacles  # noqa: E402 (the benchmark needs gymnasium_robotics)
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::safe_wrappers.errors.UnsafeStateWarning"),

@@ -160,16 +160,4 @@ def alone(hazards, agent=(0.0, 0.0, 0.0), **options):
     return env
 
 
-def test_counting_on_the_drive_allows_more_speed():
-    speeds = []
-    for brake in (True, False):
-        env = alone([[1.2, 0.0]], brake=brake)
-        fastest = 0.0
-        for _ in range(200):
-            env.step(np.array([1.0, 0.0], np.float32))
-            fastest = max(fastest, float(env.unwrapped.data.qvel[0]))
-        speeds.append(fastest)
-    assert speeds[0] > speeds[1] + 0.1
-
-
 # Refusals -----------------------------------------------------------------------------------------------------

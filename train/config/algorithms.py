@@ -42,10 +42,15 @@ _NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tens
     "_init_setup_model",
     "stats_window_size",
 }
+_Noise = Annotated[
+    dict[Literal["normal", "ornstein_uhlenbeck"], Annotated[Number, Field(gt=0)]],
+    Field(min_length=1, max_length=1),
+]
+"""A standard deviation of actions scaled to [-1, 1]."""
 _OF_DEFAULT: Final[Mapping[type, Any]] = {bool: StrictBool, int: Integer, float: Number}
 _TYPES: Final[Mapping[str, Any]] = {
     "learning_rate": Annotated[Number, Field(gt=0)],
-    "action_noise": Literal["none"] | dict[Literal["normal", "ornstein_uhlenbeck"], Number] | None,
+    "action_noise": Literal["none"] | _Noise | None,
     "replay_buffer_class": Literal["HerReplayBuffer"],
     "train_freq": Any,  # may be [4, "episode"]
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "buffer_size"), Count),

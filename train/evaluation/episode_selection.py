@@ -18,16 +18,19 @@ class Pair(NamedTuple):
 
 
 class ShownEpisode(NamedTuple):
-    """The evaluation episode that is looked at in every arm and condition, and the worst one beside it on film."""
+    """The evaluation episode that is looked at in every arm and condition, and the worst one beside it on film.
+
+    Attributes:
+        seed: The training seed of the policies.
+        episode_seed: Of the typical episode.
+        worst_seed: Of the one with the lowest return.
+        reason: How they were chosen, for the page.
+    """
 
     seed: int
-    """The training seed of the policies."""
     episode_seed: int
-    """Of the typical episode."""
     worst_seed: int
-    """Of the one with the lowest return."""
     reason: str
-    """How they were chosen, for the page."""
 
     @property
     def filmed(self) -> dict[str, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +20,6 @@ from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger
 from ..run.training import finished_checkpoint
-from .scene import Scene, SceneRecorder, save_scenes
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
 
 EVALUATION_COLUMNS: Final = ("episode_seed", *COLUMNS)
@@ -32,7 +30,7 @@ def evaluation_folder(run_folder: Path) -> Path:
     """Where a run's evaluation lies.
 
     Per condition (`filter_off`, `filter_on`) a table of episodes `.csv`, the steps `_steps.npz`
-    (`safe_wrappers.train.step_log`), and for tasks seen from above the scenes `.npz`.
+    (`safe_wrappers.train.evaluation.step_log`), and for tasks seen from above what stood where, `_places.json`.
     """
     return run_folder / EVALUATION
 
@@ -74,69 +72,55 @@ def evaluate_run(
             it.
     """
     check_finished(arm, folder)
+    filters = conditions(arm, default_filter)
     with only_writer(folder):
-        _evaluate(arm, seed, folder, settings, conditions(arm, default_filter), progress)
-
-
-def _evaluate(
-    arm: ArmConfig,
-    seed: int,
-    folder: Path,
-    settings: EvaluationConfig,
-    filters: Mapping[str, FilterConfig],
-    progress: Progress,
-) -> None:
-    checkpoint = finished_checkpoint(arm, seed, folder)
-    out = evaluation_folder(folder)
-    state = {
-        "settings": {"episodes": settings.episodes, "seed": settings.seed},
-        "filter": filters.get("filter_on", FilterConfig()).plain(),
-        "timesteps": checkpoint.timesteps,
-    }
-    if read_json(out / STATE_FILE) == state:
-        return
-    (out / STATE_FILE).unlink(missing_ok=True)
-    shutil.rmtree(out, ignore_errors=True)  # or after a kill there would be rows of two settings
-    policy = TrainedPolicy(arm, checkpoint.folder)
-    logger = run_logger(arm, seed, folder)
-    for at, (condition, used) in enumerate(filters.items()):
-        rows: list[dict[str, Any]] = []
-        scenes: dict[int, Scene] = {}
-        with closing(make_stack(arm.env, used, arm.learner.in_evaluation)) as env:
-            steps = StepRecorder(env)
-            for episode_seed in range(settings.seed, settings.seed + settings.episodes):
-                figures, scene = _episode(env, policy, episode_seed, steps)
-                rows.append({"episode_seed": episode_seed, **figures})
-                if scene is not None:
-                    scenes[episode_seed] = scene
-                for key, value in figures.items():
-                    logger.record_mean(f"evaluation_{condition}/{key}", float(value))
-                progress.steps(at * settings.episodes + len(rows))
-                if progress.stopping():
-                    raise RunStoppedError("stopped; this evaluation begins again")
-            log = steps.finish()
-        logger.dump(checkpoint.timesteps)
-        write_rows(out / f"{condition}.csv", EVALUATION_COLUMNS, rows)
-        save_scenes(out / f"{condition}.npz", scenes)
-        save_steps(out / f"{condition}_steps.npz", log)
-    logger.close()
-    write_json(out / STATE_FILE, state)
+        checkpoint = finished_checkpoint(arm, seed, folder)
+        out = evaluation_folder(folder)
+        state = {
+            "settings": {"episodes": settings.episodes, "seed": settings.seed},
+            "filter": filters.get("filter_on", FilterConfig()).plain(),
+            "timesteps": checkpoint.timesteps,
+        }
+        if read_json(out / STATE_FILE) == state:
+            return
+        (out / STATE_FILE).unlink(missing_ok=True)
+        shutil.rmtree(out, ignore_errors=True)  # or after a kill there would be rows of two settings
+        policy = TrainedPolicy(arm, checkpoint.folder)
+        logger = run_logger(arm, seed, folder)
+        for at, (condition, used) in enumerate(filters.items()):
+            rows: list[dict[str, Any]] = []
+            with closing(make_stack(arm.env, used, arm.learner.in_evaluation)) as env:
+                steps = StepRecorder(env)
+                for episode_seed in range(settings.seed, settings.seed + settings.episodes):
+                    figures = _episode(env, policy, episode_seed, steps)
+                    rows.append({"episode_seed": episode_seed, **figures})
+                    for key, value in figures.items():
+                        logger.record_mean(f"evaluation_{condition}/{key}", float(value))
+                    progress.steps(at * settings.episodes + len(rows))
+                    if progress.stopping():
+                        raise RunStoppedError("stopped; this evaluation begins again")
+                log = steps.finish()
+            logger.dump(checkpoint.timesteps)
+            write_rows(out / f"{condition}.csv", EVALUATION_COLUMNS, rows)
+            write_json(out / f"{condition}_places.json", steps.places)
+            save_steps(out / f"{condition}_steps.npz", log)
+        logger.close()
+        write_json(out / STATE_FILE, state)
 
 
 def _episode(
     env: gym.Env[Any, Any], policy: TrainedPolicy, episode_seed: int, steps: StepRecorder
-) -> tuple[dict[str, Any], Scene | None]:
+) -> dict[str, Any]:
     """Runs an episode, and records its steps; its figures as `RecordInterventions` has them."""
     observation, _ = env.reset(seed=episode_seed)
     policy.begin(env)
     steps.begin(episode_seed)
-    scene = SceneRecorder(env)
     done = False
     while not done:
         steps.before(observation)
         action = policy(observation)
         observation, _, terminated, truncated, info = env.step(action)
         steps.after(action, info)
-        scene.step(info)
         done = terminated or truncated
-    return info[keys.EPISODE_SUMMARY], scene.finish()
+    figures: dict[str, Any] = info[keys.EPISODE_SUMMARY]
+    return figures

@@ -19,48 +19,51 @@ from safe_wrappers.checks import Array
 
 from ..files import write_bytes
 
-MOST_STEPS: Final = 10_000
-"""Steps kept of one run under one condition: the first ones. Ten episodes of 1000 steps; 0.1 to 4 MB."""
+MOST_STEPS: Final = 20_000
+"""Steps kept of one run under one condition: the first ones. Twenty episodes of 1000 steps; 0.2 to 8 MB."""
 
 
 @dataclass(frozen=True)
 class StepLog:
-    """T steps of one run (or several) under one condition; floats are float32."""
+    """T steps of one run (or several) under one condition; floats are float32.
+
+    Attributes:
+        episode_seed: Shape (T,).
+        step: The step's number in its episode, from 0, shape (T,); likewise what follows without another shape.
+        intervened: The filter changed the action.
+        infeasible: It found no admissible action.
+        fallback: Its last resort acted.
+        violated: The task's own truth saw a cost, at the step's end or at any substep.
+        correction: L2, action units.
+        margin: The smallest h before the step; NaN without a filter.
+        cost: The task's; NaN where it reports none.
+        proposed: The policy's action, shape (T, action size).
+        executed: The action that the env was given, shape (T, action size).
+        refused: Which constraints refused the boxed proposal, shape (T, constraints).
+        coordinates: The state in which the step began, shape (T, coordinates).
+        constraint_names: Shape (constraints,).
+        coordinate_names: With units, shape (coordinates,).
+        left_out: Steps beyond `MOST_STEPS` that were not kept.
+        filter_time_us: Mean wall time of one filter call; NaN without a filter.
+    """
 
     episode_seed: NDArray[np.int64]
-    """(T,)"""
     step: NDArray[np.int32]
-    """(T,): the step's number in its episode, from 0."""
     intervened: NDArray[np.bool_]
-    """(T,)"""
     infeasible: NDArray[np.bool_]
-    """(T,)"""
     fallback: NDArray[np.bool_]
-    """(T,)"""
     violated: NDArray[np.bool_]
-    """(T,): the task's own truth saw a cost, at the step's end or at any substep."""
     correction: NDArray[np.float32]
-    """(T,): L2, action units."""
     margin: NDArray[np.float32]
-    """(T,): the smallest h before the step; NaN without a filter."""
     cost: NDArray[np.float32]
-    """(T,): the task's; NaN where it reports none."""
     proposed: NDArray[np.float32]
-    """(T, action size): the policy's action."""
     executed: NDArray[np.float32]
-    """(T, action size): the action that the env was given."""
     refused: NDArray[np.bool_]
-    """(T, constraints): which constraints refused the boxed proposal."""
     coordinates: NDArray[np.float32]
-    """(T, coordinates): the state in which the step began."""
     constraint_names: NDArray[np.str_]
-    """(constraints,)"""
     coordinate_names: NDArray[np.str_]
-    """(coordinates,): with units."""
     left_out: int
-    """Steps beyond `MOST_STEPS` that were not kept."""
     filter_time_us: float
-    """Mean wall time of one filter call; NaN without a filter."""
 
     def __len__(self) -> int:
         return len(self.step)
@@ -79,7 +82,7 @@ def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], A
     """A few named numbers that say where in state space a task is.
 
     - A task that publishes `agent_position` (seen from above): its place, and where the nearest hazard is, ahead and
-      to the left if it publishes `agent_heading`, else its distance;
+      to the left if it publishes `agent_heading`;
     - any other MuJoCo env: every joint's position and speed by name, angles of hinges without limits in [-pi, pi];
     - any other env: its observation, if that is a flat Box.
 
@@ -91,10 +94,9 @@ def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], A
     """
     task: Any = env.unwrapped
     if np.size(getattr(task, "agent_position", ())) >= 2:
-        heading, hazards = hasattr(task, "agent_heading"), np.size(getattr(task, "hazard_positions", ())) > 0
-        sides = ["ahead", "to the left"] if heading else ["distance"]
-        nearest = [f"nearest hazard, {side} (m)" for side in sides] if hazards else []
-        return ["x (m)", "y (m)", *nearest], lambda _: _from_above(task, bool(nearest), heading)
+        hazards = hasattr(task, "agent_heading") and np.size(getattr(task, "hazard_positions", ())) > 0
+        nearest = [f"nearest hazard, {side} (m)" for side in ("ahead", "to the left")] if hazards else []
+        return ["x (m)", "y (m)", *nearest], lambda _: _from_above(task, hazards)
     if hasattr(task, "model") and hasattr(task, "data"):
         model = task.model
         hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
@@ -113,33 +115,37 @@ def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], A
     return [], lambda _: np.zeros(0)
 
 
-def _from_above(task: Any, hazards: bool, heading: bool) -> Array:
+def _from_above(task: Any, hazards: bool) -> Array:
     at = np.array(task.agent_position, dtype=float)[:2]
     if not hazards:
         return at
     ways = np.atleast_2d(np.array(task.hazard_positions, dtype=float))[:, :2] - at
     way = ways[np.argmin(np.linalg.norm(ways, axis=1))]
-    if not heading:
-        return np.array([*at, np.linalg.norm(way)])
     ahead = np.array([math.cos(task.agent_heading), math.sin(task.agent_heading)])
     return np.array([*at, ahead @ way, ahead[0] * way[1] - ahead[1] * way[0]])
 
 
 def _joint_names(model: Any) -> list[str]:
     """Of positions, then of speeds; those of ball and free joints are numbered."""
-    kinds = mujoco.mjtJoint
-    sizes = {int(kinds.mjJNT_FREE): (7, 6), int(kinds.mjJNT_BALL): (4, 3)}
-    units = {int(kinds.mjJNT_HINGE): (" (rad)", " (rad/s)"), int(kinds.mjJNT_SLIDE): (" (m)", " (m/s)")}
+    units = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
     names: list[str] = []
-    for at, what in enumerate(("position", "speed")):
-        for j in range(model.njnt):
-            kind = int(model.jnt_type[j])
-            name = f"{model.joint(j).name or f'joint {j}'}, {what}"
-            if kind in units:
-                names.append(name + units[kind][at])
-            else:
-                names += [f"{name} {part}" for part in range(sizes[kind][at])]
+    for what, per, starts, size in (
+        ("position", "", model.jnt_qposadr, model.nq),
+        ("speed", "/s", model.jnt_dofadr, model.nv),
+    ):
+        for j, (start, end) in enumerate(zip(starts, [*starts[1:], size], strict=True)):
+            name, unit = f"{model.joint(j).name or f'joint {j}'}, {what}", units.get(int(model.jnt_type[j]))
+            names += (
+                [f"{name} {part}" for part in range(end - start)]
+                if unit is None
+                else [f"{name} ({unit}{per})"]
+            )
     return names
+
+
+def _published(env: gym.Env[Any, Any], name: str) -> Any:
+    """A number, a place or places of a task, as plain data; an empty list where it publishes none."""
+    return np.asarray(getattr(env.unwrapped, name, []), dtype=float).tolist()
 
 
 class StepRecorder:
@@ -147,22 +153,35 @@ class StepRecorder:
 
     Args:
         env: The whole stack.
+
+    Attributes:
+        places: Of each episode, by its seed, what a task seen from above publishes: where hazards and vases were at
+            its start, each place that the goal was at, and their radii; lists of [x, y], m.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env = env
         self._rows: dict[str, list[Any]] = {name: [] for name in _PER_STEP}
         self._left_out = 0
+        self.places: dict[int, dict[str, Any]] = {}
 
     def begin(self, episode_seed: int) -> None:
         """An episode has been reset."""
         # Only now: some tasks do not know where they are before their first reset.
         self._names, self._read = coordinates_of(self._env)
         self._episode_seed, self._step = episode_seed, 0
+        if np.size(_published(self._env, "agent_position")):
+            found = {what: _published(self._env, f"{what}_positions") for what in ("hazard", "vase")}
+            radii = {f"{what}_radius": _published(self._env, f"{what}_radius") for what in ("hazard", "goal")}
+            self.places[episode_seed] = found | radii | {"goal": []}
 
     def before(self, observation: Any) -> None:
         """Takes down the state in which the next step begins."""
         self._coordinates = self._read(observation)
+        if self._episode_seed in self.places:
+            goal, goals = _published(self._env, "goal_position"), self.places[self._episode_seed]["goal"]
+            if goal and goals[-1:] != [goal]:
+                goals.append(goal)
 
     def after(self, action: Any, info: dict[str, Any]) -> None:
         """Takes down what the step did.

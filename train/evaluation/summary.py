@@ -239,18 +239,21 @@ def judged_by(experiment: ExperimentConfig, judged: bool) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """One arm's metric over B bins of steps; of two seeds their range, of one none."""
+    """One arm's metric over B bins of steps.
+
+    Attributes:
+        steps: Middles of the bins, shape (B,).
+        iqm: Over seeds, shape (B,).
+        low: The interval's lower end, of two seeds the range's, shape (B,); None of one seed.
+        high: Likewise.
+        seeds: Each seed's own, shape (seeds, B).
+    """
 
     steps: Array
-    """(B,)"""
     iqm: Array
-    """(B,): over seeds."""
     low: Array | None
-    """(B,)"""
     high: Array | None
-    """(B,)"""
     seeds: Array
-    """(seeds, B): each seed's own."""
 
 
 def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) -> Curve | None:

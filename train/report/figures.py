@@ -48,9 +48,9 @@ def plane_picture(summary: Summary, arms: Sequence[str]) -> Picture:
             color = color_of(arm, arms)
             for condition, (x, y) in of_arm.items():
                 fill = "none" if condition == "filter_off" else color
-                seeds = [(row["return"], row["cost"]) for row in _rows(summary, arm, condition)]
+                seeds = np.array([(row["return"], row["cost"]) for row in _rows(summary, arm, condition)])
                 if len(seeds) > 1:
-                    axes.scatter(*zip(*seeds, strict=True), s=14, facecolor=fill, edgecolor=color, alpha=0.5)
+                    axes.scatter(seeds[:, 0], seeds[:, 1], s=14, facecolor=fill, edgecolor=color, alpha=0.5)
                 _bar(axes.hlines, y.iqm, x, color, 1.0, 0.7)
                 _bar(axes.vlines, x.iqm, y, color, 1.0, 0.7)
                 label = f"{arm}, filter {CONDITIONS[condition]}"

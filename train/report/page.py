@@ -5,42 +5,40 @@ from __future__ import annotations
 import platform
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
 import jinja2
-import numpy as np
 import yaml
 
 from safe_wrappers.errors import RunStateError
 
-from ..config import ArmConfig, ExperimentConfig
+from ..config import ExperimentConfig
 from ..evaluation.episode_selection import compared_pairs, shown_episode
 from ..evaluation.evaluate import evaluated_steps, evaluation_folder
 from ..evaluation.metrics import OF_THE_FILTER, REGISTRY
-from ..evaluation.scene import load_scene
 from ..evaluation.step_log import MOST_STEPS, StepLog, pool
-from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Curve, Summary, judged_by, learning_curve, over_seeds
+from ..evaluation.summary import (
+    SEEDS_FOR_AN_INTERVAL,
+    Curve,
+    Summary,
+    judged_by,
+    learning_curve,
+    number,
+    over_seeds,
+    spread,
+)
 from ..files import Row, read_json, write_rows, write_text
 from ..run.folder import START_FILE, finished_facts
-from ..videos.record import Video, load_video, video_path, video_problem
+from ..videos.record import Video, load_video, video_path
 from .drawing import Picture, color_of, data_uri
 from .figures import CONDITIONS, curve_picture, over_the_episode, plane_picture, refusals
 from .tables import RUN_COLUMNS, SHORT, every_metric, run_rows, short_rows
-from .verdict import cards, verdict
-from .where import place_pictures, scene_picture
+from .verdict import compare, percent, verdict
+from .where import Scene, place_pictures, scene_pictures
 
-_PACKAGES: Final = (
-    "safe-wrappers",
-    "gymnasium",
-    "mujoco",
-    "stable-baselines3",
-    "torch",
-    "numpy",
-    "qpsolvers",
-    "daqp",
-)
+_PACKAGES: Final = ("safe-wrappers", "gymnasium", "mujoco", "stable-baselines3", "torch", "numpy", "daqp")
 _CURVES: Final = {
     "return": ("Return", "return per episode"),
     "cost": ("Cost", "cost per episode"),
@@ -90,7 +88,10 @@ def write_report(
         about=about(experiment),
         first=first,
         rest=rest,
-        cards=cards(experiment, summary, _filter_us(experiment)),
+        found=compare(experiment, summary),
+        number=number,
+        percent=percent,
+        spread=spread,
         short=SHORT,
         rows=[(a, list(short_rows(summary, a))) for a in experiment.arms if any(summary.table[a.name].values())],
         over=over_seeds(*summary.seeds),
@@ -102,8 +103,7 @@ def write_report(
             for condition, words in CONDITIONS.items()
             if (video := load_video(video_path(experiment, arm, condition))) is not None
         ],
-        film_problem=video_problem(experiment),
-        scenes=list(_scenes(experiment)),
+        scenes=_scenes(experiment),
         plane=plane_picture(summary, names) if summary.judged else None,
         acting=acting,
         interventions=[] if not acting else [
@@ -122,7 +122,7 @@ def write_report(
         learners={arm.name: arm.learner.kind for arm in experiment.arms if arm.filter.kind != "none"},
         registry=REGISTRY,
         command=command,
-        versions=list(_versions()),
+        versions=[("python", platform.python_version()), *((each, version(each)) for each in _PACKAGES)],
         settings=yaml.safe_dump(values | {"arms": list(values["arms"])}, sort_keys=False),
         every=list(every_metric(experiment, summary)),
     )  # fmt: skip
@@ -174,22 +174,26 @@ def _places(experiment: ExperimentConfig, acting: dict[str, StepLog]) -> Iterato
             yield from place_pictures(filtered.name, acting[filtered.name], bare.name, off.get(bare.name))
 
 
-def _scenes(experiment: ExperimentConfig) -> Iterator[Picture]:
+def _scenes(experiment: ExperimentConfig) -> list[Picture]:
     """The shown episode seen from above, for tasks that publish where things are."""
     shown = shown_episode(experiment)
     pair = next(iter(compared_pairs(experiment)), None)
-    wanted, found = [(experiment.arms[0], "filter_off")], []
+    wanted = [(experiment.arms[0], "filter_off")]
     if pair is not None:
         wanted = [(pair.bare, "filter_off"), (pair.filtered, "filter_on")]
+    scenes = []
     for arm, condition in wanted if shown is not None else ():
         assert shown is not None
-        path = evaluation_folder(experiment.run_folder(arm, shown.seed)) / f"{condition}.npz"
-        scene = load_scene(path, shown.episode_seed)
-        if scene is not None:
-            names = [each.name for each in experiment.arms]
+        folder = experiment.run_folder(arm, shown.seed)
+        places = read_json(evaluation_folder(folder) / f"{condition}_places.json").get(
+            str(shown.episode_seed)
+        )
+        log = evaluated_steps(folder, condition)
+        if places and log is not None and (log.episode_seed == shown.episode_seed).any():
+            color = color_of(arm.name, [each.name for each in experiment.arms])
             title = f"{arm.name}, filter {CONDITIONS[condition]}, from above"
-            found.append((title, scene, color_of(arm.name, names)))
-    yield from (scene_picture(*each, [scene for _, scene, _ in found]) for each in found)
+            scenes.append(Scene(title, color, log, log.episode_seed == shown.episode_seed, places))
+    return scene_pictures(scenes)
 
 
 def _film(video: Video) -> str:
@@ -200,24 +204,16 @@ def _film(video: Video) -> str:
     return f"{said} Shown {video.speed:.1f} times as fast as real."
 
 
-def _filter_us(experiment: ExperimentConfig) -> float | None:
-    """The mean filter call of the filtered side, in training if it was there, else in evaluation."""
-    trained, evaluated = [], []
-    for _, arm in compared_pairs(experiment):
-        for seed in experiment.seeds:
-            folder = experiment.run_folder(arm, seed)
-            trained.append(finished_facts(folder).get("filter_time_us"))
-            log = evaluated_steps(folder, "filter_on")
-            evaluated.append(None if log is None or np.isnan(log.filter_time_us) else log.filter_time_us)
-    times = [time for time in trained if time is not None] or [time for time in evaluated if time is not None]
-    return float(np.mean(times)) if times else None
-
-
 def about(experiment: ExperimentConfig) -> str:
     """What was trained on what, for how long, and how it was judged."""
     kinds = ", ".join(dict.fromkeys(f"{arm.algorithm} on {arm.env.id}" for arm in experiment.arms))
-    steps = sorted({_trained(experiment, arm, seed) for arm in experiment.arms for seed in experiment.seeds})
-    how_long = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
+    steps = sorted(  # whole rollouts, which may be more than `total_steps`
+        int(finished_facts(experiment.run_folder(arm, seed)).get("timesteps", arm.total_steps))
+        * arm.action_repeat
+        for arm in experiment.arms
+        for seed in experiment.seeds
+    )
+    how_long = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
     seeds = len(experiment.seeds)
     begun = ""
     for arm in experiment.arms:
@@ -232,18 +228,3 @@ def about(experiment: ExperimentConfig) -> str:
         f"{kinds}, {how_long} steps, {seeds} seed{'s' * (seeds > 1)}; evaluation on"
         f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed.{begun}"
     )
-
-
-def _trained(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> int:
-    """Control steps of a run: whole rollouts, which may be more than `total_steps`."""
-    facts = finished_facts(experiment.run_folder(arm, seed))
-    return int(facts.get("timesteps", arm.total_steps)) * arm.action_repeat
-
-
-def _versions() -> Iterator[tuple[str, str]]:
-    yield "python", platform.python_version()
-    for package in _PACKAGES:
-        try:
-            yield package, version(package)
-        except PackageNotFoundError:
-            continue

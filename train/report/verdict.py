@@ -1,4 +1,4 @@
-"""The verdict in words, and the big numbers; they must not say more than the numbers do."""
+"""The verdict in words; it must not say more than the numbers do."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 
 from ..config import ArmConfig, ExperimentConfig
 from ..evaluation.episode_selection import Pair, compared_pairs
-from ..evaluation.metrics import NOT_JUDGED
-from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, judged_by, number, spread
+from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, judged_by, number
 
 
 class Side(NamedTuple):
@@ -52,14 +51,12 @@ class Comparison(NamedTuple):
         """The two sides differ only in the filter at evaluation."""
         return self.pairs[0].bare == self.pairs[0].filtered
 
-
-class Card(NamedTuple):
-    """A big number with what it counts, and what it is to be compared with; its mood is "", "good" or "bad"."""
-
-    title: str
-    value: str
-    lines: Sequence[str]
-    mood: str = ""
+    def who(self, arm: str) -> str:
+        """An arm of a single pair, by how it was trained."""
+        if self.same_policies:
+            return "The policy"
+        through = arm == self.pairs[0].filtered.name
+        return "Trained through the filter" if through else "Trained without the filter"
 
 
 def _side(summary: Summary, arms: Sequence[ArmConfig], condition: str, training: bool = False) -> Side:
@@ -96,15 +93,12 @@ def compare(experiment: ExperimentConfig, summary: Summary) -> Comparison | None
     on = _side(summary, filtered, "filter_on", training)
     if not off.steps or not on.steps:
         return None
-    arms = (
-        {arm.name: arm for arm in pairs[0]} if len(pairs) == 1 else {}
-    )  # of several tasks there is no common return
-    each = {
-        (name, condition): _side(summary, [arm], condition)
-        for name, arm in arms.items()
+    outcomes = {
+        (arm.name, condition): side
+        for arm in (pairs[0] if len(pairs) == 1 else ())  # of several tasks there is no common return
         for condition in ("filter_off", "filter_on")
+        if (side := _side(summary, [arm], condition)).returns and side.steps
     }
-    outcomes = {key: side for key, side in each.items() if side.steps and side.returns}
     return Comparison(pairs, off, on, _side(summary, filtered, "filter_on"), outcomes)
 
 
@@ -115,9 +109,9 @@ def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
     without and with the filter.
     """
     found = compare(experiment, summary)
+    judge = judged_by(experiment, summary.judged)
     if found is None:
-        return _without_comparison(experiment, summary)
-    judge = judged_by(experiment, found.judged)
+        return [part for part in ("There is no filter to compare with yet.", judge) if part]
     first = [_safety(found.off, found.on), judge] if found.judged else [judge, _own_measure(found.on)]
     collisions = ""
     if found.off.collisions or found.on.collisions:
@@ -140,10 +134,9 @@ def _safety(off: Side, on: Side) -> str:
     if not on.violations:
         return "No violation with the filter, and none without it: the task did not put it to the test."
     through = f"{on.violations:,} of {on.steps:,} steps ({percent(on.share)}) with it, {without} without."
-    lowered = (
-        "lowered violations without removing them" if on.share < off.share else "did not lower violations"
-    )
-    return f"The filter {lowered}: {through}"
+    if on.share < off.share:
+        return f"The filter lowered violations without removing them: {through}"
+    return f"The filter did not lower violations: {through}"
 
 
 def _own_measure(on: Side) -> str:
@@ -161,24 +154,19 @@ def _price(found: Comparison) -> list[str]:
     if not found.outcomes:
         return []
     told = [_policy(found, arm) for arm in dict.fromkeys(arm for arm, _ in found.outcomes)]
-    return [*told, " ".join(filter(None, (_choice(found), _brackets(found), _training(found))))]
+    return [*told, _choice(found)]
 
 
-def _policy(found: Comparison, name: str) -> str:
+def _policy(found: Comparison, arm: str) -> str:
     """What one arm's policies returned in evaluation, without and with the filter."""
-    if found.same_policies:
-        who, phrases = "The policy", ("without the filter", "with it")
-    elif name == found.pairs[0].filtered.name:
-        who, phrases = "Trained through the filter, the policy", ("with it taken off", "with it")
-    else:
-        who, phrases = "Trained without the filter, the policy", ("without it", "with it added afterwards")
     parts = []
-    for condition, phrase in zip(("filter_off", "filter_on"), phrases, strict=True):
-        side = found.outcomes.get((name, condition))
+    for condition, phrase in (("filter_off", "with the filter off"), ("filter_on", "with it on")):
+        side = found.outcomes.get((arm, condition))
         if side is not None:
             returns = side.returns[0]
             told = number(returns.iqm) if returns.low is None else str(returns)
             parts.append(f"{told} {phrase}{_in_brackets(side)}")
+    who = found.who(arm) + ("" if found.same_policies else ", the policy")
     return f"{who} returned per evaluation episode {' and '.join(parts)}."
 
 
@@ -199,35 +187,12 @@ def _choice(found: Comparison) -> str:
     if added.iqm == through.iqm:
         return "With the filter on, both returned the same."
     better = "trained without it" if added.iqm > through.iqm else "trained through it"
-    return f"With the filter on, the policy {better} returned more ({_how_surely(added, through)})."
-
-
-def _how_surely(one: Estimate, other: Estimate) -> str:
-    seeds = min(one.seeds, other.seeds)
-    if seeds < SEEDS_FOR_AN_INTERVAL:
-        return "one seed says little" if seeds < 2 else f"{seeds} seeds say little"
-    assert one.low is not None and one.high is not None and other.low is not None and other.high is not None
-    apart = one.low > other.high or other.low > one.high
-    return f"the intervals over {seeds} seeds {'lie apart' if apart else 'overlap'}"
-
-
-def _brackets(found: Comparison) -> str:
-    counts = [side.returns[0].seeds for side in found.outcomes.values()]
-    if max(counts) < 2:
-        return "One seed: no interval."
-    if max(counts) < SEEDS_FOR_AN_INTERVAL:
-        return f"In brackets the range over {max(counts)} seeds, which is not an interval."
-    rest = "" if min(counts) >= SEEDS_FOR_AN_INTERVAL else ", of two seeds their range"
-    return f"In brackets bootstrap 95 % intervals over seeds{rest}."
-
-
-def _training(found: Comparison) -> str:
-    """For how long the compared policies were trained."""
-    arms = {arm.name: arm for arm in found.pairs[0]}
-    lengths = [f"{arm.total_steps * arm.action_repeat:,}" for arm in arms.values()]
-    if len(set(lengths)) == 1:
-        return f"Trained for {lengths[0]} control steps{' each' if len(lengths) > 1 else ''}."
-    return f"Trained for {' and '.join(lengths)} control steps."
+    seeds = min(added.seeds, through.seeds)
+    surely = "one seed says little" if seeds < 2 else f"{seeds} seeds say little"
+    if seeds >= SEEDS_FOR_AN_INTERVAL:
+        apart = max(added.low or 0.0, through.low or 0.0) > min(added.high or 0.0, through.high or 0.0)
+        surely = f"the intervals over {seeds} seeds {'lie apart' if apart else 'overlap'}"
+    return f"With the filter on, the policy {better} returned more ({surely})."
 
 
 def _work(on: Side, evaluated: Side) -> str:
@@ -248,70 +213,3 @@ def _work(on: Side, evaluated: Side) -> str:
 def _failed(infeasible: int, fallback: int) -> str:
     were = "step was" if infeasible == 1 else "steps were"
     return f"{infeasible:,} {were} infeasible and {fallback:,} ran the fallback"
-
-
-def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> list[str]:
-    parts = ["There is no filter to compare with yet."]
-    for arm in experiment.arms:
-        for condition, words in (("filter_off", "in evaluation"), ("training", "while training")):
-            alone = _side(summary, [arm], condition)
-            if alone.steps and alone.returns:
-                said = f"{arm.name}: return {number(alone.returns[0].iqm)} {words}"
-                if alone.violations is not None:
-                    said += f", {alone.violations:,} of {alone.steps:,} steps in violation"
-                parts.append(f"{said}.")
-                break
-    return [part for part in (*parts, judged_by(experiment, summary.judged)) if part]
-
-
-def cards(experiment: ExperimentConfig, summary: Summary, filter_us: float | None) -> list[Card]:
-    """The numbers that a reader should know after ten seconds; none where there is no filter to compare with.
-
-    Args:
-        experiment: The experiment.
-        summary: Its numbers.
-        filter_us: Mean time of a filter call.
-    """
-    found = compare(experiment, summary)
-    if found is None:
-        return []
-    off, on = found.off, found.on
-    scope = "of evaluation" if found.same_policies else "of training and evaluation"
-    parts = [_return(found, arm, condition) for arm, condition in found.outcomes]
-    if found.judged:
-        mood = "good" if not on.violations and off.violations else "bad" if on.share > off.share else ""
-        of = [f"with the filter, of {on.steps:,} {scope}", f"without: {off.violations:,} of {off.steps:,}"]
-        parts.append(Card("Steps in violation", f"{on.violations:,}", of, mood))
-    else:
-        what = f"by the filter's own measure (h < 0), of {on.steps:,} {scope}"
-        parts.append(Card("Unsafe steps", f"{on.unsafe:,}", [what, f"violations: {NOT_JUDGED}"]))
-    if on.changed is not None:
-        parts.append(Card("Steps changed", percent(on.changed), ["by the filter, in evaluation"]))
-    nothing = f"where no action was admissible, {scope}"
-    parts.append(
-        Card("Infeasible steps", f"{on.infeasible:,}", [nothing, f"fallback: {on.fallback:,} steps"])
-    )
-    if filter_us is not None:
-        parts.append(
-            Card("Filter time per step", f"{filter_us:,.0f} µs", ["mean, on the machine that ran it"])
-        )
-    return parts
-
-
-def _return(found: Comparison, arm: str, condition: str) -> Card:
-    """What one arm's policies returned in evaluation with the filter off or on."""
-    filtered = arm == found.pairs[0].filtered.name
-    trained = "Trained through the filter" if filtered else "Trained without the filter"
-    side = found.outcomes[arm, condition]
-    returns = side.returns[0]
-    lines = ["return per episode"]
-    if returns.low is not None and returns.high is not None:
-        lines.append(f"{spread(returns.seeds)} {number(returns.low)} to {number(returns.high)}")
-    hurt = (
-        f"{side.violations:,} of {side.steps:,} steps in violation"
-        if side.violations
-        else "no step in violation"
-    )
-    lines.append(f"violations {NOT_JUDGED}" if side.violations is None else hurt)
-    title = f"{arm if found.same_policies else trained}, {condition.replace('_', ' ')}"
-    return Card(title, number(returns.iqm), lines)

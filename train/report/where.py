@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from ..evaluation.scene import Scene
 from ..evaluation.step_log import StepLog
 from .drawing import BAD, MARK, Picture, draw
 
@@ -22,47 +21,72 @@ _MOST_ROWS: Final = 20_000
 _HAZARD, _GOAL, _VASE = "#6f7fd6", "#2c8f4e", "#2aa5ad"
 
 
-def scene_picture(title: str, scene: Scene, color: str, together: Sequence[Scene]) -> Picture:
-    """An episode from above: the robot's path, what stands there, where the filter acted, and violations.
+class Scene(NamedTuple):
+    """An episode of a log, seen from above.
 
-    Args:
-        title: Of the picture.
-        scene: The episode.
+    Attributes:
+        title: Of its picture.
         color: Of its path.
-        together: Scenes whose pictures have the same frame.
+        log: Steps, whose first two coordinates are x and y in m.
+        steps: Those of the episode, shape (T,).
+        places: As `StepRecorder` has them.
     """
-    places = np.concatenate([part for each in together for part in (each.agent, each.goals, each.hazards)])
-    (left, low), (right, high) = places.min(axis=0) - 0.4, places.max(axis=0) + 0.4
-    violated, changed = int(scene.violated.sum()), int(scene.intervened.sum())
+
+    title: str
+    color: str
+    log: StepLog
+    steps: NDArray[np.bool_]
+    places: Mapping[str, Any]
+
+    @property
+    def path(self) -> NDArray[np.floating]:
+        """Where each step began, shape (steps, 2), m."""
+        return self.log.coordinates[self.steps][:, :2]
+
+
+def scene_pictures(scenes: Sequence[Scene]) -> list[Picture]:
+    """Paths among hazards, goals and vases, where the filter acted, and violations; all in one frame."""
+    points = [scene.path for scene in scenes]
+    points += [
+        np.array(scene.places[what])[:, :2]
+        for scene in scenes
+        for what in ("hazard", "goal")
+        if scene.places[what]
+    ]
+    return [_scene_picture(scene, np.concatenate(points)) for scene in scenes]
+
+
+def _scene_picture(scene: Scene, inside: NDArray[np.floating]) -> Picture:
+    path, places = scene.path, scene.places
+    changed, violated = scene.log.intervened[scene.steps], scene.log.violated[scene.steps]
 
     def paint(axes: Axes) -> None:
+        (left, low), (right, high) = inside.min(axis=0) - 0.4, inside.max(axis=0) + 0.4
         axes.set(xlabel="x in m", title="y in m", aspect="equal", xlim=(left, right), ylim=(low, high))
-        for x, y in scene.hazards:
-            axes.add_patch(Circle((x, y), scene.hazard_radius, facecolor=_HAZARD, alpha=0.35))
-        for x, y in scene.vases:
-            axes.add_patch(Rectangle((x - 0.08, y - 0.08), 0.16, 0.16, facecolor=_VASE, alpha=0.5))
-        for at, (x, y) in enumerate(scene.goals, start=1):
-            axes.add_patch(Circle((x, y), scene.goal_radius, facecolor=_GOAL, alpha=0.15, edgecolor=_GOAL))
-            axes.text(x, y, str(at), color=_GOAL, ha="center", va="center", weight="bold")
-        axes.plot(*scene.agent.T, color=color, linewidth=1.3, label="path")
-        axes.plot(
-            *scene.agent[0], "o", markerfacecolor="none", color="black", linestyle="none", label="start"
-        )
-        for places, what, mark, size in (
-            (scene.intervened, "changed by the filter", MARK, 8),
-            (scene.violated, "in violation", BAD, 14),
+        for what, radius, hue in (
+            ("hazard", places["hazard_radius"], _HAZARD),
+            ("goal", places["goal_radius"], _GOAL),
+            ("vase", 0.1, _VASE),
         ):
-            if places.any():
-                axes.scatter(*scene.agent[:-1][places].T, s=size, color=mark, zorder=3, label=what)
-        for what, hue, there in (
-            ("hazard", _HAZARD, scene.hazards), ("goals, in order", _GOAL, scene.goals), ("vase", _VASE, scene.vases)
-        ):  # fmt: skip
-            if len(there):
-                axes.scatter([], [], color=hue, alpha=0.5, label=what)
+            size = float(np.max(radius, initial=0.0))
+            for at, place in enumerate(places[what]):
+                label = what if at == 0 else None
+                axes.add_patch(Circle(place[:2], size, facecolor=hue, alpha=0.4, label=label))
+        for at, place in enumerate(places["goal"], start=1):
+            axes.text(place[0], place[1], str(at), color=_GOAL, ha="center", va="center", weight="bold")
+        axes.plot(*path.T, color=scene.color, linewidth=1.3, label="path")
+        axes.plot(*path[0], "o", markerfacecolor="none", color="black", linestyle="none", label="start")
+        for flags, what, mark, size in (
+            (changed, "changed by the filter", MARK, 8),
+            (violated, "in violation", BAD, 14),
+        ):
+            if flags.any():
+                axes.scatter(path[flags, 0], path[flags, 1], s=size, color=mark, zorder=3, label=what)
 
-    steps = len(scene.violated)
-    reading = f"{violated:,} of {steps:,} steps in violation, {changed:,} changed by the filter."
-    return Picture(title, reading, draw(paint, height=4.1))
+    reading = (
+        f"{violated.sum():,} of {len(path):,} steps in violation, {changed.sum():,} changed by the filter."
+    )
+    return Picture(scene.title, reading, draw(paint, height=4.1))
 
 
 def telling_pair(coordinates: NDArray[np.floating], flags: NDArray[np.bool_]) -> tuple[int, int]:
@@ -138,7 +162,8 @@ def _place(
             axes.set_aspect("equal")  # a round obstacle is to look round
         shades = LinearSegmentedColormap.from_list("shares", ["#e8e9ea", color])
         cells = axes.hexbin(
-            *places[inside].T,
+            places[inside, 0],
+            places[inside, 1],
             C=flags[inside],
             gridsize=(_CELLS, int(_CELLS * 0.55)),
             extent=(low[0], high[0], low[1], high[1]),

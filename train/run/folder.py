@@ -104,7 +104,9 @@ def claim_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
         shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)
         for name in (EPISODES, START_FILE):
             (folder / name).unlink(missing_ok=True)
-    write_json(folder / RUN_FILE, {"arm": arm.name, "seed": seed, "config": arm.fingerprint()})
+    ours = {"arm": arm.name, "seed": seed, "config": arm.fingerprint()}
+    if not _is_begun(folder) or read_json(folder / RUN_FILE) != ours:
+        write_json(folder / RUN_FILE, ours)
 
 
 def _is_begun(folder: Path) -> bool:

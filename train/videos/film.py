@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array
 from safe_wrappers.drawing.scene import find_renderer, set_size
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
@@ -43,8 +42,6 @@ _COLORS: Final = {
     "now": (255, 255, 255),
     "title": (29, 35, 43),
 }
-_SEEN: Final = 0.6
-"""Share of the picture, about its middle, in which a robot is kept: words and strips are near the edges."""
 
 
 def for_film(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
@@ -54,17 +51,13 @@ def for_film(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
 
 
 class InSight(gym.Wrapper[Any, Any, Any, Any]):
-    """Frames in which the robot stays in sight: the free camera moves sideways by as little as that takes.
+    """Frames in whose middle the robot stays: the free camera follows it.
 
     Fixed cameras stay where they are, and so does the picture of an env that MuJoCo does not draw.
 
     Args:
         env: Makes frames (render mode "rgb_array").
     """
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self._home: Array | None = None
 
     def render(self) -> Any:
         """The env's frame."""
@@ -73,13 +66,9 @@ class InSight(gym.Wrapper[Any, Any, Any, Any]):
             viewer = renderer._get_viewer(str(self.render_mode))
             # Half of what a frame costs without a graphics card.
             viewer.scn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
-            camera = viewer.cam
-            if self._home is None:
-                self._home = camera.lookat.copy()
             root = robot_root(renderer.model)
             if root is not None:
-                robot, aspect = renderer.data.subtree_com[root], renderer.width / renderer.height
-                camera.lookat[:] = self._home + _aside(renderer.model, camera, self._home, robot, aspect)
+                viewer.cam.type, viewer.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, root
         return self.env.render()
 
 
@@ -94,21 +83,6 @@ def robot_root(model: mujoco.MjModel) -> int | None:
         if kind == kinds.mjTRN_BODY:
             return int(model.body_rootid[at])
     return None
-
-
-def _aside(model: mujoco.MjModel, camera: Any, home: Array, robot: Array, aspect: float) -> Array:
-    """By how much, m, a camera has to look beside a point so that the robot is inside the picture's middle."""
-    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
-    flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    ahead = np.cos(elevation) * flat + np.array([0.0, 0.0, np.sin(elevation)])
-    right = np.array([flat[1], -flat[0], 0.0])
-    offset = robot - (home - camera.distance * ahead)
-    half = max(offset @ ahead, 0.0) * np.tan(np.radians(model.vis.global_.fovy) / 2.0)
-    aside = np.zeros(3)
-    for axis, reach in ((right, half * aspect), (np.cross(right, ahead), half)):
-        place = offset @ axis
-        aside += (place - np.clip(place, -_SEEN * reach, _SEEN * reach)) * axis
-    return aside
 
 
 @dataclass

@@ -6,7 +6,7 @@ import json
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
@@ -23,8 +23,6 @@ from ..run.stack import make_stack
 from ..run.training import finished_checkpoint
 from .film import film_episodes, for_film
 from .rendering import find_rendering
-
-_PROBLEM: Final = "problem.json"
 
 
 class Video(NamedTuple):
@@ -43,15 +41,10 @@ def video_path(experiment: ExperimentConfig, arm: ArmConfig, condition: str) -> 
 
 def load_video(path: Path) -> Video | None:
     """Reads a video back; None if there is none."""
-    facts = _facts(path)
+    facts = read_json(path.with_suffix(".json"))
     if not facts or not path.exists():
         return None
     return Video(path.read_bytes(), facts["speed"], [tuple(episode) for episode in facts["episodes"]])
-
-
-def _facts(path: Path) -> dict[str, Any]:
-    """What was noted of a film; empty where there is none."""
-    return read_json(path.with_suffix(".json"))
 
 
 def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
@@ -62,32 +55,21 @@ def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
         path.with_suffix(".json").unlink(missing_ok=True)
 
 
-def video_problem(experiment: ExperimentConfig) -> str:
-    """The one line that says why there are no videos; empty if nothing is known to stand against them."""
-    path = experiment.folder / "videos" / _PROBLEM
-    return str(read_json(path).get("problem", ""))
-
-
 def record_videos(experiment: ExperimentConfig, console: Console) -> None:
     """Films the shown episodes for every arm and condition that are not on film yet, if the config wants films.
 
-    Nothing here fails an evaluation: where no frame can be drawn, one line says why, on the console and later
-    in the report.
+    Nothing here fails an evaluation: where no frame can be drawn, one line says why.
     """
     shown = shown_episode(experiment)
     if shown is None or not experiment.evaluation.films:
         return
-    problem = ""
     envs: list[EnvConfig] = []
     for arm in experiment.arms:
         if arm.env not in envs:
             envs.append(arm.env)
-            problem = _record_env(experiment, arm.env, shown, console) or problem
-    path = experiment.folder / "videos" / _PROBLEM
-    path.unlink(missing_ok=True)
-    if problem:
-        write_json(path, {"problem": problem})
-        console.print(f"No videos: {problem}", highlight=False, soft_wrap=True, markup=False)
+            problem = _record_env(experiment, arm.env, shown, console)
+            if problem:
+                console.print(f"No videos: {problem}", highlight=False, soft_wrap=True, markup=False)
 
 
 def _record_env(experiment: ExperimentConfig, env: EnvConfig, shown: ShownEpisode, console: Console) -> str:
@@ -98,10 +80,9 @@ def _record_env(experiment: ExperimentConfig, env: EnvConfig, shown: ShownEpisod
         for condition, used in conditions(arm, experiment.evaluation_filter).items():
             path = video_path(experiment, arm, condition)
             state = _state(arm, used, shown, finished_checkpoint(arm, shown.seed, folder).timesteps)
-            if arm.env == env and (_facts(path).get("state") != state or not path.exists()):
-                path.unlink(
-                    missing_ok=True
-                )  # a film of another policy or episode must not be taken for this one
+            same = read_json(path.with_suffix(".json")).get("state") == state and path.exists()
+            if arm.env == env and not same:
+                path.unlink(missing_ok=True)  # it shows another policy or episode
                 name = f"video {arm.name} {condition.replace('_', ' ')}"
                 jobs.append(Job(name, 1, "episodes", record_video, (arm, shown, folder, used, path)))
     if not jobs:

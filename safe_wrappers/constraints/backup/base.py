@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.nearest_discs import NUMBERS
+from safe_wrappers.control.numerics.planar import NUMBERS
 from safe_wrappers.filter.constraint import BoundConstraint, Memory
 from safe_wrappers.plants.plant import Plant
 
@@ -87,7 +87,7 @@ class BoundDetourClearance(BoundBackupClearance):
 
     @abstractmethod
     def nearest(self, neighbours: int) -> Array:
-        """The nearest discs in the machine's frame: see `control/numerics/nearest_discs.py`."""
+        """The nearest discs in the machine's frame: see `control/numerics/planar.py`."""
 
     def feature_count(self, neighbours: int) -> int:
         return 2 + NUMBERS * neighbours

@@ -12,11 +12,10 @@ from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
-from safe_wrappers.control.numerics.nearest_discs import nearest_discs
+from safe_wrappers.control.numerics.planar import nearest_discs
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces
-from safe_wrappers.filter.constraint_batch import ConstraintBatch
+from safe_wrappers.filter.constraint import Constraint, ConstraintBatch, HalfSpaces
 from safe_wrappers.plants.mujoco.actuators import Actuators, acting_ranges
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -43,7 +42,6 @@ class HeadingDriveClearance(Constraint):
         margin: Fixed protective distance, m.
         state_error: Bound on the error of the measured position, m.
         uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
-        brake: False: the backup coasts along the heading, too; it needs no drive, and more room.
         detour: When a driving action is refused, first try the same drive while turning towards the nearer tangent of
             the disc in the way, then turning alone; both only if admitted. No safety measure.
     """
@@ -53,7 +51,6 @@ class HeadingDriveClearance(Constraint):
     margin: float = 0.002
     state_error: float = 0.0
     uncertainty: float = 0.0
-    brake: bool = True
     detour: bool = False
 
     promise = "proved"
@@ -93,7 +90,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
 
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
-        self._scene = self.models, np.empty(6), self.discs(), self.spec.brake, self.reserve
+        self._scene = self.models, np.empty(6), self.discs(), self.reserve
         qpos, qvel, place = self.plant.qpos, self.plant.qvel, self.frame.place
         value, self._in_play = among.least_clearance(qpos, qvel, place, self._scene)
         return np.array([value])
@@ -155,7 +152,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
     def draw(self) -> list[Mark]:
         """The discs with what is kept free before them; the outline of the area that braking sweeps, and its end."""
         motion = Motion(*self._scene[1].tolist())
-        path = stopping_path(self.drive, motion, self.spec.brake)
+        path = stopping_path(self.drive, motion)
         corners = path_corners(path)
         found = obstacle_marks(self.spec.obstacles, self.plant, self.reserve, corners[0])
         return [*found, *line("way", corners, THIN, closed=True), ball("way", corners[2], 3.0 * THIN)]
@@ -239,7 +236,7 @@ class HeadingDriveBatch(ConstraintBatch):
     ) -> tuple[Array, NDArray[np.int64]]:
         self._observe()
         n, one = len(proposals), self._bound[0]
-        scene = self._models, self._motions, self._discs, self._first, one.spec.brake, one.reserve
+        scene = self._models, self._motions, self._discs, self._first, one.reserve
         values, admitted, stages = np.empty(n), np.empty(n, dtype=bool), np.zeros(n, dtype=np.int64)
         pairs = np.ascontiguousarray(self._pairs(proposals))
         among.admit_each(*scene, pairs, values, admitted)

@@ -14,10 +14,9 @@ from safe_wrappers.constraints.contact.contact_feasibility import checked_fricti
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.control.legged import whole_body
-from safe_wrappers.control.legged.predicted_positions import predicted_position_rows
-from safe_wrappers.control.legged.support import common_plane, support_polygon, support_rows
+from safe_wrappers.control.legged.support import common_plane, support_rows
 from safe_wrappers.control.legged.whole_body import WholeBodySolution, WholeBodyStatus
-from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem, predicted_position_rows
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
@@ -140,9 +139,9 @@ class BoundStance(BoundConstraint):
         if np.count_nonzero(pressing) < 3:
             return None
         plane = common_plane(points[pressing], normals[pressing])
-        if plane is None or len(support_polygon(plane.flat(points[pressing]))) < 3:
+        some = None if plane is None else support_rows(points[pressing], plane, self.spec.zmp_inset)
+        if some is None:
             return None
-        some = support_rows(points[pressing], plane, self.spec.zmp_inset)
         rows = np.zeros((len(some), len(points), 3))
         rows[:, pressing] = some.reshape(len(some), -1, 3)
         return np.asarray(rows.reshape(len(some), -1))

@@ -9,7 +9,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.constraints.contact.contact_feasibility import require_contacts
 from safe_wrappers.constraints.rollout import BoundSlacks
-from safe_wrappers.control.legged.support_distances import support_distances
+from safe_wrappers.control.legged.support import support_distances
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.contacts import ContactForecast
 from safe_wrappers.plants.plant import Plant

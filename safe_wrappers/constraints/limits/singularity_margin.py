@@ -36,15 +36,13 @@ class SingularityMargin(RolloutConstraint):
     a plant that is right. Gravity, contacts and coupling can be stronger than the actuators.
 
     Args:
-        threshold: Smallest w, in m^k for k translations and hinges (times `length` to the number of rotations).
+        threshold: Smallest w, in m^k for k directions and hinges.
         site: Name of the site whose motion the task is about; or
         body: of a body, meaning its frame's origin; or
         geom: of a geom, meaning its centre.
         directions: Of translation, some of "xyz" in the world's axes.
-        rotations: About these axes, likewise.
-        length: Length that weighs a rotation against a translation, m; needed if there are both.
         joints: Names of those that do the task. None: those that an actuator drives directly and that move the frame.
-        task_speed: Speed that has to be possible in every direction, m/s (rad/s for rotations alone).
+        task_speed: Speed that has to be possible in every direction, m/s.
         rate_limit: Largest rate of each joint at that speed, rad/s for hinges, m/s for slides.
         margin: Kept free above the threshold, as a share of it.
         horizon: Control steps to forecast; cover the braking time.
@@ -59,8 +57,6 @@ class SingularityMargin(RolloutConstraint):
     body: str | None = None
     geom: str | None = None
     directions: str = "xyz"
-    rotations: str = ""
-    length: float | None = None
     joints: Sequence[str] | None = None
     task_speed: float | None = None
     rate_limit: float | None = None
@@ -73,7 +69,7 @@ class SingularityMargin(RolloutConstraint):
 
     def __post_init__(self) -> None:
         self._check_shared()
-        check_fields(self, positive, ("threshold", "task_speed", "rate_limit", "length"), "the task's units")
+        check_fields(self, positive, ("threshold", "task_speed", "rate_limit"), "the task's units")
         both = self.task_speed, self.rate_limit
         if (self.threshold is None) is (None in both) or (
             self.threshold is not None and both != (None, None)
@@ -89,18 +85,12 @@ class SingularityMargin(RolloutConstraint):
         self._kind = named[0]
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
-        for name, given in (("directions", self.directions), ("rotations", self.rotations)):
-            if not (isinstance(given, str) and set(given) <= set("xyz") and len(set(given)) == len(given)):
-                raise ConfigurationError(f'{name} is some of "xyz", each once, or ""; got {given!r}')
-        if not self.directions + self.rotations:
-            raise ConfigurationError('a task has directions (some of "xyz"), rotations, or both; got neither')
-        if self.length is None and self.directions and self.rotations:
-            raise ConfigurationError(
-                "for both directions and rotations give the length (m) that weighs rotations"
-            )
-        weight = 1.0 if self.length is None else self.length
-        self._rows = ["xyz".index(d) for d in self.directions] + [3 + "xyz".index(r) for r in self.rotations]
-        self._weights = np.array([1.0] * len(self.directions) + [weight] * len(self.rotations))
+        given = self.directions
+        if not (
+            isinstance(given, str) and given and set(given) <= set("xyz") and len(set(given)) == len(given)
+        ):
+            raise ConfigurationError(f'directions is some of "xyz", each once; got {given!r}')
+        self._rows = ["xyz".index(direction) for direction in given]
 
     def bind(self, plant: Plant) -> "BoundSingularityMargin":
         return BoundSingularityMargin(self, plant)
@@ -127,7 +117,7 @@ class BoundSingularityMargin(BoundRollout):
         moving = np.linalg.norm(jacobians, axis=1).max(axis=0) > _STILL
         self._joints = [j for j, moves in zip(self._joints, moving, strict=True) if moves]
         jacobians = jacobians[..., moving]
-        task = f"directions={spec.directions!r}, rotations={spec.rotations!r}"
+        task = f"directions={spec.directions!r}"
         if len(self._joints) < len(spec._rows):
             there = ", ".join(model.joint(j).name for j in self._joints) or "none"
             raise ConfigurationError(
@@ -187,16 +177,15 @@ class BoundSingularityMargin(BoundRollout):
         return qpos
 
     def _jacobians(self, qpos: Array) -> Array:
-        """The task's rows, weighed, over the joints that do it, at finite positions (k, nq): shape (k, m, n)."""
+        """The task's rows over the joints that do it, at finite positions (k, nq): shape (k, m, n)."""
         model, data, of_frame = self.plant.model, self._data, _JACOBIANS[self.spec._kind]
-        both = np.empty((len(qpos), 2, 3, model.nv))
-        for q, (linear, angular) in zip(qpos, both, strict=True):
+        found = np.empty((len(qpos), 3, model.nv))
+        for q, linear in zip(qpos, found, strict=True):
             data.qpos[:] = q
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
-            of_frame(model, data, linear, angular, self._index)
-        of_twist = both.reshape(len(qpos), 6, model.nv)[:, self.spec._rows]
-        return np.asarray(of_twist[..., model.jnt_dofadr[self._joints]] * self.spec._weights[:, None])
+            of_frame(model, data, linear, None, self._index)
+        return found[:, self.spec._rows][..., model.jnt_dofadr[self._joints]]
 
     def _measure(self, qpos: Array) -> Array:
         """w, shape (k,), below zero beyond the singular pose; NaN where a position is not finite."""

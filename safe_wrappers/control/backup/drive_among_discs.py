@@ -44,13 +44,12 @@ SAME: Final = 1e-6
 REST: Final = 16.0
 """Time until rest, in time constants of the coasting: of 1 m, 0.1 um are left."""
 
-Scene = tuple[Array, Array, Array, bool, float]
+Scene = tuple[Array, Array, Array, float]
 """What is seen, as a plain tuple, which compiled code takes fastest.
 
 * models: constants of the body, then of each corner of its uncertainty, shape (1 + c, 14)
 * motion: as `Motion`, shape (6,)
 * discs: x, y and the distance to keep from there, margin in it, m, shape (n, 3)
-* brake: whether the backup manoeuvre brakes along the heading
 * reserve: the margin, m
 """
 
@@ -61,7 +60,6 @@ class Look(NamedTuple):
     Attributes:
         models: As in `Scene`.
         body: The first of them.
-        brake: As in `Scene`.
         motion: Of the body.
         path: From there, without any further control but the backup manoeuvre's.
         discs: Those that one hold can bring into play: x, y and the distance to keep, m, shape (k, 3).
@@ -75,7 +73,6 @@ class Look(NamedTuple):
 
     models: Array
     body: HeadingDrive
-    brake: bool
     motion: Motion
     path: StoppingPath
     discs: Array
@@ -109,16 +106,16 @@ def _to_disc(body: HeadingDrive, path: StoppingPath, disc: Array) -> float:
 
 
 @compiled
-def _ends(body: HeadingDrive, m: Motion, brake: bool) -> tuple[float, float]:
+def _ends(body: HeadingDrive, m: Motion) -> tuple[float, float]:
     """The drive controls that brake and that push on, as far as the drive acts."""
     ahead = m.vx * math.cos(m.heading) + m.vy * math.sin(m.heading)
     full = body.drive_limit / body.drive_gain
-    return brake_control(body, ahead) if brake else 0.0, math.copysign(full, ahead)
+    return brake_control(body, ahead), math.copysign(full, ahead)
 
 
 @compiled
 def _least_on_the_way(
-    models: Array, start: Motion, drive: float, turn: float, brake: bool, discs: Array, reserve: float
+    models: Array, start: Motion, drive: float, turn: float, discs: Array, reserve: float
 ) -> float:
     """The least clearance, margin not taken off, m, of a held control and then of the backup until rest.
 
@@ -147,7 +144,7 @@ def _least_on_the_way(
             if near > 2.0 * (coast * com_speed(truth, motion) + abs(truth.com_offset)):
                 break
             forward = motion.vx * math.cos(motion.heading) + motion.vy * math.sin(motion.heading)
-            ahead, around = brake_control(body, forward) if brake else 0.0, 0.0
+            ahead, around = brake_control(body, forward), 0.0
         found = min(found, least)
     return found
 
@@ -155,10 +152,10 @@ def _least_on_the_way(
 @compiled
 def look(scene: Scene) -> Look:
     """Judge the present state."""
-    models, motion, discs, brake, reserve = scene
+    models, motion, discs, reserve = scene
     body = _body(models[0])
     now = Motion(motion[0], motion[1], motion[2], motion[3], motion[4], motion[5])
-    path = stopping_path(body, now, brake)
+    path = stopping_path(body, now)
     control_dt = body.timestep * body.substeps
     coast = body.mass * (1.0 + body.uncertainty) / (body.damping * (1.0 - body.uncertainty))
     change = body.drive_limit / (body.mass * (1.0 - body.uncertainty)) * control_dt
@@ -170,7 +167,7 @@ def look(scene: Scene) -> Look:
     for i in range(n):
         bound = hypot(discs[i, 0] - now.x, discs[i, 1] - now.y) - discs[i, 2] - kept
         if bound != bound:
-            return Look(models, body, brake, now, path, order[:0], math.nan, math.nan, False, reserve, loss)
+            return Look(models, body, now, path, order[:0], math.nan, math.nan, False, reserve, loss)
         place = i
         while place > 0 and bounds[place - 1] > bound:
             bounds[place] = bounds[place - 1]
@@ -191,12 +188,12 @@ def look(scene: Scene) -> Look:
             close += 1
     value, exact = best + reserve, math.inf
     if value < CLOSE_M:
-        exact = _least_on_the_way(models, now, _ends(body, now, brake)[0], 0.0, brake, order, reserve)
+        exact = _least_on_the_way(models, now, _ends(body, now)[0], 0.0, order, reserve)
     safe, beyond = exact >= -HAIR_M, beyond_reach(body, now)
     value = max(value, 0.0) if safe else min(value, exact)
     if beyond > 0.0:
         value = min(value, -beyond * loss)
-    return Look(models, body, brake, now, path, order[:close], best, value, safe, reserve, loss)
+    return Look(models, body, now, path, order[:close], best, value, safe, reserve, loss)
 
 
 @compiled
@@ -210,7 +207,7 @@ def _least_of(path: StoppingPath, at: Look) -> float:
 @compiled
 def _after(at: Look, corner: int, drive: float, turn: float) -> StoppingPath:
     """The stopping path at the end of a held control, predicted with one model of the uncertainty, from 1 on."""
-    return stopping_path(at.body, predict(_body(at.models[corner]), at.motion, drive, turn), at.brake)
+    return stopping_path(at.body, predict(_body(at.models[corner]), at.motion, drive, turn))
 
 
 @compiled
@@ -232,7 +229,7 @@ def _needed(at: Look, disc: Array, backup: StoppingPath) -> float:
 
 @compiled
 def _braking(at: Look) -> float:
-    return _ends(at.body, at.motion, at.brake)[0]
+    return _ends(at.body, at.motion)[0]
 
 
 @compiled
@@ -265,7 +262,7 @@ def _keeps_clear(at: Look, least: float, drive: float, turn: float) -> bool:
     """Whether a control that leaves this clearance leads, step by step, to rest without touching a disc."""
     if not at.safe or min(at.value, least + at.reserve) >= CLOSE_M:
         return True  # an unsafe state promises nothing; elsewhere the closed form says it
-    return _least_on_the_way(at.models, at.motion, drive, turn, at.brake, at.discs, at.reserve) >= HAIR_M
+    return _least_on_the_way(at.models, at.motion, drive, turn, at.discs, at.reserve) >= HAIR_M
 
 
 @compiled
@@ -315,7 +312,7 @@ def rows(at: Look) -> tuple[Array, Array]:
     normals, offsets, k = np.zeros(((len(at.models) - 1) * each, 2)), np.zeros((len(at.models) - 1) * each), 0
     if near == 0:
         return normals[:0], offsets[:0]
-    braking, pushing = _ends(at.body, at.motion, at.brake)
+    braking, pushing = _ends(at.body, at.motion)
     needed = _aim(at, _recovery(at)[1]) if outside else 0.0
     left = np.zeros(4)  # by braking, by pushing on, and by braking while turning left and right
     for i in range(1, len(at.models)):

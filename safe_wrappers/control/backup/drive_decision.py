@@ -190,7 +190,7 @@ def bounds_of(
 
 @compiled
 def _round_inside(out: Array, normals: Array, offsets: Array, low: Array, high: Array) -> None:
-    """`cast_inside` of `filter/projection.py` to single precision, in place."""
+    """`cast_inside` of `control/numerics/projection.py` to single precision, in place."""
     sent, worst, most = np.empty(2, dtype=np.float32), -1, 0.0
     for j in range(2):
         sent[j] = np.float32(min(max(out[j], low[j]), high[j]))
@@ -212,7 +212,6 @@ def admit_each(
     motions: Array,
     discs: Array,
     first: NDArray[np.int64],
-    brake: bool,
     reserve: float,
     proposals: Array,
     values: Array,
@@ -225,14 +224,13 @@ def admit_each(
         motions: Likewise, shape (n, 6).
         discs: All robots' discs, one after the other, shape (d, 3).
         first: Where each robot's discs begin, and the end, shape (n + 1,).
-        brake: Whether the backup manoeuvre brakes along the heading.
         reserve: The margin, m.
         proposals: (drive, turn), shape (n, 2).
         values: Written: as of `least_clearance`, m, shape (n,).
         admitted: Written: whether its proposal is admitted, shape (n,).
     """
     for i in range(len(motions)):
-        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve))
+        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], reserve))
         values[i] = at.value
         admitted[i] = admits(at, proposals[i, 0], proposals[i, 1])
 
@@ -243,7 +241,6 @@ def decide_each(
     motions: Array,
     discs: Array,
     first: NDArray[np.int64],
-    brake: bool,
     reserve: float,
     proposals: Array,
     chosen: NDArray[np.int64],
@@ -262,7 +259,7 @@ def decide_each(
     """
     for r in range(len(chosen)):
         i = chosen[r]
-        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], brake, reserve))
+        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], reserve))
         stage, side, normals, offsets = _decide(at, proposals[i], sides[i], detour, bounds[r], out[i])
         sides[i] = side
         if single:

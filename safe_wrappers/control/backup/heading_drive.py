@@ -207,8 +207,8 @@ def residual_turn_angle(body: HeadingDrive, yaw_rate: float) -> float:
 
 
 @compiled
-def stopping_path(body: HeadingDrive, motion: Motion, brake: bool) -> StoppingPath:
-    """The area that the backup manoeuvre stays in; `brake=False`: coasting along the heading too."""
+def stopping_path(body: HeadingDrive, motion: Motion) -> StoppingPath:
+    """The area that the backup manoeuvre stays in."""
     heading = motion.heading + residual_turn_angle(body, motion.yaw_rate)
     cos, sin = math.cos(heading), math.sin(heading)
     ahead = motion.vx * cos + motion.vy * sin
@@ -217,7 +217,7 @@ def stopping_path(body: HeadingDrive, motion: Motion, brake: bool) -> StoppingPa
     flip_a, flip_s = (-1.0 if ahead < 0.0 else 1.0), (-1.0 if aside < 0.0 else 1.0)
     ahead, aside = abs(ahead), abs(aside)
     coast = body.mass * (1.0 + body.uncertainty) / (body.damping * (1.0 - body.uncertainty))
-    forward = brake_distance(body, ahead) if brake else coast * ahead
+    forward = brake_distance(body, ahead)
     sideways = coast * aside
     wander = _WANDER * sideways
     crossing = min(sideways, forward * aside / ahead) if ahead > 1e-9 else 0.0

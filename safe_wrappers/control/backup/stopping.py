@@ -17,7 +17,6 @@ from safe_wrappers.control.numerics.surfaces import nearest_points
 
 _RETREAT_RATE: Final = 1.0
 """1/s: rate at which a violation is to shrink."""
-_ROUNDING: Final = 1.0 + 1e-9
 _UNBOUNDED: Final = 1e12
 """A control without a bound counts as this large."""
 
@@ -183,32 +182,3 @@ def approach_rows_of(
     distance, normal, curvature = nearest_points(surfaces, point)
     still = np.zeros(normal.shape)
     return approach_rows(distance, normal, still, curvature, velocity, drift, effect, machine)
-
-
-@compiled
-def out_of_reach(surfaces: Array, reach: Array, machine: Machine) -> tuple[Array, bool]:
-    """The rooms of `approach_rows_of`, and whether it certainly has no rows.
-
-    `reach` is what `Points.reaches` says of the point.
-    """
-    low, high, delay_s, control_dt, radius, braking, reserve = machine
-    velocity = reach[3:6]
-    distance, normal, curvature = nearest_points(surfaces, reach[:3])
-    still, none = np.zeros(normal.shape), np.zeros(3)
-    clearance, speed = approaches(distance, normal, still, velocity, delay_s, radius)
-    room, certain = np.empty(len(distance)), True
-    for i in range(len(distance)):
-        room[i] = clearance[i] - held_stop(speed[i], braking, control_dt)
-        limit = held_limit(clearance[i] - reserve, speed[i], braking, control_dt)
-        outside = clearance[i] + radius > 0.0
-        limit += _away(normal[i], none, curvature[i], velocity, reach[6:9], speed[i], outside)
-        gives = strongest = 0.0
-        for j in range(3):
-            for k in range(3):
-                gives += normal[i, j] * reach[9 + 3 * j + k] * normal[i, k]
-        for k in range(len(low)):
-            # What acts now is the control nearest to zero.
-            change = _largest(low[k], high[k]) + abs(min(max(0.0, low[k]), high[k]))
-            strongest += math.sqrt(max(gives * reach[18 + k], 0.0)) * change
-        certain = certain and strongest * _ROUNDING <= limit
-    return room, certain

@@ -17,15 +17,17 @@ from safe_wrappers.checks import Array
 from safe_wrappers.control.contact.friction_cone import cone_excess, friction_pyramid
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.control.legged.whole_body_program import (
+    Candidate,
     Elimination,
     Motion,
+    Program,
     ReducedProgram,
+    by_clarabel,
+    by_daqp,
     eliminate,
     motion_of,
     reduced_program,
 )
-from safe_wrappers.control.numerics.conic_program import Candidate, Program, by_clarabel, by_daqp
-from safe_wrappers.errors import UnknownNameError
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""
@@ -86,25 +88,17 @@ class WholeBodySolution(NamedTuple):
     objective: float
 
 
-def solve_pyramid(problem: WholeBodyProblem, edges: int = 4, solver: str = "daqp") -> WholeBodySolution:
-    """Solve with friction pyramids: a quadratic program, conservative.
-
-    Args:
-        problem: The instant.
-        edges: Of each pyramid, at least 3.
-        solver: "daqp" (an active set: the fast one) or "clarabel" (interior points).
-    """
-    if solver not in ("daqp", "clarabel"):
-        raise UnknownNameError(f"solver {solver!r} is not one of: daqp, clarabel")
+def solve_pyramid(problem: WholeBodyProblem, edges: int = 4) -> WholeBodySolution:
+    """Solve with friction pyramids of so many edges, at least 3: a quadratic program, conservative, by daqp."""
     grips = problem.stance[problem.friction[problem.stance] > 0.0]
     first = None if problem.first_tangents is None else problem.first_tangents[grips]
     pyramids = friction_pyramid(problem.normals[grips], problem.friction[grips], edges, first)
-    return _solve(problem, pyramids[:, :-1], solver)  # the sides imply that nothing pulls
+    return _solve(problem, pyramids[:, :-1])  # the sides imply that nothing pulls
 
 
 def solve_cone(problem: WholeBodyProblem) -> WholeBodySolution:
     """Solve with the exact friction cones: a second-order cone program, by clarabel."""
-    return _solve(problem, None, "clarabel")
+    return _solve(problem, None)
 
 
 def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Array]:
@@ -132,40 +126,36 @@ def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
     return np.asarray(attainable)
 
 
-def _solve(problem: WholeBodyProblem, sides: Array | None, solver: str) -> WholeBodySolution:
+def _solve(problem: WholeBodyProblem, sides: Array | None) -> WholeBodySolution:
     motion = motion_of(problem)
     rigid, loose = eliminate(motion)
     consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _tolerance(problem.wanted)
     reduced = reduced_program(problem, motion, rigid, sides) if consistent else None
     if reduced is not None and not problem.tasks:
-        unchanged = _nominal(problem, motion, reduced, solver)
+        unchanged = _nominal(problem, motion, reduced)
         if unchanged is not None:
             return unchanged
-    if problem.contact_softness > 0.0:
-        reduced = reduced_program(problem, motion, loose, sides, 1.0 / problem.contact_softness)
     verdict = "infeasible"
     if reduced is not None:
-        candidate = _ask(reduced.program, solver)
+        candidate = _ask(reduced.program)
         if candidate.y is not None:
             found = _checked(problem, motion, reduced, candidate.y, WholeBodyStatus.SOLVED)
             if found is not None:
                 return found
         verdict = "failed" if candidate.y is not None else candidate.verdict
-    return _least_violation(problem, motion, loose, sides, solver, verdict)
+    return _least_violation(problem, motion, loose, sides, verdict)
 
 
-def _ask(program: Program, solver: str) -> Candidate:
-    """One solver; clarabel as well before infeasibility is accepted."""
-    if solver == "daqp":
+def _ask(program: Program) -> Candidate:
+    """Daqp where there are no cones; clarabel as well before infeasibility is accepted."""
+    if program.cones is None:
         candidate = by_daqp(program)
         if candidate.y is not None:
             return candidate
     return by_clarabel(program)
 
 
-def _nominal(
-    problem: WholeBodyProblem, motion: Motion, reduced: ReducedProgram, solver: str
-) -> WholeBodySolution | None:
+def _nominal(problem: WholeBodyProblem, motion: Motion, reduced: ReducedProgram) -> WholeBodySolution | None:
     """The nominal control, if contacts can hold it exactly with some forces that they can give."""
     u, inner = problem.nominal, reduced.elimination.size - len(problem.nominal)
     if not ((u >= problem.lower) & (u <= problem.upper)).all():
@@ -174,7 +164,7 @@ def _nominal(
     if inner:
         program = reduced.program.with_first(u)
         # One solver is enough: where it finds no inner forces, the whole problem is solved next.
-        found = by_clarabel(program) if solver != "daqp" else by_daqp(program)
+        found = by_daqp(program) if program.cones is None else by_clarabel(program)
         if found.y is None:
             return None
         y[len(u) :] = found.y
@@ -195,7 +185,6 @@ def _checked(
     answer = _answer(problem, motion, reduced, inside, status)
     missed = answer.residuals
     force = _tolerance(answer.forces)
-    exact = problem.contact_softness == 0.0 or status is WholeBodyStatus.INACTIVE
     program, soft = reduced.program, reduced.softenable
     over = program.rows @ inside - program.limits
     size = np.abs(program.rows[:soft]) @ np.abs(inside)
@@ -204,7 +193,7 @@ def _checked(
         and missed.cone <= force
         and bool((over[soft:] <= force).all())
         and bool((over[:soft] <= TOLERANCE * (1.0 + size)).all())
-        and (not exact or missed.contact <= _tolerance(problem.wanted))
+        and missed.contact <= _tolerance(problem.wanted)
     )
     return answer if fine else None
 
@@ -261,12 +250,10 @@ def _least_violation(
     motion: Motion,
     loose: Elimination,
     sides: Array | None,
-    solver: str,
     verdict: str,
 ) -> WholeBodySolution:
     """Minimise the squared violations of contact accelerations and rows; box and cones stay hard."""
-    softness = problem.contact_softness
-    plain = reduced_program(problem, motion, loose, sides, 1.0 / softness if softness > 0.0 else 0.0)
+    plain = reduced_program(problem, motion, loose, sides)
     nu = len(problem.nominal)
     misses = np.arange(nu, nu + loose.misses)
     half = 0.5 * (problem.upper - problem.lower)
@@ -279,8 +266,8 @@ def _least_violation(
     softer = plain.program._replace(hessian=hessian, linear=share * plain.program.linear)
     program = softer.softened(plain.softenable)
     status = WholeBodyStatus.INFEASIBLE if verdict == "infeasible" else WholeBodyStatus.FAILED
-    for backend in dict.fromkeys((solver, "clarabel")):  # clarabel as well where the first violates its cones
-        candidate = _ask(program, backend)
+    for ask in (_ask, by_clarabel):  # clarabel as well where the first violates its cones
+        candidate = ask(program)
         if candidate.y is not None:
             y = candidate.y[: loose.size].copy()
             y[:nu] = np.clip(y[:nu], problem.lower, problem.upper)

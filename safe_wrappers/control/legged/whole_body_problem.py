@@ -1,12 +1,17 @@
-"""The whole-body control problem at one instant of a robot in contact: `M qacc + h = B u + sum J_k' f_k`."""
+"""The whole-body control problem at one instant of a robot in contact: `M qacc + h = B u + sum J_k' f_k`.
+
+Source: appendix "Hierarchical whole-body control quadratic program" and its caveat: a bound at the present position
+does not cover the motion between samples. So `predicted_position_rows` bound accelerations such that positions keep
+their ranges until a horizon, which is no shorter than stopping takes.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import Array, non_negative, positive
+from safe_wrappers.checks import Array, finite_arrays, non_negative, positive
 from safe_wrappers.control.contact.friction_cone import checked_friction
 from safe_wrappers.errors import ConfigurationError
 
@@ -46,7 +51,6 @@ class WholeBodyProblem:
         contact_acceleration: Wanted at the contact points, shape (k, 3), m/s^2; None is zero.
         control_weight: Of the squared distance from the nominal, positive, a number or shape (nu,).
         force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces of equal effect.
-        contact_softness: A missed contact acceleration r (m/s^2) costs `r^2 / contact_softness`; 0 allows none.
         breaking: Contacts that are to open, shape (k,): force 0, normal acceleration at least the wanted; None: none.
         first_tangents: Direction of each pyramid's first edge, shape (k, 3); None for a default.
         tasks: See `Task`; with any, no control is `inactive`.
@@ -69,7 +73,6 @@ class WholeBodyProblem:
     contact_acceleration: Array | None = None
     control_weight: Array | float = 1.0
     force_weight: float = 1e-8
-    contact_softness: float = 0.0
     breaking: NDArray[np.bool_] | None = None
     first_tangents: Array | None = None
     tasks: Sequence[Task] = ()
@@ -120,15 +123,7 @@ class WholeBodyProblem:
             if name not in ("lower", "upper") and not np.isfinite(value).all():
                 raise ConfigurationError(f"{name} must be finite, got {value}")
         for task in self.tasks:
-            rows = len(task.target)
-            if task.jacobian.shape != (rows, nv) or task.drift.shape != (rows,):
-                shapes = f"{task.jacobian.shape}, {task.drift.shape} and {task.target.shape}"
-                raise ConfigurationError(
-                    f"expected a task's jacobian (r, {nv}), drift and target (r,), got {shapes}"
-                )
             non_negative("a task's weight", task.weight, "its own unit")
-            if not all(np.isfinite(a).all() for a in (task.jacobian, task.drift, task.target)):
-                raise ConfigurationError("a task must be finite")
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
         checked_friction(self.friction)
@@ -137,10 +132,57 @@ class WholeBodyProblem:
         if not (weights.shape == (nu,) and np.isfinite(weights).all() and (weights > 0.0).all()):
             raise ConfigurationError(f"control_weight must be positive, one or of shape ({nu},), got {given}")
         positive("force_weight", self.force_weight, "1/N^2")
-        non_negative("contact_softness", self.contact_softness, "m^2/s^4")
         opens = np.zeros(k, bool) if self.breaking is None else np.asarray(self.breaking, bool)
         acceleration = 0.0 if self.contact_acceleration is None else self.contact_acceleration
         object.__setattr__(self, "stance", np.flatnonzero(~opens))
         object.__setattr__(self, "opening", np.flatnonzero(opens))
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "wanted", acceleration - self.drift)
+
+
+def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float) -> Array:
+    """The largest constant acceleration that stays within a limit until a horizon > 0, shape (...).
+
+    The distance to the limit is in m or rad, the speed towards it in m/s or rad/s. From beyond the limit (a negative
+    distance): the largest that returns to it by the end of the horizon.
+    """
+    d, v = finite_arrays(distance=distance, speed=speed)
+    positive("horizon_s", horizon_s, "s")
+    at_end = 2.0 * (d - horizon_s * v) / horizon_s**2
+    # Where the top of the parabola is before the end, the top may just reach the limit.
+    top_is_inside = (d > 0.0) & (2.0 * d < horizon_s * v)
+    with np.errstate(over="ignore"):  # very close to the limit: the largest finite number
+        at_top = np.maximum(-(v * v) / (2.0 * np.where(d > 0.0, d, 1.0)), -np.finfo(np.float64).max)
+    return np.asarray(np.where(top_is_inside, at_top, at_end))
+
+
+def predicted_position_rows(
+    dofs: ArrayLike,
+    positions: ArrayLike,
+    velocities: ArrayLike,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    horizon_s: float,
+    nv: int,
+) -> tuple[Array, Array]:
+    """Rows `G qacc <= g`, shapes (m, nv) and (m,), that keep joints in range until the horizon, upper limits first.
+
+    The acceleration is constant; there is one row for each finite limit.
+
+    Args:
+        dofs: Indices of the joints' degrees of freedom (slides and hinges), shape (n,).
+        positions: Shape (n,), m or rad.
+        velocities: Shape (n,).
+        lower: Smallest positions, shape (n,); -inf is no limit.
+        upper: Largest positions, shape (n,); inf is no limit.
+        horizon_s: s; a control step, or the time that stopping takes if that is longer.
+        nv: Degrees of freedom of the whole model.
+    """
+    q, v = finite_arrays(positions=positions, velocities=velocities)
+    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    above, below = np.isfinite(high), np.isfinite(low)
+    units = np.eye(nv)[np.asarray(dofs)]
+    rows = np.concatenate([units[above], 0.0 - units[below]])  # 0 - x: no negative zeros
+    upwards = largest_acceleration(high[above] - q[above], v[above], horizon_s)
+    downwards = largest_acceleration(q[below] - low[below], -v[below], horizon_s)
+    return rows, np.concatenate([upwards, downwards])

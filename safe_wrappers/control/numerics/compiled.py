@@ -87,19 +87,10 @@ def compiled(function: Function) -> Function:
 
     It may call only other compiled functions, `math`, and NumPy's plain indexing; tuples may be named.
     """
-    return _compile(function, inline=False)
-
-
-def inlined(function: Function) -> Function:
-    """`compiled` into its callers: a call counts references to every array that it hands on, which takes time."""
-    return _compile(function, inline=True)
-
-
-def _compile(function: Function, inline: bool) -> Function:
     if _COMPILE is None:
         return function
     _drop_stale(function)
-    options = {"error_model": "numpy", "nogil": True, "forceinline": inline}
+    options = {"error_model": "numpy", "nogil": True}
     try:
         return _COMPILE(cache=True, **options)(function)  # type: ignore[no-any-return]
     except RuntimeError:  # no folder to cache in

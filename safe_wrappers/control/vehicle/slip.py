@@ -77,14 +77,6 @@ class Wheel:
     inertia: Array
     damping: Array
 
-    def __post_init__(self) -> None:
-        for name, least in (("radius", "> 0 m"), ("inertia", "> 0 kg m^2"), ("damping", ">= 0 N m s/rad")):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            fits = value >= 0.0 if least.startswith(">=") else value > 0.0
-            if not (np.isfinite(value).all() and fits.all()):
-                raise ConfigurationError(f"a wheel's {name} must be finite and {least}, got {value}")
-            object.__setattr__(self, name, value)
-
     def response(
         self, timestep: float, substeps: int, feedback: Array | float = 0.0, implicit: bool = False
     ) -> Response:

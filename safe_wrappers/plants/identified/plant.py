@@ -16,14 +16,11 @@ from safe_wrappers.plants.env_checks import (
     name_of,
     refuse_changed_actions,
 )
-from safe_wrappers.plants.identified.conformal import scores_needed, upper_bound
-from safe_wrappers.plants.identified.coverage import Coverage
-from safe_wrappers.plants.identified.ensemble import EnsembleModel
-from safe_wrappers.plants.identified.linear import LinearModel
-from safe_wrappers.plants.identified.logs import Episode, checked_episodes
-from safe_wrappers.plants.identified.windows import Model, measured, shortfalls
+from safe_wrappers.plants.identified.coverage import Coverage, scores_needed, upper_bound
+from safe_wrappers.plants.identified.logs import Episode, Model, checked_episodes, measured, shortfalls
+from safe_wrappers.plants.identified.models import EnsembleModel, LinearModel
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
-from safe_wrappers.plants.simulator.substeps import known_substeps
+from safe_wrappers.plants.simulator.plant import known_substeps
 
 MODELS = ("linear", "ensemble")
 _SCALE_WINDOWS = 8  # per fitted episode

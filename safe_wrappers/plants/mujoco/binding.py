@@ -11,7 +11,6 @@ import numpy as np
 from safe_wrappers.checks import Array, positive
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
-from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
 
 ModelOf = Callable[[Any], mujoco.MjModel]
 """Takes the unwrapped env; returns its model."""
@@ -188,3 +187,25 @@ def refuse_other_actions(env: gym.Env[Any, Any], lower: Array, upper: Array) -> 
             f"{name_of(env)} rescales or limits actions in its own step: it has not one action for each control. Use "
             f"AnalyticPlant(f=..., g=..., state=...) with your own f and g: {ranges}"
         )
+
+
+def moves_by_displacement(raw: Any) -> bool:
+    """Whether an unwrapped env is of the Fetch kind: one mocap body welded to the gripper, four actions."""
+    model, space = getattr(raw, "model", None), getattr(raw, "action_space", None)
+    return (
+        isinstance(model, mujoco.MjModel)
+        and isinstance(space, gym.spaces.Box)
+        and space.shape == (4,)
+        and hasattr(raw, "block_gripper")
+        and hasattr(raw, "n_substeps")
+        and len(welds(model)) == model.nmocap == 1
+    )
+
+
+def welds(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Mocap bodies (their mocap ids) and the bodies welded to them."""
+    weld = model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)
+    pairs = zip(model.eq_obj1id[weld].tolist(), model.eq_obj2id[weld].tolist(), strict=True)
+    mocap = model.body_mocapid.tolist()
+    both = (pair for first, second in pairs for pair in ((first, second), (second, first)))
+    return [(mocap[one], other) for one, other in both if mocap[one] >= 0 and mocap[other] < 0]

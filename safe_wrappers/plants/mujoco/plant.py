@@ -3,7 +3,7 @@
 import copy
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import gymnasium as gym
 import mujoco
@@ -18,23 +18,25 @@ from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
 from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
-from safe_wrappers.plants.mujoco.constants import (
+from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
+from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
+from safe_wrappers.plants.mujoco.model import (
     DYNAMICS,
     PLACES,
     Constants,
     different_fields,
     every_constant,
 )
-from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
-from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.snapshot import STATE, Snapshot
+
+STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
 
 _ROUNDING = 1e-6, 1e-6
 """Of controls and states, relative and absolute: envs may compute in single precision."""
 
 
-class MujocoPlant(Snapshot):
+class MujocoPlant(Plant):
     """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
 
     u is the env's action. f and g hold for the present set of active contacts and limits, and are exact for pyramidal
@@ -62,6 +64,9 @@ class MujocoPlant(Snapshot):
 
     bounds_are_action_space: ClassVar[bool] = True
     can_brake: ClassVar[bool] = True
+    model: mujoco.MjModel  #: the plant's own
+    data: mujoco.MjData  #: likewise; at the present state only after `forward` or `pose`
+    _loaded = _forwarded = False
     lower: Array = np.zeros(0)  #: of the action, shape (nu,), once bound: ctrlrange, or -inf and inf
     upper: Array = np.zeros(0)
     action_map: ActionMap | None = None
@@ -244,6 +249,61 @@ class MujocoPlant(Snapshot):
             self._recorder.act(self.data, control)
             mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
         self._keep()
+
+    def _new_snapshot(self) -> None:
+        self._nq, self._nv = int(self.model.nq), int(self.model.nv)
+        self._snapshot: Array = np.zeros(mujoco.mj_stateSize(self.model, STATE))
+
+    def _keep(self) -> None:
+        """Make the data's state the present one."""
+        mujoco.mj_getState(self.model, self.data, self._snapshot, STATE)
+        self._loaded = False
+
+    def _load(self) -> None:
+        if not self._loaded:
+            mujoco.mj_setState(self.model, self.data, self._snapshot, STATE)
+            self._loaded, self._forwarded = True, False
+
+    def _load_to_step(self) -> None:
+        """The data at the present state; the caller may change it."""
+        self._load()
+        self._loaded = False
+
+    @property
+    def time(self) -> float:
+        """Time of the present state, s; under a delay the predicted one."""
+        return float(self._snapshot[0])
+
+    @property
+    def qpos(self) -> Array:
+        """Positions, shape (nq,): m, rad, or quaternions."""
+        return self._snapshot[1 : 1 + self._nq]
+
+    @property
+    def qvel(self) -> Array:
+        """Velocities, shape (nv,): m/s or rad/s."""
+        return self._snapshot[1 + self._nq : 1 + self._nq + self._nv]
+
+    @property
+    def state(self) -> Array:
+        """(qpos, qvel), shape (nq + nv,)."""
+        return self._snapshot[1 : 1 + self._nq + self._nv]
+
+    @property
+    def weight_n(self) -> float:
+        """Weight of everything that moves, N; without gravity its mass in kg."""
+        return of_model.weight_n(self.model)
+
+    def named(self, kind: str, name: str, argument: str = "") -> int:
+        """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all.
+
+        The error also says which `argument` has the name, where the caller may have left that at its default.
+        """
+        return of_model.named(self.model, kind, name, argument)
+
+    def names(self, kind: str, pattern: str = "*") -> list[str]:
+        """All names of a kind that match a shell pattern."""
+        return of_model.names(self.model, kind, pattern)
 
     def forward(self) -> mujoco.MjData:
         """The plant's data with every derived quantity up to date at the present state.

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
+from safe_wrappers.control.legged.centroidal import CentroidalMomentum, centroidal_momentum
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
-from safe_wrappers.plants.mujoco.model import control_range, fixed_bodies, inertia
+from safe_wrappers.plants.mujoco.model import control_range, fixed_bodies, inertia, kinematics
 
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)  # this type and those above are contacts
 
@@ -108,3 +109,26 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
     friction = np.where(dim > 1, data.contact.friction[touching, 0], 0.0).reshape(k)
     geometry = points, normals, first, friction, pushed, pushed_by
     return ContactPoints(*geometry, jacobians, drift, forces, moments, gaps)
+
+
+class MomentumReader:
+    """Computes the momentum of the moving bodies among those chosen, a mask of shape (nbody,), by MuJoCo's subtrees.
+
+    With a chosen body all that hangs from it is chosen. Armature, of no body, is left out.
+    """
+
+    def __init__(self, model: mujoco.MjModel, chosen: NDArray[np.bool_]) -> None:
+        self._model, self._data = model, mujoco.MjData(model)
+        moving = chosen & ~fixed_bodies(model)
+        roots = moving & ~moving[model.body_parentid] & (model.body_subtreemass > 0.0)
+        self._roots = np.flatnonzero(roots)
+
+    def read(self, data: mujoco.MjData) -> CentroidalMomentum | None:
+        """The momentum at the state of the data, which are only read; None where numbers are not finite."""
+        model, own, roots = self._model, self._data, self._roots
+        kinematics(model, data, own)
+        mujoco.mj_subtreeVel(model, own)
+        parts = own.subtree_com[roots], own.subtree_linvel[roots], own.subtree_angmom[roots]
+        if not all(np.isfinite(part).all() for part in parts):
+            return None
+        return centroidal_momentum(model.body_subtreemass[roots], *parts)

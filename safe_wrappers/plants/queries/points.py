@@ -2,9 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-import mujoco
-import numpy as np
-
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -43,14 +40,9 @@ class Points:
             self._machine.named(kind, name)
 
     @property
-    def of_machine(self) -> bool:
-        """Whether they are a MuJoCo machine's, so that `reaches` knows them."""
-        return self._machine is not None
-
-    @property
     def coordinates(self) -> int:
         """Of each point."""
-        return 3 if self.of_machine else len(self._position)
+        return len(self._position) if self._machine is None else 3
 
     def motions(self) -> list[tuple[Array, Array]]:
         """Position, m, and velocity, m/s, of each point."""
@@ -58,34 +50,6 @@ class Points:
             return [self._machine.motion(kind, name) for kind, name in self._named]
         x = self._plant.state
         return [(x[self._position], x[self._velocity])]
-
-    def reaches(self) -> list[Array]:
-        """What controls can do to each point of a machine at most, whatever touches it, shape (18 + nu,) each, SI.
-
-        Position and velocity; the acceleration a0 at the control nearest to zero; the matrix W of accelerations per
-        force at the point without contacts and limits, shape (3, 3); for every control k the energy e_k of its unit
-        force, its squared length in the inverse of the inertia. A unit of control k changes the acceleration along a
-        unit vector n by at most `sqrt(n W n e_k)`: contacts and limits only add to the inertia, and the rest is the
-        inequality of Cauchy and Schwarz.
-        """
-        assert self._machine is not None
-        plant, found = self._machine, []
-        model, data = plant.model, plant.forward()
-        gain, _ = plant.actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
-        forces = plant.actuators.moment(data) * gain[:, None]
-        if plant.action_map is not None:
-            forces *= plant.action_map.scale[:, None]
-        responses, solved = np.empty_like(forces), np.empty((3, model.nv))
-        mujoco.mj_solveM(model, data, responses, forces)
-        energies = (forces * responses).sum(axis=1)
-        for kind, name in self._named:
-            p, jacobian = plant.frames.jacobian(kind, name)
-            rate = plant.frames.jacobian_rate(kind, name)
-            mujoco.mj_solveM(model, data, solved, jacobian)
-            drift = jacobian @ data.qacc + rate @ data.qvel
-            parts = p, jacobian @ data.qvel, drift, (solved @ jacobian.T).ravel(), energies
-            found.append(np.concatenate(parts))
-        return found
 
     def accelerations(self) -> list[tuple[Array, Array, Array, Array]]:
         """Position, velocity, drift and control matrix of the acceleration of each point, SI."""

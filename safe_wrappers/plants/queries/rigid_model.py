@@ -14,8 +14,6 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 LEFT_OVER: Final = 0.05
 """Share of a vibration's amplitude that may be left after a control interval for a rigid model to be good enough."""
-LIGHT_DAMPING: Final = 0.05
-"""Damping ratio below which torque steps ring on."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +47,6 @@ class RigidModelCheck:
     def rigid_is_good_enough(self) -> bool:
         """Whether every vibration is gone, but for 5 %, before the next command comes."""
         return self.left_over <= LEFT_OVER
-
-    @property
-    def lightly_damped(self) -> tuple[float, ...]:
-        """The resonances with a damping ratio below 0.05, rad/s: torque steps ring on in them."""
-        both = zip(self.resonances, self.damping_ratios, strict=True)
-        return tuple(resonance for resonance, ratio in both if ratio < LIGHT_DAMPING)
 
     def __str__(self) -> str:
         """The verdict and why, in one sentence."""

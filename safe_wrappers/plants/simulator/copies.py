@@ -11,7 +11,7 @@ import mujoco
 
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of, wrappers_of
-from safe_wrappers.plants.mujoco.constants import Constants, every_constant
+from safe_wrappers.plants.mujoco.model import Constants, every_constant
 
 _DRAWING = ("pygame", "glfw", "OpenGL", "moviepy")
 _SHARED = (gym.Space, gym.envs.registration.EnvSpec, ModuleType)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from safe_wrappers.plants.identified.conformal import allowed_misses, scores_needed, upper_bound
+from safe_wrappers.plants.identified.coverage import allowed_misses, scores_needed, upper_bound
 
 RATES = st.tuples(st.integers(1, 99), st.just(100)) | st.tuples(st.integers(1, 6), st.just(7))
 
@@ -23,13 +23,6 @@ def test_the_bound_is_the_smallest_score_that_enough_scores_do_not_exceed(rate, 
     assert upper_bound(scores, float(exact)) == (fits[0] if fits else math.inf)
     assert math.isfinite(upper_bound(scores, float(exact))) == (n >= scores_needed(float(exact)))
     assert allowed_misses(n, float(exact)) == math.floor((n + 1) * exact)
-
-
-def test_numbers_that_everybody_can_count():
-    assert scores_needed(0.1) == 9 and scores_needed(0.05) == 19 and scores_needed(0.5) == 1
-    assert upper_bound(np.arange(9.0), 0.1) == 8.0
-    assert upper_bound(np.arange(19.0), 0.1) == 17.0
-    assert upper_bound(np.arange(8.0), 0.1) == math.inf
 
 
 def test_what_is_no_number_counts_as_infinite():

@@ -22,30 +22,6 @@ def test_a_log_can_be_replayed():
     assert not np.array_equal(logs[0].observations, logs[1].observations)
 
 
-def test_the_same_seed_logs_the_same_and_leaves_the_envs_own_draws_alone():
-    env = gym.make("Pendulum-v1")
-    env.action_space.seed(3)
-    first, second = (sw.plants.log_steps(env, episodes=2, seed=1, max_steps=5) for _ in range(2))
-    for one, other in zip(first, second, strict=True):
-        np.testing.assert_array_equal(one.actions, other.actions)
-        np.testing.assert_array_equal(one.observations, other.observations)
-    drawn = env.action_space.sample()
-    env.action_space.seed(3)
-    np.testing.assert_array_equal(drawn, env.action_space.sample())
-
-
-def test_a_policy_sees_observations_and_ended_episodes_are_shorter():
-    seen = []
-
-    def push_right(observation):
-        seen.append(observation.copy())
-        return 1
-
-    (one,) = sw.plants.log_steps(gym.make("CartPole-v1"), push_right, episodes=1)
-    assert one.actions.shape == (len(seen), 1) and (one.actions == 1.0).all() and len(seen) < 15
-    np.testing.assert_array_equal(np.float32(one.observations[:-1]), seen)
-
-
 def test_what_a_filter_inside_has_executed_is_logged():
     env = gym.make("InvertedPendulum-v5")
     wall = sw.constraints.Clearance(
@@ -54,28 +30,6 @@ def test_what_a_filter_inside_has_executed_is_logged():
     filtered = sw.CBFActionFilter(env, [wall])
     (one,) = sw.plants.log_steps(filtered, lambda x: np.array([3.0], np.float32), episodes=1)
     assert (one.actions < 3.0).any()
-
-
-class SameArray(gym.Env):
-    """Returns one array again and again, as some simulators do."""
-
-    observation_space = gym.spaces.Box(-10.0, 10.0, (1,))
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = np.zeros(1)
-        return self.x, {}
-
-    def step(self, action):
-        self.x += 1.0
-        return self.x, 0.0, False, self.x[0] >= 4.0, {}
-
-
-def test_an_array_that_changes_afterwards_is_copied():
-    (one,) = sw.plants.log_steps(SameArray(), episodes=1)
-    np.testing.assert_array_equal(one.observations[1:, 0], [1.0, 2.0, 3.0, 4.0])
-    assert one.observations[0, 0] == 0.0
 
 
 GOOD = (np.zeros((4, 2)), np.zeros((3, 1)))
@@ -101,15 +55,3 @@ GOOD = (np.zeros((4, 2)), np.zeros((3, 1)))
 def test_other_logs_are_refused(given, says):
     with pytest.raises(ConfigurationError, match=says):
         checked_episodes(given)
-
-
-def test_one_number_per_action_needs_no_second_axis():
-    (one,) = checked_episodes([(np.zeros((4, 2)), [0, 1, 2])])
-    assert one.actions.shape == (3, 1) and one.actions.dtype == np.float64
-
-
-def test_wrong_counts_are_refused():
-    env = gym.make("Pendulum-v1")
-    for wrong in ({"episodes": 0}, {"episodes": 1.5}, {"max_steps": 0}):
-        with pytest.raises(ConfigurationError):
-            sw.plants.log_steps(env, **wrong)

@@ -1,15 +1,11 @@
 """Fitted dynamics: a linear system is found again, and networks know a pendulum better."""
 
-import sys
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.identified.ensemble import EnsembleModel
-from safe_wrappers.plants.identified.linear import LinearModel
+from safe_wrappers.plants.identified.models import EnsembleModel, LinearModel
 
 
 def steps_of(episodes):
@@ -44,29 +40,12 @@ def test_networks_know_a_pendulum_better_and_the_same_seed_gives_the_same():
     np.testing.assert_allclose(fitted(states[:1], controls[:1]), fitted(states, controls)[:1], atol=1e-12)
 
 
-def test_seeds_decide(monkeypatch):
-    pytest.importorskip("torch")
-    monkeypatch.setattr("safe_wrappers.plants.identified.ensemble._UPDATES", 20)
-    draw = np.random.default_rng(0)
-    data = draw.normal(size=(50, 2)), draw.normal(size=(50, 1)), draw.normal(size=(50, 2))
-    one, same, other = (EnsembleModel(*data, seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one(*data[:2]), same(*data[:2]))
-    assert not np.allclose(one(*data[:2]), other(*data[:2]))
-
-
 def test_a_number_that_never_changes_does_no_harm(monkeypatch):
     pytest.importorskip("torch")
-    monkeypatch.setattr("safe_wrappers.plants.identified.ensemble._UPDATES", 20)
+    monkeypatch.setattr("safe_wrappers.plants.identified.models._UPDATES", 20)
     draw = np.random.default_rng(0)
     states = np.column_stack([draw.normal(size=50), np.full(50, 0.3)])
     changes = np.column_stack([draw.normal(size=50), np.zeros(50)])
     model = EnsembleModel(states, draw.normal(size=(50, 1)), changes, seed=0)
     found = model(states, np.zeros((50, 1)))
     assert np.isfinite(found).all() and np.abs(found[:, 1] - 0.3).max() < 2.0
-
-
-def test_without_torch_the_message_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    logs = sw.plants.log_steps(gym.make("Pendulum-v1"), episodes=20, max_steps=5)
-    with pytest.raises(ConfigurationError, match=r"pip install 'safe-wrappers\[train\]'"):
-        sw.IdentifiedPlant(logs, model="ensemble")

@@ -1,0 +1,234 @@
+"""Makes one mistake at a time in a copy of the package, runs the tests around it, and says whether they notice.
+
+    python -m benchmarks mutants                        # those that matter most, then 40 that are drawn; half an hour
+    python -m benchmarks mutants --only filter lease    # in modules whose path has one of these words
+    python -m benchmarks mutants --drawn 400 --seed 1   # more of them, and others
+
+A mistake is made in the syntax tree: a comparison turned round, + for -, another constant, `not` before a condition,
+min for max, a return too early, a statement left out. The tests of a module are the files that mention most of its
+names. A mutant is killed if a test fails or is more than three times as late as without. Exit status 1 if one of
+those that matter survives, or is gone with its function.
+"""
+
+import ast
+import importlib
+import itertools
+import multiprocessing
+import os
+import random
+import re
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.tables import markdown, options
+
+ROOT = Path(__file__).parents[1]
+PRELOADED = ("numba", "gymnasium", "hypothesis", "mujoco", "scipy.optimize", "pytest")
+"""Imported once for all the processes that run tests."""
+AREAS = (
+    "filter",
+    "constraints",
+    "control/backup",
+    "control/handover",
+    "control/watchdog",
+    "plants",
+    "wrappers",
+)
+MOST_TESTS = 5
+TURNED: dict[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+}  # fmt: skip
+OTHER: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
+}  # fmt: skip
+OPPOSITE = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "argmin": "argmax"}
+_LEFT_OUT = (ast.Assign, ast.AugAssign, ast.Expr, ast.Raise, ast.Break, ast.Continue)
+
+
+class Mutant(NamedTuple):
+    """One mistake: the `number`-th of its kind in a function ("" is the module) of a file in the package."""
+
+    file: str
+    function: str
+    kind: str
+    number: int = 0
+
+
+MATTER: tuple[Mutant, ...] = ()
+"""What a filter must never get wrong, each by its function; the list of all that was tried by hand before is
+`benchmarks/results/mutants.md`."""
+
+
+def _mistakes(node: Any) -> Iterator[tuple[str, Callable[[], None]]]:
+    """What can be wrong at a node, by kind, and what makes it so."""
+    if isinstance(node, ast.Compare) and type(node.ops[0]) in TURNED:
+        yield "comparison", lambda: node.ops.__setitem__(0, TURNED[type(node.ops[0])]())
+    if isinstance(node, ast.BinOp | ast.AugAssign) and type(node.op) in OTHER:
+        yield "arithmetic", lambda: setattr(node, "op", OTHER[type(node.op)]())
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        yield "constant", lambda: setattr(node, "value", 2 * node.value + (node.value == 0))
+    if isinstance(node, ast.If | ast.While | ast.IfExp):
+        yield "not", lambda: setattr(node, "test", ast.UnaryOp(ast.Not(), node.test))
+    place = "id" if isinstance(node, ast.Name) else "attr"
+    if isinstance(node, ast.Name | ast.Attribute) and getattr(node, place) in OPPOSITE:
+        yield "min/max", lambda: setattr(node, place, OPPOSITE[getattr(node, place)])
+    body = node.body if isinstance(node, ast.FunctionDef | ast.If | ast.For | ast.While | ast.With) else ()
+    for i, one in enumerate(body):
+        if isinstance(one, _LEFT_OUT) and not isinstance(getattr(one, "value", None), ast.Constant):
+            yield "statement", lambda i=i: body.__setitem__(i, ast.Pass())  # type: ignore[misc]
+        if isinstance(node, ast.FunctionDef) and i and not isinstance(one, ast.Return):
+            yield "return", lambda i=i: body.insert(i, ast.Return())  # type: ignore[misc]
+
+
+def mistakes(tree: ast.Module) -> Iterator[tuple[str, str, Callable[[], None]]]:
+    """Of a module: in which function, of which kind, and what makes it; nothing in docstrings or annotations."""
+
+    def walk(node: ast.AST, name: str) -> Iterator[tuple[str, str, Callable[[], None]]]:
+        yield from ((name, kind, make) for kind, make in _mistakes(node))
+        for field, value in ast.iter_fields(node):
+            for child in value if isinstance(value, list) else [value]:
+                if not isinstance(child, ast.AST) or field in ("annotation", "returns", "decorator_list"):
+                    continue
+                own = getattr(child, "name", "") if isinstance(child, ast.FunctionDef | ast.ClassDef) else ""
+                yield from walk(child, ".".join(filter(None, (name, own))))
+
+    yield from walk(tree, "")
+
+
+def every(package: Path, only: list[str]) -> list[Mutant]:
+    """All mutants of the areas."""
+    found = []
+    for path in sorted(path for area in AREAS for path in (package / area).rglob("*.py")):
+        file = str(path.relative_to(package))
+        if only and not any(word in file for word in only):
+            continue
+        counts: Counter[tuple[str, str]] = Counter()
+        for function, kind, _ in mistakes(ast.parse(path.read_text())):
+            found.append(Mutant(file, function, kind, counts[function, kind]))
+            counts[function, kind] += 1
+    return found
+
+
+def mistaken(text: str, mutant: Mutant) -> tuple[str, str] | None:
+    """A module's text with a mistake, and the line that it is in; None if its function is gone."""
+    tree = ast.parse(text)
+    before = ast.unparse(tree).splitlines()
+    made = [make for function, kind, make in mistakes(tree) if (function, kind) == mutant[1:3]]
+    if len(made) <= mutant.number:
+        return None
+    made[mutant.number]()
+    changed = ast.unparse(ast.fix_missing_locations(tree))
+    line = next((old for old, new in zip(before, changed.splitlines(), strict=False) if old != new), "")
+    return changed, line.strip()
+
+
+def tests_of(where: Path, file: str) -> list[str]:
+    """The test files that mention most of the names that a module defines."""
+    tree = ast.parse((where / "safe_wrappers" / file).read_text())
+    names = [n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef) if n.name[0] != "_"]
+    names += [rf"{Path(file).stem} import", *(name.removeprefix("Bound") for name in names)]
+    word = re.compile(rf"\b({'|'.join(names)})\b")
+    texts = {path: path.read_text() for path in sorted((where / "tests").rglob("test_*.py"))}
+    counts = {
+        path: len(word.findall(text)) / len(text) + (Path(file).stem in path.stem)
+        for path, text in texts.items()
+    }
+    best = sorted((path for path in counts if counts[path]), key=lambda path: -counts[path])[:MOST_TESTS]
+    return [str(path.relative_to(where)) for path in best]
+
+
+def copied(into: Path) -> None:
+    """The package as an install lays it out, and its tests."""
+    ignore = shutil.ignore_patterns("__pycache__")
+    for name in ("safe_wrappers", "tests", "benchmarks", "docs", "configs", "examples"):
+        shutil.copytree(ROOT / name, into / name, ignore=ignore)
+    for name in ("envs", "train"):
+        shutil.copytree(ROOT / name, into / "safe_wrappers" / name, ignore=ignore)
+    shutil.copy(ROOT / "pyproject.toml", into)
+
+
+def _tests(where: Path, files: list[str]) -> None:
+    os.chdir(where)
+    sys.path[:] = [str(where), *(path for path in sys.path if path not in ("", str(ROOT)))]
+    with (where / "output.txt").open("w") as output:
+        os.dup2(output.fileno(), 1)
+        os.dup2(output.fileno(), 2)
+    import safe_wrappers
+
+    assert Path(str(safe_wrappers.__file__)).is_relative_to(where), "the tests import another package"
+    os._exit(int(importlib.import_module("pytest").main(["-x", "-q", "-p", "no:cacheprovider", *files])))
+
+
+def fails(where: Path, files: list[str], longest_s: float | None) -> bool:
+    """Whether a test fails on the copy, or is late, in a process that has the copied package."""
+    process = multiprocessing.get_context("fork").Process(target=_tests, args=(where, files))
+    process.start()
+    process.join(longest_s)
+    late = process.is_alive()
+    process.kill()
+    process.join()
+    return late or process.exitcode != 0
+
+
+def verdicts(where: Path, mutants: list[Mutant]) -> Iterator[tuple[Mutant, str, str]]:
+    """Of each mutant what became of it, and the line; module by module, the tests once without a mistake before."""
+    for file in dict.fromkeys(mutant.file for mutant in mutants):
+        path = where / "safe_wrappers" / file
+        text = path.read_text() if path.exists() else ""
+        files, began = tests_of(where, file) if text else [], time.monotonic()
+        if files and fails(where, files, None):
+            raise SystemExit(f"{files} fail without a mutant: {(where / 'output.txt').read_text()[-2000:]}")
+        longest_s = 30.0 + 3.0 * (time.monotonic() - began)
+        for number, mutant in enumerate(mutant for mutant in mutants if mutant.file == file):
+            made = mistaken(text, mutant)
+            if made is None:
+                yield mutant, "gone", ""
+                continue
+            path.write_text(made[0])
+            os.utime(path, (number, number))  # bytecode is kept by size and second of change
+            yield mutant, "killed" if files and fails(where, files, longest_s) else "survived", made[1]
+        if text:
+            path.write_text(text)
+
+
+def main() -> None:
+    """Print what became of each mutant, and a table of the areas."""
+    given = options(__doc__, only=[], drawn=40, seed=0)
+    os.environ |= {"MUJOCO_GL": "disabled", "OMP_NUM_THREADS": "1", "SAFE_WRAPPERS_COMPILED": "0"}
+    for name in PRELOADED:
+        importlib.import_module(name)
+    with tempfile.TemporaryDirectory() as folder:
+        where = Path(folder).resolve()
+        copied(where)
+        kinds: dict[str, list[Mutant]] = {}
+        for mutant in every(where / "safe_wrappers", given.only):
+            kinds.setdefault(mutant.kind, []).append(mutant)
+        rng = random.Random(given.seed)
+        drawn = [
+            rng.choice(found)
+            for _, found in zip(range(given.drawn), itertools.cycle(kinds.values()), strict=False)
+        ]
+        matter = [m for m in MATTER if not given.only or any(word in m.file for word in given.only)]
+        counts: dict[str, Counter[str]] = {}
+        bad = 0
+        for mutant, verdict, line in verdicts(where, [*matter, *sorted(set(drawn))]):
+            print(
+                f"{verdict:9} {mutant.file}: {mutant.function}, {mutant.kind} {mutant.number}: {line}",
+                flush=True,
+            )
+            counts.setdefault(mutant.file.partition("/")[0], Counter())[verdict] += 1
+            bad += mutant in matter and verdict != "killed"
+    counts["all"] = sum(counts.values(), Counter())
+    lines = [
+        [area, of.total(), *(of[verdict] for verdict in ("killed", "survived", "gone"))]
+        for area, of in counts.items()
+    ]
+    print(markdown("area | mutants | killed | survived | gone", lines))
+    sys.exit(bad > 0)

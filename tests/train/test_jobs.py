@@ -1,0 +1,95 @@
+"""Jobs side by side: what is shown of them, how they fail, and signals."""
+
+import io
+import os
+import signal
+import threading
+
+import fake_task
+import pytest
+from rich.console import Console
+
+from safe_wrappers.train.processes import Interrupted, Job
+from safe_wrappers.train.processes.parallel import RunsFailedError, _noted_signals, run_jobs
+
+
+def job(name, call, *arguments):
+    return Job(name, 100, "steps", call, arguments)
+
+
+def test_a_terminal_shows_bars_and_messages():
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=True, width=100, color_system=None)
+    run_jobs([job("first", fake_task.count, 100)], 2, console, "Counting")
+    shown = text.getvalue()
+    assert "first: done" in shown
+    assert "0%" in shown
+    assert "first: a line to read" in shown
+
+
+def test_lines_in_a_file_and_failures_among_others():
+    jobs = [
+        job("good", fake_task.count, 10),
+        job("bad", fake_task.fail),
+        job("worse", fake_task.crash),
+        job("gone", fake_task.vanish),
+        job("last", fake_task.count, 10),
+    ]
+    text = io.StringIO()
+    with pytest.raises(RunsFailedError) as failure:
+        run_jobs(jobs, 1, Console(file=text, width=100), "Counting")
+    assert failure.value.names == {"bad", "worse", "gone"}
+    first, refused, *trace = str(failure.value).strip().splitlines()
+    assert (first, refused) == ("Counting: 3 of 5 failed.", "bad: too hot")
+    assert trace[0].startswith("worse: Traceback")
+    assert "ValueError: nobody expected this" in trace
+    assert trace[-1].startswith("gone: its process was killed")
+    lines = [line for line in text.getvalue().splitlines() if not line.startswith("  ")]
+    assert lines == [
+        "good: started (100 steps)",
+        "good: a line to read",
+        "good: done",
+        "bad: started (100 steps)",
+        "bad: failed",
+        "worse: started (100 steps)",
+        "worse: failed",
+        "gone: started (100 steps)",
+        "gone: failed",
+        "last: started (100 steps)",
+        "last: a line to read",
+        "last: done",
+    ]
+
+
+def test_a_signal_asks_jobs_to_stop_and_unwanted_ones_do_not_begin():
+    text = io.StringIO()
+    jobs = [job("waits", fake_task.until_stopped), job("unwanted", fake_task.fail)]
+    timer = threading.Timer(0.0, lambda: None)
+
+    def unwanted(name):
+        nonlocal timer
+        if name == "waits" and not timer.is_alive():
+            timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
+            timer.start()
+        return name == "unwanted"
+
+    with pytest.raises(Interrupted) as stopped:
+        run_jobs(jobs, 2, Console(file=text, width=100), "Waiting", unwanted)
+    assert stopped.value.signum == signal.SIGTERM
+    assert "waits: stopped" in text.getvalue()
+    assert "unwanted" not in text.getvalue()
+
+
+def test_what_is_ignored_stays_ignored_and_all_is_put_back():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with _noted_signals() as noted:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not noted
+            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)  # at once: of one sender
+            assert noted == [signal.SIGTERM]
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -1,0 +1,287 @@
+"""What a run leaves for others: the same actions, no foreign code, another env or filter refused."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hub_server import serving
+from test_run import Reports
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, RunStateError
+from safe_wrappers.train import policies
+from safe_wrappers.train.cli import main
+from safe_wrappers.train.config import FilterConfig, parse_experiment, stored_arm
+from safe_wrappers.train.files import write_rows
+from safe_wrappers.train.policies import load_policy, upload, write_card
+from safe_wrappers.train.run.training import train_run
+
+SHIPPED = Path(__file__).parents[2] / "configs" / "policies"
+REACHER = {
+    "name": "x",
+    "env": "Reacher-v5",
+    "seeds": [0],
+    "total_steps": 64,
+    "arms": {"a": {"filter": "protect"}},
+}
+SMALL = {"policy_kwargs": {"net_arch": [8]}}
+PPO = {
+    "algorithm": "PPO",
+    "hyperparameters": {"n_steps": 16, **SMALL},
+    "n_envs": 4,
+    "normalize": {"observation": True},
+}
+SAC = {"algorithm": "SAC", "hyperparameters": {"learning_starts": 40, "use_sde": True, **SMALL}}
+HER = {
+    "algorithm": "TD3", "env": "FetchReach-v4", "total_steps": 120, "normalize": {"observation": True},
+    "hyperparameters": {
+        "learning_starts": 60, "action_noise": "none", "replay_buffer_class": "HerReplayBuffer", **SMALL,
+    },
+    "arms": {"a": {"filter": "protect", "learner": {"kind": "both", "penalty": 0.1}}},
+}  # fmt: skip
+DQN = {"algorithm": "DQN", "env": "CartPole-v1", "arms": {"a": {"filter": "none"}}, "hyperparameters": SMALL}
+
+
+def trained(settings, tmp_path):
+    """The folder of a finished run."""
+    (arm,) = parse_experiment({**REACHER, **settings}).arms
+    folder = tmp_path / "seed_0"
+    train_run(arm, 0, folder, Reports().progress)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def reacher(tmp_path_factory):
+    return trained(PPO, tmp_path_factory.mktemp("reacher"))
+
+
+@pytest.fixture
+def policy(reacher, tmp_path):
+    """A copy of its policy's folder, to break."""
+    return shutil.copytree(reacher / "policy", tmp_path / "policy")
+
+
+@pytest.mark.parametrize("settings", [PPO, SAC, HER, DQN], ids=["PPO", "SAC", "HER", "DQN"])
+def test_its_folder_acts_as_the_run_does(settings, tmp_path):
+    if settings is HER:
+        pytest.importorskip("gymnasium_robotics")
+    run = trained(settings, tmp_path)
+    of_run, of_folder = load_policy(run), load_policy(str(run / "policy"))
+    assert of_folder.arm.fingerprint() == of_run.arm.fingerprint()
+    env = of_run.make_env()
+    observation, _ = env.reset(seed=0)
+    for _ in range(8):
+        action = of_run(observation)
+        np.testing.assert_array_equal(of_folder(observation), action)
+        observation = env.step(action)[0]
+
+
+def test_it_sees_scaled_observations_and_has_its_filter(reacher):
+    trained = load_policy(reacher)
+    env, bare = trained.make_env(), trained.make_env("none")
+    assert env.has_wrapper_attr("filter") and not bare.has_wrapper_attr("filter")
+    observation, _ = env.reset(seed=0)
+    scaling = trained._normalize
+    seen = np.clip((observation - scaling.obs_rms.mean) / np.sqrt(scaling.obs_rms.var + 1e-8), -10, 10)
+    proposed = trained.model.predict(seen, deterministic=True)[0]
+    assert np.array_equal(trained(observation), proposed) and np.any(proposed)
+
+
+@pytest.mark.parametrize("name", ["filtered", "unfiltered"])
+def test_the_policies_that_ship_act_safely_in_their_filter(name):
+    trained = load_policy(SHIPPED / name)
+    env = trained.make_env("protect")
+    observation, _ = env.reset(seed=0)
+    trained.begin(env)
+    for _ in range(100):
+        observation, _, _, _, info = env.step(trained(observation))
+        assert info["cost"] == 0.0
+
+
+def test_what_is_no_policy_or_unreadable_is_refused(policy, tmp_path):
+    (policy / "model.zip").write_bytes(b"x")
+    with pytest.raises(RunStateError, match=r"model\.zip' cannot be read"):
+        load_policy(policy)
+    (policy / "config.json").write_text("{}")
+    with pytest.raises(ConfigurationError, match="no run's folder"):
+        load_policy(policy)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(ConfigurationError, match="has no checkpoint yet"):
+        load_policy(tmp_path)
+
+
+def test_another_env_is_refused_unless_told(policy):
+    with pytest.raises(ConfigurationError, match="is for another observation space"):
+        load_policy(policy, sw.protect(gym.make("HalfCheetah-v5")))
+    older = sw.protect(gym.make("Reacher-v5", max_episode_steps=20))
+    assert load_policy(policy, older).arm.env.id == "Reacher-v5"
+    gym.register("OtherReacher-v5", gym.spec("Reacher-v5").entry_point, max_episode_steps=50)
+    other = sw.CBFActionFilter(gym.make("OtherReacher-v5"), older.constraints)
+    with pytest.raises(ConfigurationError, match="trained on Reacher-v5, not on OtherReacher-v5"):
+        load_policy(policy, other)
+    load_policy(policy, other, other_env=True)
+
+
+@pytest.mark.parametrize("run_or_folder", ["", "policy"])
+def test_another_filter_is_refused_unless_told(reacher, run_or_folder):
+    limit = sw.constraints.JointSpeedLimit(limit=4.0)
+    for env, here in (
+        (gym.make("Reacher-v5"), "here: no filter"),
+        (sw.CBFActionFilter(gym.make("Reacher-v5"), [limit]), r"here: JointSpeedLimit\(limit=4\.0"),
+    ):
+        with pytest.raises(ConfigurationError, match=rf"(?s)trained: JointSpeedLimit\(limit=5\.0.*{here}"):
+            load_policy(reacher / run_or_folder, env)
+        load_policy(reacher / run_or_folder, env, other_filter=True)
+    load_policy(reacher / run_or_folder, sw.RecordInterventions(sw.protect(gym.make("Reacher-v5"))))
+
+
+def test_a_recipe_that_has_changed_since_is_refused_unless_told(policy, monkeypatch):
+    monkeypatch.setattr(policies, "constraints_of_arm", lambda arm: ["JointSpeedLimit(limit=9.0)"])
+    with pytest.raises(ConfigurationError, match=r"(?s)through another filter.*limit=9\.0"):
+        load_policy(policy)
+    load_policy(policy, other_filter=True)
+
+
+ARMS = {
+    "protect": {"filter": {"protect": {"margin": 0.1}, "lease": {"budget": {"closing_speed": 3.0}}}},
+    "factory": {"filter": {"factory": "fake_task:shield", "kwargs": {"margin": None}}},
+    "map": {"filter": "protect", "learner": {"kind": "safe_set_map", "anchor": "backup"}},
+    "curriculum": {"filter": "protect", "learner": {"margin_curriculum": {"start": 0.1, "until": 0.5}}},
+    "priced": {"hyperparameters": {"clip_range": "linear_0.2"}, "learner": {"cost_limit": 25}},
+    "begun": {"start_from": "map", "normalize": {"observation": True}, "action_repeat": 4, "n_envs": 3},
+    "seen": {"env": {"id": "SafePointGoal1-v0", "observation": "constraints", "reset_options": {"a": []}}},
+    "judged": {"env": {"id": "Reacher-v5", "judge": "constraints"}},
+}
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_an_arm_is_read_back_from_what_its_folder_says(name):
+    given = {**REACHER, **PPO, "env": "SafePointGoal1-v0", "arms": ARMS, "evaluation": {"filter": "protect"}}
+    arm = next(arm for arm in parse_experiment(given).arms if arm.name == name)
+    assert stored_arm(name, json.loads(json.dumps(arm.fingerprint()))) == arm
+
+
+def test_the_card_has_what_was_measured_and_says_what_was_not_judged(reacher, tmp_path):
+    run = shutil.copytree(reacher, tmp_path / "seed_0")
+    arm = load_policy(run).arm
+    card = run / "policy" / "README.md"
+    (run / "episodes.csv").unlink()
+    write_card(arm, 0, run, FilterConfig())
+    assert "Nothing was measured yet." in card.read_text()
+    columns = ("return", "length", "intervention_rate", "infeasible")
+    rows = [
+        {"return": value, "length": 50, "intervention_rate": 0.5, "infeasible": 1} for value in (-4.0, -8.0)
+    ]
+    write_rows(run / "evaluation" / "filter_on.csv", columns, rows)
+    write_card(arm, 0, run, FilterConfig())
+    text = card.read_text()
+    for line in (
+        "# PPO on Reacher-v5", "| Episodes; steps | 2; 100 |", "| Return / episode | -6 |",
+        "| Share of steps changed | 0.5 |",
+        "| Steps in violation, total | not judged |", "| Infeasible steps, total | 2 |",
+        "| Fallback steps, total | - |",
+        "trained for 64 steps through the filter `protect`", "* `JointSpeedLimit(limit=5.0",
+    ):  # fmt: skip
+        assert line in text, line
+
+
+# The hub --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """huggingface_sb3 as far as it is used here, with a folder for a hub; files are looked for where it does."""
+    there = tmp_path / "hub"
+
+    def push_to_hub(repo_id, filename, commit_message):
+        (there / repo_id).mkdir(parents=True, exist_ok=True)
+        shutil.copy(filename, there / repo_id / filename)
+
+    def load_from_hub(repo_id, filename):
+        return str(there / repo_id / filename)
+
+    package = types.SimpleNamespace(push_to_hub=push_to_hub, load_from_hub=load_from_hub)
+    monkeypatch.setitem(sys.modules, "huggingface_sb3", package)
+    return there
+
+
+def test_a_policy_goes_to_the_hub_and_comes_back(reacher, hub, capsys):
+    write_card(load_policy(reacher).arm, 0, reacher, FilterConfig())
+    assert main(["push", str(reacher), "me/reacher"]) == 0
+    names = "config.json, model.zip, vecnormalize.pkl, README.md"
+    assert f"Uploaded: {names}" in capsys.readouterr().out
+    there, here = load_policy("hub:me/reacher"), load_policy(reacher)
+    observation, _ = here.make_env().reset(seed=0)
+    np.testing.assert_array_equal(there(observation), here(observation))
+
+
+THROUGH_THE_HUB = """
+import sys
+from safe_wrappers.train.cli import main
+assert main(["push", sys.argv[1], "me/reacher"]) == 0
+assert main(["enjoy", "hub:me/reacher", "--episodes", "1"]) == 0
+"""
+
+
+def test_the_real_package_takes_it_there_and_back(reacher, tmp_path):
+    pytest.importorskip("huggingface_sb3", reason="pip install 'safe-wrappers[hub]'")
+    write_card(load_policy(reacher).arm, 0, reacher, FilterConfig())
+    with serving(tmp_path / "hub") as url:  # huggingface_hub reads the variables when it is imported
+        env = {"HF_ENDPOINT": url, "HF_HOME": str(tmp_path / "home"), "HF_TOKEN": "hf_stub"}
+        done = subprocess.run(
+            [sys.executable, "-c", THROUGH_THE_HUB, str(reacher)],
+            env={**os.environ, **env},
+            capture_output=True,
+            text=True,
+        )
+    assert done.returncode == 0, done.stderr
+    assert "Uploaded: config.json" in done.stdout and "episode 0: return" in done.stdout
+    there = tmp_path / "hub" / "me" / "reacher"
+    for name in ("config.json", "model.zip", "vecnormalize.pkl"):
+        assert (there / name).read_bytes() == (reacher / "policy" / name).read_bytes()
+
+
+def test_what_cannot_go_there_is_refused(policy, hub, tmp_path, monkeypatch):
+    for name in ("me", "me/", "a/b/c"):
+        with pytest.raises(ConfigurationError, match="expected owner/name"):
+            upload(policy, name)
+    with pytest.raises(ConfigurationError, match="no policy's"):
+        upload(tmp_path / "none", "me/reacher")
+    monkeypatch.setitem(sys.modules, "huggingface_sb3", None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'safe-wrappers\[hub\]'"):
+        upload(policy, "me/reacher")
+
+
+def test_a_policy_imports_no_module_that_was_not_named(policy, tmp_path, monkeypatch):
+    (tmp_path / "unread.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\ndef f(env): return env\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plain = json.loads((policy / "config.json").read_text())
+    factory = {"factory": "unread:f", "kwargs": {}}
+    arm = plain["config"]
+    for place, config in {
+        "filter.factory": {**arm, "filter": factory},
+        "env.cost": {**arm, "env": {**arm["env"], "cost": "unread:f"}},
+        "env.judge.factory": {**arm, "env": {**arm["env"], "judge": factory}},
+        "env.observation.factory": {**arm, "env": {**arm["env"], "observation": factory}},
+        "env.id": {**arm, "env": {**arm["env"], "id": "unread:Reacher-v5"}},
+    }.items():
+        (policy / "config.json").write_text(json.dumps({**plain, "config": config}))
+        with pytest.raises(
+            ConfigurationError, match=rf"wants the module 'unread' \({place} of its config.json\)"
+        ):
+            load_policy(policy, imports=["json"], other_filter=True)
+        assert not (tmp_path / "ran").exists()
+    config = {**plain, "config": {**arm, "filter": factory}, "constraints": []}
+    (policy / "config.json").write_text(json.dumps(config))
+    assert main(["enjoy", str(policy), "--episodes", "1"]) == 1
+    assert not (tmp_path / "ran").exists()
+    assert main(["enjoy", str(policy), "--episodes", "1", "--imports", "unread"]) == 0
+    assert (tmp_path / "ran").exists()
+    sys.modules.pop("unread")

@@ -1,0 +1,275 @@
+"""A sweep over the fake task, and over trials whose outcome is made up."""
+
+import csv
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+from safe_wrappers.errors import ConfigurationError, RunStateError
+from safe_wrappers.train import sweep
+from safe_wrappers.train.cli import main
+from safe_wrappers.train.config import read_config
+from safe_wrappers.train.evaluation.summary import episode_file
+from safe_wrappers.train.files import write_rows
+from safe_wrappers.train.processes import Interrupted
+from safe_wrappers.train.processes.parallel import RunsFailedError
+from safe_wrappers.train.run import Progress
+from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
+from safe_wrappers.train.sweep import Space, sweep_experiment
+
+optuna = pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")
+
+FAKE = Path(__file__).parent / "fake.yaml"
+RATE, MARGIN = "hyperparameters.learning_rate", "arms.filtered.filter.kwargs.margin"
+PARAMETERS = {RATE: {"low": 1e-5, "high": 1e-2, "log": True}, MARGIN: {"choices": [0.0, 0.1, 0.2]}}
+QUIET = Console(quiet=True)
+
+
+def settings(folder, **sweep):
+    overrides = [f"output={folder}", "total_steps=128", "seeds=[0]", "evaluation.episodes=1"]
+    return {**read_config(FAKE, overrides), "sweep": {"parameters": PARAMETERS, **sweep}}
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Jobs run here, one after the other; the calls before which a signal comes are told."""
+    made, stops = [], set()
+
+    def run(jobs, *_):
+        for job in jobs:
+            made.append(job.name)
+            if len(made) in stops:
+                raise Interrupted(2)
+            job.call(*job.arguments, Progress(lambda _: None, lambda _: None))
+
+    monkeypatch.setattr(sweep, "run_jobs", run)
+    return SimpleNamespace(made=made, stops=stops)
+
+
+def rows(folder):
+    with (folder / "fake" / "sweep" / "sweep.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_command_searches_and_its_trials_are_ordinary_experiments(tmp_path, capsys):
+    config = tmp_path / "searched.yaml"
+    given = settings(tmp_path, trials=2, at_once=2)
+    config.write_text(yaml.safe_dump(given, sort_keys=False))
+    assert main(["sweep", str(config), "workers=2"]) == 0
+    told = capsys.readouterr().out
+    found = rows(tmp_path)
+    assert [row["trial"] for row in found] == ["0", "1"]
+    assert {row["state"] for row in found} == {"at cost zero"}
+    best = max(found, key=lambda row: float(row["return"]))
+    values = f"{RATE}={float(best[RATE])!r} {MARGIN}={best[MARGIN]}"
+    assert f"safe-wrappers compare {config} workers=2 {values}" in told
+    trial = tmp_path / "fake" / "sweep" / "trial_0001"
+    assert main(["report", str(trial / "config.yaml")]) == 0
+    assert (trial / "report.html").exists()
+    assert yaml.safe_load((trial / "config.yaml").read_text())["hyperparameters"]["learning_rate"] == float(
+        found[1][RATE]
+    )
+    assert main(["sweep", str(config)]) == 0  # all is done
+    assert rows(tmp_path) == found
+
+
+@pytest.mark.parametrize("stop", [1, 4, 6])
+def test_a_sweep_that_was_stopped_tries_the_same_as_one_that_was_not(tmp_path, in_process, stop):
+    whole, cut = settings(tmp_path / "a", trials=4, at_once=2), settings(tmp_path / "b", trials=4, at_once=2)
+    sweep_experiment(whole, FAKE, (), QUIET)
+    assert len(in_process.made) == 2 * 4
+    expected = rows(tmp_path / "a")
+    assert len({row[RATE] for row in expected}) == 4
+    in_process.made.clear()
+    in_process.stops.add(stop)
+    with pytest.raises(Interrupted):
+        sweep_experiment(cut, FAKE, (), QUIET)
+    sweep_experiment(cut, FAKE, (), QUIET)
+    assert rows(tmp_path / "b") == expected
+
+
+def test_a_study_of_other_settings_is_refused_but_for_more_trials(tmp_path, in_process):
+    sweep_experiment(settings(tmp_path, trials=1), FAKE, (), QUIET)
+    with pytest.raises(RunStateError, match=r"another sweep \(other seed\)"):
+        sweep_experiment(settings(tmp_path, trials=2, seed=1), FAKE, (), QUIET)
+    sweep_experiment(settings(tmp_path, trials=2), FAKE, (), QUIET)
+    assert len(rows(tmp_path)) == 2
+
+
+def test_a_study_lies_where_its_storage_says_and_another_sweep_may_lie_there_too(tmp_path, in_process):
+    storage = f"sqlite:///{tmp_path}/studies.db"
+    sweep_experiment(settings(tmp_path / "own", trials=2), FAKE, (), QUIET)
+    sweep_experiment(settings(tmp_path / "a", trials=2, storage=storage), FAKE, (), QUIET)
+    sweep_experiment({**settings(tmp_path / "a", storage=storage, trials=1), "name": "b"}, FAKE, (), QUIET)
+    assert not list((tmp_path / "a").rglob("study.db"))
+    assert set(optuna.get_all_study_names(storage)) == {"b", "fake"}
+    assert rows(tmp_path / "a") == rows(tmp_path / "own")
+
+
+def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_process, monkeypatch):
+    run = sweep.run_jobs
+
+    def failing(jobs, *_):
+        run([job for job in jobs if "trial_0000" not in job.name])
+        failed = [job.name for job in jobs if "trial_0000" in job.name]
+        if failed:
+            raise RunsFailedError("too hot", failed)
+
+    monkeypatch.setattr(sweep, "run_jobs", failing)
+    sweep_experiment(settings(tmp_path, trials=2, at_once=2), FAKE, (), QUIET)
+    assert [row["state"] for row in rows(tmp_path)] == ["fail", "at cost zero"]
+    assert rows(tmp_path)[0]["return"] == ""
+
+
+def test_values_that_the_task_refuses_fail_their_trial(tmp_path, in_process, capsys):
+    given = settings(tmp_path, trials=1)
+    given["env"] = {"id": "fake_task:FakeGoal-v0"}
+    given["sweep"]["parameters"] = {"env.kwargs.colour": {"choices": ["red", "blue"]}}
+    sweep_experiment(given, FAKE, (), Console())
+    assert [row["state"] for row in rows(tmp_path)] == ["fail"]
+    told = capsys.readouterr().out
+    assert "trial_0000: " in told and "colour" in told
+    assert "none is recommended" in told
+
+
+def test_a_task_that_reports_no_cost_is_refused(tmp_path):
+    given = settings(tmp_path)
+    given["env"] = "fake_task:SilentGoal-v0"
+    with pytest.raises(ConfigurationError, match=r"the task reports no cost.*env\.judge"):
+        sweep_experiment(given, FAKE, (), QUIET)
+
+
+def told(outcomes):
+    """A study in memory: (return, violations) per trial; no violations: pruned."""
+    made = optuna.create_study(direction="maximize")
+    for value, violations in outcomes:
+        trial = made.ask()
+        trial.report(value, step=10)
+        if violations is None:
+            made.tell(trial, state=optuna.trial.TrialState.PRUNED)
+        else:
+            trial.set_constraint(sweep.VIOLATIONS, violations)
+            made.tell(trial, value)
+    return made
+
+
+def test_a_violation_ranks_below_every_return_at_cost_zero():
+    made = told([(9.0, 2.0), (1.0, 0.0), (99.0, None), (3.0, 0.0), (8.0, 0.5), (2.0, 0.0)])
+    assert [trial.number for trial in sweep.ranked(made)] == [3, 5, 1, 4, 0, 2]
+    assert made.best_trial.number == 3  # Optuna's own opinion
+
+
+def test_the_median_is_of_trials_at_cost_zero():
+    kept = [(float(value), 0.0) for value in range(1, 6)]
+    reckless = [(100.0, 3.0)] * 20
+    for value, expected in [(2.9, True), (3.1, False)]:
+        made = told(kept + reckless)
+        trial = made.ask()
+        trial.report(value, step=10)
+        assert sweep.is_worse_than_median(made, trial, trial.number) is expected
+        assert not sweep.is_worse_than_median(made, trial, before=4)  # the fifth is of the same batch
+    made = told(kept[:4] + reckless)  # too few to say
+    trial = made.ask()
+    trial.report(-5.0, step=10)
+    assert not sweep.is_worse_than_median(made, trial, trial.number)
+
+
+def test_a_trial_is_asked_about_at_its_checkpoints_and_given_up(tmp_path, monkeypatch):
+    space = Space(settings(tmp_path))
+    made = optuna.create_study(direction="maximize")
+    _, experiment = space.trial("trial_0000", {})
+    arm = experiment.arms[0]
+    monkeypatch.setattr(sweep, "is_worse_than_median", lambda *_: made.trials[0].last_step == 256)
+    experiment = replace(experiment, arms=(replace(arm, total_steps=512),))
+    attempt = sweep.Attempt(made.ask(), experiment, 0)
+    for seed in experiment.seeds:
+        path = episode_file(experiment.run_folder(arm, seed), "training")
+        found = [
+            {"timesteps": step, "env": 0, "return": step / 10, "length": 20} for step in range(20, 400, 20)
+        ]
+        write_rows(path, EPISODE_COLUMNS, found)
+    assert not attempt.look()
+    attempt._looked_at -= 10.0
+    assert attempt.look()
+    expected = {
+        128: np.mean([step / 10 for step in range(20, 128, 20)]),
+        256: np.mean([step / 10 for step in range(140, 256, 20)]),
+    }
+    assert made.trials[0].intermediate_values == pytest.approx(expected)
+
+
+def test_what_is_pruned_is_neither_evaluated_nor_begun(tmp_path, in_process, monkeypatch):
+    monkeypatch.setattr(sweep, "is_worse_than_median", lambda *_: True)
+    sweep_experiment(settings(tmp_path, trials=1), FAKE, (), QUIET)
+    assert in_process.made == ["trial_0000 filtered seed 0"]
+    assert [row["state"] for row in rows(tmp_path)] == ["pruned"]
+
+
+def test_the_help_does_not_import_optuna():
+    code = "import sys; from safe_wrappers.train.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    code += "assert not {'optuna', 'ray'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+# What may be searched -----------------------------------------------------------------------------
+
+
+def space(parameters, *overrides, **given):
+    return Space({**read_config(FAKE, overrides), "sweep": {"parameters": parameters, **given}})
+
+
+ENVS = {"n_envs": {"low": 1, "high": 2}}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({"hyperparameters.gama": {"low": 0.9, "high": 0.99}}, r"gamma"),
+        ({"arms.filterd.filter": {"choices": ["none", "protect"]}}, r"Did you mean 'filtered'"),
+        ({MARGIN: {"low": 0.1, "high": 0.1}}, r"the range is empty: low is 0.1, high is 0.1"),
+        ({MARGIN: {"low": 0.1}}, r"expected low and high"),
+        ({MARGIN: {"low": 0.1, "high": 0.2, "choices": [1, 2]}}, r"low and high, or choices; got both"),
+        ({MARGIN: {"choices": [0.1]}}, r"two or more different values, got \[0.1\]"),
+        ({MARGIN: {"low": 0, "high": 1, "log": True}}, r"log needs low above 0"),
+        ({MARGIN: {"low": 0, "high": 4, "step": 0.5}}, r"step: low and high are integers"),
+        ({"total_steps": {"low": 100, "high": 500}}, r"compared at the same steps"),
+        ({"evaluation.episodes": {"low": 1, "high": 5}}, r"changes nothing of what arm 'filtered' learns"),
+        ({"n_envs": {"low": 0, "high": 5}}, r"n_envs: .*greater than or equal to 1"),
+        (
+            {"arms.filtered.filter": {"choices": ["none", {"factory": "fake_task:shield"}]}},
+            r"there is no filter",
+        ),
+    ],
+)
+def test_parameters_that_do_not_exist_or_decide_nothing_are_refused(parameters, said):
+    with pytest.raises(ConfigurationError, match=said):
+        space(parameters)
+
+
+def test_an_arm_without_a_filter_anywhere_cannot_be_ranked():
+    with pytest.raises(ConfigurationError, match="return with the filter on, and there is no filter"):
+        space(ENVS, "arms={unfiltered: {filter: none}}")
+    with pytest.raises(ConfigurationError, match=r"sweep\.arm"):
+        space(ENVS, arm="filtred")
+
+
+def test_a_trial_is_the_ranked_arm_and_those_that_it_begins_with(tmp_path):
+    searched = space({MARGIN: {"low": 0.0, "high": 0.2}}, f"output={tmp_path}")
+    written, trial = searched.trial("trial_0003", {MARGIN: 0.125})
+    assert [arm.name for arm in trial.arms] == ["filtered"]
+    assert trial.arms[0].filter.kwargs == {"margin": 0.125}
+    assert trial.folder == tmp_path / "fake" / "sweep" / "trial_0003"
+    assert "sweep" not in written
+    # An unfiltered one keeps the filter of the arm that is left out.
+    _, trial = space({MARGIN: {"low": 0.0, "high": 0.2}}, arm="unfiltered").trial("t", {MARGIN: 0.125})
+    assert [arm.name for arm in trial.arms] == ["unfiltered"]
+    assert trial.evaluation_filter.kwargs == {"margin": 0.125}
+    begun = space(ENVS, "arms.filtered.start_from=unfiltered")
+    assert [arm.name for arm in begun.trial("t", {})[1].arms] == ["filtered", "unfiltered"]
