@@ -1,33 +1,31 @@
 """Random MuJoCo models through MujocoPlant and a filter: supported, or refused by name, never a crash.
 
-    python -m benchmarks random_models                   # 10,000 models; goes on where it was stopped
-    python -m benchmarks random_models --models 200 --results DIR
-    python -m benchmarks random_models --seed 17         # one of them: its XML, and what became of it
+    python -m benchmarks random_models              # 10,000 models; goes on where it was stopped
+    python -m benchmarks random_models --seed 17    # one of them: its XML, and what became of it
 
 A model that MuJoCo compiles and can simulate becomes one of Gymnasium's MuJoCo envs, twice: one is filtered, the twin
 gets what was executed. It is *supported* if every forecast of an executed control is the env's step and the twin's to
 the last bit (to 0.001 where bodies may sleep, which MuJoCo's state does not tell), every executed control is finite
 and in the action space, and f + g u is MuJoCo's acceleration where no constraint is active. It is *refused* if the
 library says so and names the part of the model. Everything else is a *defect*: another exception, a crash, more than
-two minutes, a number that is wrong. Models run in batches, each in a process of its own, so that a crash is seen and
-has a seed; a crash of MuJoCo alone, before the library is asked, counts as refused by MuJoCo. A defect that was found
-is tried again when the command is.
+two minutes, a number that is wrong. Models run in a process of their own, so that a crash is seen and has a seed; a
+crash of MuJoCo alone, before the library is asked, counts as refused by MuJoCo. A defect that was found is tried
+again when the command is.
 """
 
-import argparse
 import copy
+import itertools
 import json
+import multiprocessing
 import os
 import random
 import re
-import selectors
-import subprocess
-import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import gymnasium as gym
@@ -37,14 +35,12 @@ from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
 from benchmarks.random_mjcf import RandomModel
-from benchmarks.tables import RESULTS
+from benchmarks.tables import RESULTS, keep, markdown, options
 from safe_wrappers.errors import SafeWrappersError
 
 STEPS = 3
-BATCH = 500
 LONGEST_S = 120.0
 """Of one model, the first one's imports and compilation included."""
-_SIMULATED = "simulated"
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _HINGE_OR_SLIDE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _READ = (
@@ -99,27 +95,34 @@ class DefectError(Exception):
     """What the library did is wrong."""
 
 
-def trial(seed: int, simulated: Callable[[], None] = lambda: None) -> tuple[str, str]:
-    """What became of a model: "mujoco", "supported", "refused" or "defect", and why.
-
-    `simulated` is called once MuJoCo alone has compiled and simulated it.
-    """
-    drawn = RandomModel(seed)
+def _made(seed: int) -> tuple[Machine, Machine, random.Random]:
+    """The machine and its twin."""
     rng = random.Random(f"trial {seed}")
     frame_skip, dtype = rng.choice((1, 2, 4, 5)), rng.choice((np.float32, np.float64))
+    model = mujoco.MjModel.from_xml_string(RandomModel(seed).xml)
+    return *(Machine(each, frame_skip, dtype) for each in (model, copy.copy(model))), rng  # type: ignore[return-value]
+
+
+def simulates(seed: int) -> tuple[str, str]:
+    """Whether MuJoCo alone compiles and simulates a model: "mujoco" and why not, or nothing."""
     try:
-        model = mujoco.MjModel.from_xml_string(drawn.xml)
-        machine, twin = (Machine(each, frame_skip, dtype) for each in (model, copy.copy(model)))
-        _simulate(twin, seed)
+        _simulate(_made(seed)[1], seed)
     except (ValueError, mujoco.FatalError) as error:
         return "mujoco", str(error)
-    simulated()
+    return "", ""
+
+
+def trial(seed: int) -> tuple[str, str]:
+    """What became of a model that MuJoCo simulates: "supported", "refused" or "defect", and why."""
+    machine, twin, rng = _made(seed)
+    _simulate(twin, seed)
     try:
-        return _closed_loop(machine, twin, seed, rng)
+        _closed_loop(machine, twin, seed, rng)
     except SafeWrappersError as error:
         return ("refused" if _names_a_part(str(error), machine.model) else "defect"), str(error)
     except Exception:
         return "defect", traceback.format_exc()
+    return "supported", ""
 
 
 def _sleeps(model: mujoco.MjModel) -> bool:
@@ -144,11 +147,11 @@ def _counts(kind: str) -> str:
     return {"body": "nbody", "actuator": "nu", "jnt": "njnt"}.get(kind, f"n{kind}")
 
 
-def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random) -> tuple[str, str]:
+def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random) -> None:
     onlooker = sw.MujocoPlant()
     onlooker.bind(machine)
     plants = {} if rng.random() < 0.8 else {"delay_s": 0.013}
-    env, unfit = _filtered(machine, plants, rng)
+    env = _filtered(machine, plants, rng)
     env.reset(seed=seed)
     twin.reset(seed=seed)
     for _ in range(STEPS):
@@ -167,11 +170,10 @@ def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random)
         if np.isfinite(onlooker.state).all():
             _check_response(onlooker, rng)
             _ask(onlooker, executed)
-    return "supported", unfit
 
 
-def _filtered(machine: Machine, plants: dict[str, Any], rng: random.Random) -> tuple[gym.Env[Any, Any], str]:
-    """The machine with a filter of the first constraint that fits, and why others did not."""
+def _filtered(machine: Machine, plants: dict[str, Any], rng: random.Random) -> gym.Env[Any, Any]:
+    """The machine with a filter of the first constraint that fits."""
     model, limits, unfit = machine.model, sw.constraints, []
     scalar = [
         n for j in range(model.njnt) if model.jnt_type[j] in _HINGE_OR_SLIDE and (n := model.joint(j).name)
@@ -192,9 +194,7 @@ def _filtered(machine: Machine, plants: dict[str, Any], rng: random.Random) -> t
     for constraint in [*(first if rng.random() < 0.6 else []), *options]:
         also = [options[0]] if rng.random() < 0.2 and constraint is not options[0] else []
         try:
-            return sw.CBFActionFilter(machine, [constraint, *also], sw.MujocoPlant(**plants)), " | ".join(
-                unfit
-            )
+            return sw.CBFActionFilter(machine, [constraint, *also], sw.MujocoPlant(**plants))
         except SafeWrappersError as error:
             if not _names_a_part(str(error), model):
                 raise
@@ -279,53 +279,29 @@ def _ask(onlooker: sw.MujocoPlant, executed: Any) -> None:
             raise DefectError(f"{what} is not finite at a finite state")
 
 
-def child(first: int, last: int) -> None:
-    """Print the outcomes of these seeds as JSON lines, each after its seed."""
+def _begin() -> None:
+    os.chdir(tempfile.mkdtemp())  # MuJoCo writes its log into the working directory
     warnings.simplefilter("ignore")
     warnings.filterwarnings("error", category=RuntimeWarning, module="safe_wrappers")
-    for seed in range(first, last):
-        print(seed, flush=True)
-        print(json.dumps(trial(seed, lambda: print(_SIMULATED, flush=True))), flush=True)
 
 
-def outcomes(first: int, last: int) -> Iterator[tuple[int, str, str]]:
-    """Seed, outcome and reason of each seed, in processes that may crash or hang."""
-    while first < last:
-        seed, ours, why = first, False, "exit"
-        with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes its log into the working directory
-            command = [sys.executable, "-m", "benchmarks", "random_models", "--child", str(first), str(last)]
-            where = os.environ | {"PYTHONPATH": str(RESULTS.parents[1]), "MUJOCO_GL": "disabled"}
-            process = subprocess.Popen(
-                command, stdout=subprocess.PIPE, cwd=folder, env=where, text=True, bufsize=1
-            )
-            assert process.stdout is not None
-            for line in _lines_in_time(process):
-                if line.strip().isdigit():
-                    seed, ours = int(line), False
-                elif line.strip() == _SIMULATED:
-                    ours = True
-                else:
-                    outcome, why = json.loads(line)
-                    yield seed, outcome, why
-                    first = seed + 1
-            process.kill()
-            code = process.wait()
-        if first < last:
-            late = code == -9
-            how = f"more than {LONGEST_S:g} s" if late else f"the interpreter ended with {code}"
-            yield seed, "defect" if ours or late else "mujoco", how
-            first = seed + 1
-
-
-def _lines_in_time(process: "subprocess.Popen[str]") -> Iterator[str]:
-    with selectors.DefaultSelector() as selector:
-        assert process.stdout is not None
-        selector.register(process.stdout, selectors.EVENT_READ)
-        while selector.select(LONGEST_S):
-            line = process.stdout.readline()
-            if not line:
-                return
-            yield line
+def outcomes(seeds: Iterable[int]) -> Iterator[tuple[int, str, str]]:
+    """Seed, outcome and reason of each seed, in a process that may crash or hang and is made anew then."""
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(1, context, initializer=_begin)
+    for seed in seeds:
+        found = ("mujoco", "MuJoCo alone crashes or hangs")
+        try:
+            found = pool.submit(simulates, seed).result(LONGEST_S) or found
+            if not found[0]:
+                found = ("defect", "the interpreter crashed, or hung")
+                found = pool.submit(trial, seed).result(LONGEST_S)
+        except (BrokenProcessPool, TimeoutError):
+            for process in pool._processes.values():
+                process.kill()
+            pool = ProcessPoolExecutor(1, context, initializer=_begin)
+        yield seed, *found
+    pool.shutdown()
 
 
 def kind_of(refusal: str) -> str:
@@ -338,67 +314,35 @@ def kind_of(refusal: str) -> str:
 
 
 def main() -> None:
-    """Run, or go on; print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--models", type=int, default=10_000, help="that MuJoCo compiles")
-    parser.add_argument("--seed", type=int, help="of one model to look at")
-    parser.add_argument("--child", type=int, nargs=2, help=argparse.SUPPRESS)
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the counts and the table")
-    arguments = parser.parse_args()
-    if arguments.child:
-        child(*arguments.child)
-    elif arguments.seed is not None:
-        print(RandomModel(arguments.seed).xml)
-        print(*trial(arguments.seed), sep="\n")
-    else:
-        run(arguments.models, arguments.results)
-
-
-def run(models: int, results: Path) -> None:
-    """Count until there are so many models, and keep the counts after every batch."""
-    path = results / "random_models.json"
-    new: dict[str, Any] = {
-        "next_seed": 0,
-        "mujoco": 0,
-        "supported": 0,
-        "refused": {},
-        "unfit": {},
-        "defects": [],
-    }
-    counts = json.loads(path.read_text()) if path.exists() else new
-    again, counts["defects"] = counts["defects"], []
-    for defect in again:  # they may have been mended
-        for seed, outcome, why in outcomes(defect["seed"], defect["seed"] + 1):
-            _count(counts, seed, outcome, why)
-    while (tried := counts["supported"] + sum(counts["refused"].values()) + len(counts["defects"])) < models:
-        first = counts["next_seed"]
-        for seed, outcome, why in outcomes(first, first + min(BATCH, models - tried)):
-            _count(counts, seed, outcome, why)
-            counts["next_seed"] = seed + 1
+    """Count until there are so many models, and keep the counts as they come; print the table."""
+    given = options(__doc__, models=10_000, seed=int)
+    if given.seed is not None:
+        print(RandomModel(given.seed).xml, *next(outcomes([given.seed])), sep="\n")
+        return
+    path = RESULTS / "random_models.json"
+    new = {"next_seed": 0, "mujoco": 0, "supported": 0, "refused": {}, "defects": []}
+    counts: dict[str, Any] = json.loads(path.read_text()) if path.exists() else new
+    again, counts["defects"] = (
+        [defect["seed"] for defect in counts["defects"]],
+        [],
+    )  # they may have been mended
+    for seed, outcome, why in outcomes(itertools.chain(again, itertools.count(counts["next_seed"]))):
+        if outcome == "defect":
+            counts["defects"].append({"seed": seed, "why": why})
+        elif outcome == "refused":
+            counts["refused"][kind_of(why)] = counts["refused"].get(kind_of(why), 0) + 1
+        else:
+            counts[outcome] += 1
+        counts["next_seed"] = max(counts["next_seed"], seed + 1)
         path.write_text(json.dumps(counts, indent=1) + "\n")
-        print(f"{counts['next_seed']} seeds, {len(counts['defects'])} defects", flush=True)
-    text = table(counts)
-    path.write_text(json.dumps(counts, indent=1) + "\n")
-    path.with_suffix(".md").write_text(text + "\n")
-    print(text)
-
-
-def _count(counts: dict[str, Any], seed: int, outcome: str, why: str) -> None:
-    if outcome == "defect":
-        counts["defects"].append({"seed": seed, "why": why})
-    elif outcome == "refused":
-        counts["refused"][kind_of(why)] = counts["refused"].get(kind_of(why), 0) + 1
-    else:
-        counts[outcome] += 1
-    for each in why.split(" | ") if outcome == "supported" and why else ():
-        counts["unfit"][kind_of(each)] = counts["unfit"].get(kind_of(each), 0) + 1
+        if counts["supported"] + sum(counts["refused"].values()) + len(counts["defects"]) >= given.models:
+            break
+    keep("random_models", table(counts))
 
 
 def table(counts: dict[str, Any]) -> str:
     """Markdown: what became of the models."""
-    lines = ["| outcome | models |", "|---|---|", f"| supported | {counts['supported']:,} |"]
     refused = sorted(counts["refused"].items(), key=lambda item: -item[1])
-    lines += [f"| refused: {kind} | {count:,} |" for kind, count in refused]
-    lines += [f"| defect | {len(counts['defects']):,} |"]
-    lines += [f"| (refused by MuJoCo itself) | {counts['mujoco']:,} |"]
-    return "\n".join(lines)
+    rows = [("supported", counts["supported"]), *((f"refused: {kind}", count) for kind, count in refused)]
+    rows += [("defect", len(counts["defects"])), ("(refused by MuJoCo itself)", counts["mujoco"])]
+    return markdown("outcome | models", ([name, f"{count:,}"] for name, count in rows))

@@ -26,7 +26,6 @@ _WRITTEN = {
     "env.observation": "`constraints`",
     "learner.margin_curriculum": "mapping",
     "sweep": "mapping",
-    "sweep.parameters.KEY.choices": "list",
 }
 """Types in YAML where Python has another one."""
 

@@ -20,9 +20,17 @@ POINT_GOAL_IDS: Final = tuple(f"SafePointGoal{level}-v0" for level in range(3))
 CAR_GOAL_IDS: Final = tuple(f"SafeCarGoal{level}-v0" for level in range(3))
 """Ids of the goal task with the car, by level."""
 
-VELOCITY_IDS: Final = tuple(
-    f"Safe{robot}Velocity-v0" for robot in ("HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid")
-)
+SPEED_LIMITS: Final = {
+    "HalfCheetah": 3.2096,
+    "Hopper": 0.7402,
+    "Walker2d": 2.3415,
+    "Swimmer": 0.2282,
+    "Ant": 2.6222,
+    "Humanoid": 1.4149,
+}
+"""By robot, m/s (Safety-Gymnasium, its velocity tasks v1): along x, for Ant and Humanoid in the plane."""
+
+VELOCITY_IDS: Final = tuple(f"Safe{robot}Velocity-v0" for robot in SPEED_LIMITS)
 """Ids of the velocity tasks: Gymnasium's robots with a published speed limit."""
 
 FLEX_JOINT_REACH_ID: Final = "FlexJointReach-v0"
@@ -51,9 +59,9 @@ TELEOP_CONTACT_ID: Final = "TeleopContact-v0"
 def register_envs() -> None:
     """Register every task of this package with Gymnasium; ids already there are left alone."""
     for level, env_id in enumerate(POINT_GOAL_IDS):
-        _register(env_id, "safe_wrappers.envs.point_goal:SafePointGoalEnv", {"level": level})
+        _register(env_id, "safe_wrappers.envs.goal_env:SafePointGoalEnv", {"level": level})
     for level, env_id in enumerate(CAR_GOAL_IDS):
-        _register(env_id, "safe_wrappers.envs.car_goal:SafeCarGoalEnv", {"level": level})
+        _register(env_id, "safe_wrappers.envs.goal_env:SafeCarGoalEnv", {"level": level})
     for env_id in VELOCITY_IDS:
         robot = env_id.removeprefix("Safe").removesuffix("Velocity-v0")
         _register(env_id, "safe_wrappers.envs.velocity:make_velocity_env", {"robot": robot})
@@ -82,6 +90,7 @@ __all__ = [
     "POINT_GOAL_IDS",
     "REACH_EPISODE_STEPS",
     "SAFE_ROVER_ID",
+    "SPEED_LIMITS",
     "TELEOP_CONTACT_ID",
     "TELEOP_EPISODE_STEPS",
     "VELOCITY_IDS",

@@ -1,6 +1,6 @@
-"""The goal task for any robot on the floor: reach goals, keep out of hazards, leave vases alone."""
+"""The goal tasks: reach goals, keep out of hazards, leave vases alone, with a point or a car."""
 
-import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,28 +11,29 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_action
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED
+from safe_wrappers.info import COST, COST_SUBSTEP
 
-from .goal.layout import Layout, PartialLayout, parse_layout
-from .goal.levels import (
+from .field import FieldEnv
+from .goal_layout import (
     GOAL_RADIUS,
     HAZARD_RADIUS,
     LEVELS,
     VASE_HALF_SIZE,
     VASE_SPEED_LIMIT,
+    Given,
+    Layout,
+    parse_layout,
+    sample_goal,
+    sample_layout,
 )
-from .goal.lidar import LIDAR_BINS, pseudo_lidar
-from .goal.placement import sample_goal, sample_layout
-from .goal.robot import Robot
+from .goal_robots import CAR, LIDAR_BINS, POINT, Robot, pseudo_lidar
 
 COST_HAZARDS: Final = "cost_hazards"
 """float: 1 if the robot's centre is inside a hazard's disc at the end of the step, else 0."""
 COST_VASES: Final = "cost_vases"
 """float: 1 if a vase is touched or moves at the end of the step, else 0 (always 0 below level 2)."""
-GOAL_MET: Final = "goal_met"
-"""bool: this step reached the goal (a new one stands already)."""
 
 _FRAME_SKIP: Final = 10
 _REWARD_LIMIT: Final = 10.0
@@ -47,7 +48,7 @@ _CAMERA_DISTANCE: Final = 2.8
 """Of the camera, in half extents of the field."""
 
 
-class SafeGoalEnv(MujocoEnv, EzPickle):
+class SafeGoalEnv(FieldEnv):
     """Safety-Gymnasium's goal task on today's MuJoCo: semantics theirs, model and code our own.
 
     **Levels**: 0 has a goal alone; 1 has 8 hazards and a vase that costs nothing; 2 has 10 hazards and 10
@@ -81,11 +82,6 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
     Raises:
         ConfigurationError: There is no such level.
     """
-
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
-        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
-        "render_fps": 50,
-    }
 
     hazard_radius: Final = HAZARD_RADIUS
     goal_radius: Final = GOAL_RADIUS
@@ -121,26 +117,15 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
             self.model.opt.sleep_tolerance = _SLEEP_TOLERANCE
             # With sleeping on, MuJoCo computes the poses of what never moves here alone (3.13 and later).
             mujoco.mj_resetData(self.model, self.data)
-        self._given = PartialLayout()
         self._path = np.zeros((_FRAME_SKIP, 2))
         self._apply(Layout(np.zeros(3), np.zeros(2), np.zeros((0, 2)), np.zeros((0, 2))))
 
     # What a constraint may read: from qpos, never a substep behind as xpos is after mj_step ----------------
 
     @property
-    def agent_position(self) -> Array:
-        """Robot's centre, shape (2,), m."""
-        return np.array(self.data.qpos[:2])
-
-    @property
     def agent_heading(self) -> float:
         """Where positive controls drive the robot, in [-pi, pi], rad."""
         return self.robot.heading(self.data.qpos)
-
-    @property
-    def goal_position(self) -> Array:
-        """Goal's centre, shape (2,), m."""
-        return np.array(self._targets[0])
 
     @property
     def hazard_positions(self) -> Array:
@@ -159,18 +144,8 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
 
     # Gymnasium ---------------------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode; ``options["layout"]`` fixes parts of the scenario.
-
-        Raises:
-            UnknownNameError: An unknown layout key.
-            ConfigurationError: A layout that cannot be used.
-        """
-        self._given = parse_layout(options, self.level)
-        observation, info = super().reset(seed=seed, options=options)
-        return observation, info
+    def _parse(self, options: Mapping[str, Any] | None) -> Given:
+        return parse_layout(options, self.level)
 
     def reset_model(self) -> Array:
         """Sample what the options left open, place everything, return the observation."""
@@ -182,7 +157,6 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         self._judge_now()
 
-    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
     def step(  # type: ignore[override]
         self, action: NDArray[np.floating[Any]]
     ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -191,22 +165,13 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         Raises:
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
         """
-        control = finite_action(action, self.model.nu)
-        before = self._goal_distance()
-        self._step_mujoco_simulation(control, self.frame_skip)
-        reward = before - self._goal_distance()
-        self._goal_met = self._goal_distance() <= GOAL_RADIUS
-        if self._goal_met:
-            reward += 1.0
-            self._goals_reached += 1
-            vases = self.vase_positions
-            self.place_goal(
-                sample_goal(self.np_random, self.level, self.agent_position, self._hazards, vases)
-            )
-        if self.render_mode == "human":
-            self.render()  # type: ignore[no-untyped-call]
-        reward = max(-_REWARD_LIMIT, min(_REWARD_LIMIT, reward))
-        return self.observe(), reward, False, False, self._get_reset_info()
+        observation, reward, *rest = super().step(action)
+        return observation, max(-_REWARD_LIMIT, min(_REWARD_LIMIT, reward)), *rest
+
+    def _next_goal(self) -> Array:
+        return sample_goal(
+            self.np_random, self.level, self.agent_position, self._hazards, self.vase_positions
+        )
 
     def _get_reset_info(self) -> dict[str, Any]:
         return {
@@ -214,8 +179,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
             COST_SUBSTEP: float(self._violated),
             COST_HAZARDS: float(self._in_hazard),
             COST_VASES: float(self._vase_hit),
-            GOAL_MET: self._goal_met,
-            GOALS_REACHED: self._goals_reached,
+            **super()._get_reset_info(),
         }
 
     # Physics and judging -----------------------------------------------------------------------------------
@@ -307,12 +271,8 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
 
     def place_goal(self, goal: Array) -> None:
         """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
-        self._targets[0] = goal
-        self.data.mocap_pos[0] = goal[0], goal[1], _GOAL_Z
-
-    def _goal_distance(self) -> float:
-        goal, qpos = self._targets[0], self.data.qpos
-        return math.hypot(goal[0] - qpos[0], goal[1] - qpos[1])
+        super().place_goal(goal)
+        self.data.mocap_pos[0, 2] = _GOAL_Z
 
     def observe(self) -> Array:
         """Observation of the state as it is now: also right after `set_state`."""
@@ -321,3 +281,64 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         relative = self.robot.relative(targets, self.data.qpos)
         lidar = pseudo_lidar(relative, self._groups, self._kinds)
         return np.concatenate([self.robot.sensors(self.data), lidar])
+
+
+class SafePointGoalEnv(SafeGoalEnv):
+    """`SafeGoalEnv` with a force along the heading and a turning-speed servo as its two controls.
+
+    **Action**: ``Box(-1, 1, (2,))``. Control 0 pushes along the heading, clipped at 0.05, times the gear 0.3:
+    at most 0.015 N on 5.19 g, reached at a control of 0.05 already. Control 1 asks for a turning speed of
+    control / 0.3 rad/s, by a torque of at most 0.015 N m. That servo is unstable at the time step of 2 ms:
+    the turning speed chatters by up to half a rad/s between substeps, and its mean is lower than asked for.
+    Nothing acts sideways: the robot slides, with linear damping (0.01 N s/m, so speed decays with a time
+    constant of 0.52 s).
+
+    **Observation**: accelerometer 3 (m/s^2), velocimeter 3 (m/s), gyro 3 (rad/s), magnetometer 3, then the
+    lidars of `SafeGoalEnv`. 28 numbers at level 0, 60 at levels 1 and 2.
+
+    Args:
+        level: 0, 1 or 2; see `SafeGoalEnv`.
+        kwargs: Passed to `SafeGoalEnv` (``render_mode``, ``width``, ``height``, ``camera_name``, ...).
+    """
+
+    def __init__(self, level: int = 1, **kwargs: Any) -> None:
+        # EzPickle rebuilds the class from these arguments, so it must see this class's signature.
+        EzPickle.__init__(self, level=level, **kwargs)
+        super().__init__(POINT, level, **kwargs)
+
+
+class SafeCarGoalEnv(SafeGoalEnv):
+    """`SafeGoalEnv` with a car: a torque on each of its two wheels.
+
+    **Action**: ``Box(-1, 1, (2,))``, the torques of the joints ``"left"`` and ``"right"`` in N m, clipped at 0.02:
+    in effect full torque one way or the other. Equal positive controls drive the car straight along its heading;
+    more of control 0 turns it to the left (the original's wheels are named as seen from the front). Wheels are
+    damped (0.001 N m s): at full torque one in the air ends at 20 rad/s, 1 m/s at its rim. Full torque is 0.4 N
+    at the rim of each wheel, and all of the car weighs 0.3 N: the wheels slip. Without torque it brakes through
+    its wheels.
+
+    **Observation**: accelerometer 3 (m/s^2), velocimeter 3 (m/s), gyro 3 (rad/s), magnetometer 3, turning speed of
+    the ball caster 3 (rad/s), its orientation as a rotation matrix 9 (by rows), then the lidars of `SafeGoalEnv`. 40
+    numbers at level 0, 72 at levels 1 and 2. All are in the body's frame: x along the axle, to the left of the
+    heading, -y along the heading. A lidar's bin 0 begins at x, so bin 12 begins straight ahead.
+
+    **State**: `qpos` begins with the car's x, y, z and quaternion, the angles of the left and the right wheel (rad)
+    and the caster's quaternion; `qvel` with six velocities of the free joint, two of the wheels, three of the caster.
+    `agent_position` is the body's origin, which is what hazards judge; `agent_heading` the direction of -y.
+
+    **Time**: a control step is ten physics substeps of 4 ms, 0.04 s; 1000 steps are 40 s.
+
+    Args:
+        level: 0, 1 or 2; see `SafeGoalEnv`.
+        kwargs: Passed to `SafeGoalEnv` (``render_mode``, ``width``, ``height``, ``camera_name``, ...).
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
+        **SafeGoalEnv.metadata,
+        "render_fps": 25,
+    }
+
+    def __init__(self, level: int = 1, **kwargs: Any) -> None:
+        # EzPickle rebuilds the class from these arguments, so it must see this class's signature.
+        EzPickle.__init__(self, level=level, **kwargs)
+        super().__init__(CAR, level, **kwargs)

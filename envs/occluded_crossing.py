@@ -1,6 +1,7 @@
 """Crossing a road whose cars hide behind pillars: what is not seen has to be estimated."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,14 +10,12 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_action
+from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
-from safe_wrappers.errors import SafeWrappersError
-from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP, GOALS_REACHED
+from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
-from .crossing.layout import (
+from .crossing_layout import (
     CARS,
     CARS_PER_LANE,
     CROSSING_GOAL_RADIUS,
@@ -29,20 +28,9 @@ from .crossing.layout import (
     sample_crossing_goal,
     sample_crossing_layout,
 )
-from .goal_env import GOAL_MET
-from .traffic import CAR_ACCELERATION_NOISE, CAR_MEAN_SPEED, CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
-
-__all__ = [
-    "CAR_ACCELERATION_NOISE",
-    "CAR_BODIES",
-    "CAR_MEAN_SPEED",
-    "CAR_RADIUS",
-    "CAR_SPEED_STD",
-    "CAR_TIME_CONSTANT_S",
-    "COLLISIONS",
-    "OccludedCrossingEnv",
-]
-
+from .field import FieldEnv
+from .goal_layout import Given
+from .traffic import CAR_ACCELERATION_NOISE, CAR_MEAN_SPEED, CAR_TIME_CONSTANT_S, Traffic
 
 CAR_BODIES: Final = tuple(f"car{i}" for i in range(CARS))
 """The cars' bodies and joints, in the order of every array of six: the first three drive towards +x."""
@@ -52,13 +40,11 @@ CAR_RADIUS: Final = 0.4
 _FRAME_SKIP: Final = 4
 _CARS: Final = slice(3, 3 + CARS)  # coordinates: robot x, y, heading, then the cars' x
 _CONTACT_SQUARED: Final = (CAR_RADIUS + ROBOT_RADIUS) ** 2
-_GOAL_BODY: Final = 0  # of the mocap bodies; the pillars follow
 _ASSET: Final = Path(__file__).parent / "assets" / "occluded_crossing.xml"
 _CAMERA: Final = {"distance": 10.0, "elevation": -60.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
-_NOT_FINITE: Final = "the crossing's state is not finite: a state that was set, or a changed model, broke it"
 
 
-class OccludedCrossingEnv(MujocoEnv, EzPickle):
+class OccludedCrossingEnv(FieldEnv):
     """Cross a road of two lanes, again and again, between cars that pillars hide and the observation leaves out.
 
     A disc of 0.2 m and 1 kg with a camera and a site, both called ``eye``, 0.15 m ahead of the axis that it turns
@@ -106,10 +92,7 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
         True
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
-        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
-        "render_fps": 25,
-    }
+    metadata: dict[str, Any] = {**FieldEnv.metadata, "render_fps": 25}  # noqa: RUF012 (Gymnasium's)
 
     robot_radius: Final = ROBOT_RADIUS
     car_radius: Final = CAR_RADIUS
@@ -130,17 +113,10 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
         along = np.diag([CAR_ACCELERATION_NOISE, 0.0])
         ways = [Motion(along, CAR_TIME_CONSTANT_S, np.array([v * CAR_MEAN_SPEED, 0.0])) for v in (1.0, -1.0)]
         self._tracks = Tracks([motion for motion in ways for _ in range(CARS_PER_LANE)])
-        self._goal_met = False
-        self._goals_reached = 0
         cars = np.stack([np.zeros(CARS), self._mean_velocities], axis=1)
         self._apply(CrossingLayout(np.array([0.0, -2.9, 0.0]), np.zeros(2), cars, np.zeros((PILLARS, 2))))
 
     # What a constraint or a judge may read: from qpos, never a substep behind ------------------------------
-
-    @property
-    def agent_position(self) -> Array:
-        """The robot's axis, shape (2,), m."""
-        return np.array(self.data.qpos[:2])
 
     @property
     def agent_velocity(self) -> Array:
@@ -151,11 +127,6 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
     def agent_heading(self) -> float:
         """Heading in [-pi, pi], rad."""
         return math.remainder(self.data.qpos[2], math.tau)
-
-    @property
-    def goal_position(self) -> Array:
-        """Goal's centre, shape (2,), m."""
-        return np.array(self._goal)
 
     @property
     def pillar_positions(self) -> Array:
@@ -182,18 +153,8 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
 
     # Gymnasium ---------------------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode; ``options["layout"]`` fixes parts of the scenario.
-
-        Raises:
-            UnknownNameError: An unknown layout key.
-            ConfigurationError: A layout that cannot be used.
-        """
-        self._given = parse_crossing_layout(options)
-        observation, info = super().reset(seed=seed, options=options)
-        return observation, info
+    def _parse(self, options: Mapping[str, Any] | None) -> Given:
+        return parse_crossing_layout(options)
 
     def reset_model(self) -> Array:
         """Sample what the options left open, place everything, return the observation."""
@@ -211,37 +172,17 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
         self._touching = np.zeros(CARS, dtype=bool)
         self._judge(self.data.qpos[None, :2], self.data.qpos[None, _CARS])
 
-    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
-    def step(  # type: ignore[override]
-        self, action: NDArray[np.floating[Any]]
-    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold an action for one control step.
+    def _next_goal(self) -> Array:
+        return sample_crossing_goal(self.np_random, self.agent_position, self._pillars)
 
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
-            SafeWrappersError: The physics left finite numbers.
-        """
-        control = finite_action(action, self.model.nu)
-        before = self._goal_distance()
-        self._step_mujoco_simulation(control, self.frame_skip)
-        distance = self._goal_distance()
-        reward = before - distance
-        self._goal_met = distance <= CROSSING_GOAL_RADIUS
-        if self._goal_met:
-            reward += 1.0
-            self._goals_reached += 1
-            self.place_goal(sample_crossing_goal(self.np_random, self.agent_position, self._pillars))
-        if not math.isfinite(float(self.data.qpos.sum() + self.data.qvel.sum())):
-            raise SafeWrappersError(_NOT_FINITE)
-        if self.render_mode == "human":
-            self.render()  # type: ignore[no-untyped-call]
-        return self.observe(), reward, False, False, self._get_reset_info()
+    def _is_finite(self, observation: Array) -> bool:
+        return math.isfinite(float(self.data.qpos.sum() + self.data.qvel.sum()))
 
     def observe(self) -> Array:
         """Observation of the state as it is now: also right after `set_state`."""
         x, y, heading = self.data.qpos[:3].tolist()
         vx, vy, yaw_rate = self.data.qvel[:3].tolist()
-        goal_x, goal_y = self._goal
+        goal_x, goal_y = self._targets[0].tolist()
         observation = np.empty(9 + 2 * PILLARS)
         observation[:9] = x, y, vx, vy, math.cos(heading), math.sin(heading), yaw_rate, goal_x - x, goal_y - y
         observation[9:] = (self._pillars - self.data.qpos[:2]).ravel()
@@ -252,8 +193,7 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
             COST: self._cost,
             COST_SUBSTEP: self._cost,
             COLLISIONS: self._collisions,
-            GOAL_MET: self._goal_met,
-            GOALS_REACHED: self._goals_reached,
+            **super()._get_reset_info(),
         }
 
     # Physics and judging -----------------------------------------------------------------------------------
@@ -293,19 +233,10 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
         self._goals_reached = 0
         self._goal_met = False
         self._pillars = layout.pillars
-        self.data.mocap_pos[_GOAL_BODY + 1 :, :2] = layout.pillars
+        self.data.mocap_pos[1:, :2] = layout.pillars
+        self._targets = np.zeros((1, 2))
         self.place_goal(layout.goal)
         qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
         qpos[:3] = layout.agent
         qpos[_CARS], qvel[_CARS] = layout.cars.T
         self.set_state(qpos, qvel)
-
-    def place_goal(self, goal: Array) -> None:
-        """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
-        self._goal: tuple[float, float] = float(goal[0]), float(goal[1])
-        self.data.mocap_pos[_GOAL_BODY, :2] = self._goal
-
-    def _goal_distance(self) -> float:
-        x, y = self.data.qpos[:2].tolist()
-        goal_x, goal_y = self._goal
-        return math.hypot(goal_x - x, goal_y - y)

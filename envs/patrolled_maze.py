@@ -13,7 +13,7 @@ from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
-from .crossing.markers import MarkingRenderer
+from .markers import MarkingRenderer
 from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
 
 try:
@@ -55,7 +55,7 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     0.15 m/s, time constant 2 s; `safe_wrappers.envs.traffic`), drawn without a discretisation error; at an end it
     turns about, as a ball off a wall. Patrols are no bodies of the model: they pass through the ball, and walls hide
     them from whoever looks along the floor. The observation has nothing of them. Frames show them in orange, which
-    the renderer adds (`safe_wrappers.envs.crossing.markers`).
+    the renderer adds (`safe_wrappers.envs.markers`).
 
     **Attributes**: `patrol_positions` and `patrol_velocities`, shape (k, 2), m and m/s; `patrol_tracks` (a
     `control.estimation.tracks.Tracks`): the same as tracks that are known exactly now. `agent_position`,

@@ -1,6 +1,7 @@
 """A rover on dry, wet and icy ground: too much throttle spins its wheels, and a spun wheel does not steer."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,18 +10,23 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_action
-from safe_wrappers.errors import SafeWrappersError, UnknownNameError
-from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED, SPIN_OUT
+from safe_wrappers.checks import Array
+from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.info import COST, COST_SUBSTEP, SPIN_OUT
 
-from .goal.lidar import LIDAR_BINS, pseudo_lidar
-from .goal_env import GOAL_MET
-from .ground import Ground, MagicFormula
-from .rover.layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout, start_state
-from .rover.scene import Scene
-from .rover.tyres import Tyres, rolled_over
+from .field import FieldEnv
+from .goal_layout import Given
+from .goal_robots import LIDAR_BINS, pseudo_lidar
+from .ground import Ground, MagicFormula, Tyres, rolled_over
+from .rover_layout import (
+    RoverLayout,
+    Scene,
+    parse_rover_layout,
+    sample_rover_goal,
+    sample_rover_layout,
+    start_state,
+)
 
 WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
 """The wheels' joints, bodies and geoms, in the order of every array of four."""
@@ -45,10 +51,9 @@ _LIDAR_RANGE: Final = 12.0  # m: across the field
 _SETTLING: Final = 12  # rounds until loads and tyre forces agree: each leaves a quarter of the difference
 _ASSET: Final = Path(__file__).parent / "assets" / "safe_rover.xml"
 _CAMERA: Final = {"distance": 11.0, "elevation": -55.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
-_NOT_FINITE: Final = "the rover's state is not finite: a state that was set, or a changed model, broke it"
 
 
-class SafeRoverEnv(MujocoEnv, EzPickle):
+class SafeRoverEnv(FieldEnv):
     """Drive a rover to goals, around hazards, over patches of wet and icy ground that it cannot see.
 
     18 kg, 0.5 m between the axles and 0.4 m between the wheels, centre of mass 0.12 m high. Four wheels of
@@ -95,10 +100,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         1.0
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
-        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
-        "render_fps": 100,
-    }
+    metadata: dict[str, Any] = {**FieldEnv.metadata, "render_fps": 100}  # noqa: RUF012 (Gymnasium's)
 
     hazard_radius: Final = ROVER_HAZARD_RADIUS
     goal_radius: Final = ROVER_GOAL_RADIUS
@@ -118,16 +120,9 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         self._steer = [int(model.joint(f"steer_{side}").qposadr[0]) for side in ("left", "right")]
         self._scene = Scene(model)
         self._grounds = Ground("dry", ())
-        self._goal_met = False
-        self._goals_reached = 0
         self._apply(RoverLayout(np.zeros(3), np.zeros(2), np.zeros((0, 2)), (), "dry", 0.0))
 
     # What a constraint or a judge may read: from qpos, never a substep behind ------------------------------
-
-    @property
-    def agent_position(self) -> Array:
-        """The chassis's centre, midway between the wheels, shape (2,), m."""
-        return np.array(self.data.qpos[:2])
 
     @property
     def agent_heading(self) -> float:
@@ -141,11 +136,6 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         heading = self.agent_heading
         vx, vy = self.data.qvel[:2].tolist()
         return float(vx * math.cos(heading) + vy * math.sin(heading))
-
-    @property
-    def goal_position(self) -> Array:
-        """Goal's centre, shape (2,), m."""
-        return np.array(self._targets[0])
 
     @property
     def hazard_positions(self) -> Array:
@@ -186,18 +176,8 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
 
     # Gymnasium ---------------------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode; ``options["layout"]`` fixes parts of the scenario.
-
-        Raises:
-            UnknownNameError: An unknown layout key or ground.
-            ConfigurationError: A layout that cannot be used.
-        """
-        self._given = parse_rover_layout(options)
-        observation, info = super().reset(seed=seed, options=options)
-        return observation, info
+    def _parse(self, options: Mapping[str, Any] | None) -> Given:
+        return parse_rover_layout(options)
 
     def reset_model(self) -> Array:
         """Sample what the options left open, place everything, return the observation."""
@@ -221,32 +201,14 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         self._begin_judging()
         self._judge()
 
-    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
-    def step(  # type: ignore[override]
-        self, action: NDArray[np.floating[Any]]
-    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold an action for one control step.
+    def _next_goal(self) -> Array:
+        return sample_rover_goal(self.np_random, self.agent_position, self._targets[1:])
 
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
-            SafeWrappersError: The physics left finite numbers.
-        """
-        control = finite_action(action, self.model.nu)
-        before = self._goal_distance()
-        self._step_mujoco_simulation(control, self.frame_skip)
-        distance = self._goal_distance()
-        reward = before - distance
-        self._goal_met = distance <= ROVER_GOAL_RADIUS
-        if self._goal_met:
-            reward += 1.0
-            self._goals_reached += 1
-            self.place_goal(sample_rover_goal(self.np_random, self.agent_position, self._targets[1:]))
-        observation = self.observe()
-        if not np.isfinite(observation).all():
-            raise SafeWrappersError(_NOT_FINITE)
-        if self.render_mode == "human":
-            self.render()  # type: ignore[no-untyped-call]
-        return observation, reward, rolled_over(self.data.qpos[3:7]), False, self._get_reset_info()
+    def _is_finite(self, observation: Array) -> bool:
+        return bool(np.isfinite(observation).all())
+
+    def _is_over(self) -> bool:
+        return rolled_over(self.data.qpos[3:7])
 
     def observe(self) -> Array:
         """Observation of the state as it is now: also right after `set_state`."""
@@ -268,8 +230,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
             SLIP_MAX: self._slip_max,
             SPIN_OUT: float(self._slip_max > SPIN_OUT_SLIP),
             YAW_RATE_ERROR: self._yaw_rate_error,
-            GOAL_MET: self._goal_met,
-            GOALS_REACHED: self._goals_reached,
+            **super()._get_reset_info(),
         }
 
     # Physics and judging -----------------------------------------------------------------------------------
@@ -333,12 +294,3 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         qpos, qvel = start_state(layout, self.init_qpos, self.model.nv)
         qvel[self.wheel_dofs] = layout.speed / self.wheel_radius
         self.set_state(qpos, qvel)
-
-    def place_goal(self, goal: Array) -> None:
-        """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
-        self._targets[0] = goal
-        self.data.mocap_pos[0, :2] = goal
-
-    def _goal_distance(self) -> float:
-        goal, qpos = self._targets[0], self.data.qpos
-        return math.hypot(goal[0] - qpos[0], goal[1] - qpos[1])

@@ -13,8 +13,10 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, finite_action
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from safe_wrappers.info import COST, COST_SUBSTEP
+
+from .goal_layout import known, layout_option, numbers
 
 COST_FORCE: Final = "cost_force"
 """float64: 1 if the wall or the clamp pushed with more than `FORCE_LIMIT` in this step, else 0."""
@@ -314,18 +316,9 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
 
 
 def _layout(options: Mapping[str, Any] | None) -> dict[str, Any]:
-    given = dict((options or {}).get("layout") or {})
-    shapes = {"tool": (2,), "velocity": (2,), "wanted_force": ()}
-    for key, value in given.items():
-        if key not in shapes:
-            raise UnknownNameError(f"unknown layout key {key!r}: valid keys are {', '.join(shapes)}")
-        try:
-            numbers = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            numbers = np.full(1, np.nan)
-        if numbers.shape != shapes[key] or not np.isfinite(numbers).all():
-            raise ConfigurationError(f"{key} of a layout is of shape {shapes[key]} and finite; got {value!r}")
-        given[key] = numbers
+    shapes = {"tool": ("[x, y]", (2,)), "velocity": ("[vx, vy]", (2,)), "wanted_force": ("a number of N", ())}
+    found = layout_option(options, tuple(shapes))
+    given = dict(known(**{key: numbers(found, key, form, shape) for key, (form, shape) in shapes.items()}))
     if "wanted_force" in given and not 0.0 < given["wanted_force"] < _SPRING_LIMIT:
         raise ConfigurationError(
             f"wanted_force must be above 0 and below the spring's limit of {_SPRING_LIMIT} N; got "

@@ -6,7 +6,6 @@ from typing import Any, Final
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError
 
 REACTION_S: Final = (0.15, 0.25)
 """Range of human reaction times, s, from which one is drawn."""
@@ -14,6 +13,10 @@ REACTION_S: Final = (0.15, 0.25)
 _TOUCHED: Final = 1.0  # N, of what is seen: then the operator presses
 _RAMP_S: Final = 0.5  # of the pressing force
 _PRESSED_S: Final = 1.0  # at the latest the sweep begins
+_GAP: Final = 0.03  # m: clearance at which it wants to stop
+_MASS: Final = 1.5  # kg, of hand and handle
+_DAMPING: Final = 25.0  # N s/m, of the arm
+_STEP_S: Final = 0.001  # between two actions
 
 
 class TeleopOperator:
@@ -37,14 +40,7 @@ class TeleopOperator:
         stops: Whether it stops before the clamp. False: it looks away and sweeps on.
         approach_speed: m/s, intended.
         sweep_speed: m/s, intended.
-        gap: Clearance at which it wants to stop, m.
         tremor: Standard deviation of a random force of the arm, N.
-        mass: Of hand and handle, kg.
-        damping: Of the arm, N s/m.
-        step_s: Time between two actions, s.
-
-    Raises:
-        ConfigurationError: A mass, damping or time that is not positive.
     """
 
     def __init__(
@@ -54,23 +50,13 @@ class TeleopOperator:
         stops: bool = True,
         approach_speed: float = 0.1,
         sweep_speed: float = 0.1,
-        gap: float = 0.03,
         tremor: float = 0.1,
-        mass: float = 1.5,
-        damping: float = 25.0,
-        step_s: float = 0.001,
     ) -> None:
-        for name, value in {"mass": mass, "damping": damping, "step_s": step_s}.items():
-            if not (np.isfinite(value) and value > 0.0):
-                raise ConfigurationError(f"{name} must be a finite number > 0, got {value!r}")
-        if reaction_s is not None and not (np.isfinite(reaction_s) and reaction_s >= 0.0):
-            raise ConfigurationError(f"reaction_s must be a finite time of at least 0 s, got {reaction_s!r}")
         self._random = np.random.default_rng(seed)
         drawn = float(self._random.uniform(*REACTION_S))
         self.reaction_s = drawn if reaction_s is None else float(reaction_s)
         self._stops = stops
-        self._approach_speed, self._sweep_speed, self._gap = approach_speed, sweep_speed, gap
-        self._tremor, self._mass, self._damping, self._step_s = tremor, mass, damping, step_s
+        self._approach_speed, self._sweep_speed, self._tremor = approach_speed, sweep_speed, tremor
         self.reset()
 
     def reset(self) -> None:
@@ -91,16 +77,16 @@ class TeleopOperator:
         intended, force = self._intention(seen)
         shake = self._tremor * self._random.standard_normal(2)
         for i in range(2):
-            push = self._damping * (intended[i] - self._velocity[i]) + force[i] + shake[i]
-            rate = (push - float(observation[4 + i])) / self._mass
-            self._velocity[i] = min(max(self._velocity[i] + rate * self._step_s, -1.0), 1.0)
+            push = _DAMPING * (intended[i] - self._velocity[i]) + force[i] + shake[i]
+            rate = (push - float(observation[4 + i])) / _MASS
+            self._velocity[i] = min(max(self._velocity[i] + rate * _STEP_S, -1.0), 1.0)
         self._steps += 1
         return np.array(self._velocity)
 
     def _perceived(self, observation: Array) -> list[float]:
         """What was shown one reaction time ago."""
         self._on_its_way.append(observation.tolist())
-        if len(self._on_its_way) > 1 + round(self.reaction_s / self._step_s):
+        if len(self._on_its_way) > 1 + round(self.reaction_s / _STEP_S):
             self._on_its_way.popleft()
         seen: list[float] = self._on_its_way[0]
         return seen
@@ -108,7 +94,7 @@ class TeleopOperator:
     def _intention(self, seen: list[float]) -> tuple[tuple[float, float], tuple[float, float]]:
         """Intended velocity and force."""
         touching, clearance, wanted = seen[6:9]
-        now = self._steps * self._step_s
+        now = self._steps * _STEP_S
         if self.phase == "approach":
             if touching < _TOUCHED:
                 return (self._approach_speed, 0.0), (0.0, 0.0)
@@ -120,7 +106,7 @@ class TeleopOperator:
             self.phase = "sweep"
         along = self._sweep_speed
         if self._stops:
-            along = min(along, max(clearance - self._gap, 0.0) / self._caution_s)
+            along = min(along, max(clearance - _GAP, 0.0) / self._caution_s)
         return (0.0, along), (wanted, 0.0)
 
     @property

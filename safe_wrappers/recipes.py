@@ -25,10 +25,10 @@ from safe_wrappers.constraints import (
     Workspace,
 )
 from safe_wrappers.constraints.limits.joints import driven_joints
-from safe_wrappers.control.numerics.planar import merged
-from safe_wrappers.envs.goal.car import CAR
+from safe_wrappers.control.numerics.shapes import merged
+from safe_wrappers.envs import SPEED_LIMITS
+from safe_wrappers.envs.goal_robots import CAR
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADIUS
-from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.model import HINGE

@@ -17,7 +17,7 @@ from scipy.linalg import solve_discrete_are
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
+from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsafeStateWarning, UnsupportedEnvError
 
 RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
@@ -148,7 +148,7 @@ def test_a_car_keeps_clear_of_vases_with_its_outline_where_they_cost():
 
 
 def test_the_cars_outline_encloses_every_geom():
-    from safe_wrappers.control.numerics.planar import distance_to_outline
+    from safe_wrappers.control.numerics.shapes import distance_to_outline
 
     env = gym.make("SafeCarGoal1-v0").unwrapped
     env.reset(
@@ -167,8 +167,8 @@ def test_the_cars_outline_encloses_every_geom():
 
 
 def test_hulls_are_as_large_as_the_geoms():
-    from safe_wrappers.envs.goal.levels import HAZARD_RADIUS, VASE_HALF_SIZE
-    from safe_wrappers.envs.goal.robot import POINT
+    from safe_wrappers.envs.goal_layout import HAZARD_RADIUS, VASE_HALF_SIZE
+    from safe_wrappers.envs.goal_robots import POINT
     from safe_wrappers.recipes import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
 
     assert POINT.radius <= POINT_HULL_RADIUS_M < POINT.radius + 1e-3

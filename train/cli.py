@@ -69,7 +69,7 @@ def make_parser(command: str) -> argparse.ArgumentParser:
             how.add_argument("--output", type=Path, metavar="FILM.webp", help=what)
         else:
             add("env", metavar="ENV", help="an id of gymnasium.make")
-            add("--policy", type=Path, metavar="RUN", help="a run's folder, or a model.zip of SB3")
+            add("--policy", type=Path, metavar="RUN", help="a run's folder")
             add("--steps", type=int, default=2000, help="control steps of each driver (default: %(default)s)")
             what = "the same as JSON (default: %(default)s)"
             add("--output", type=Path, metavar="FILE", default=Path("diagnosis.json"), help=what)

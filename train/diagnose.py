@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import gymnasium as gym
 from rich.console import Console
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.save_util import load_from_zip_file
 
 from safe_wrappers.diagnosis import Diagnosis, diagnose
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
-from .config.algorithms import ALGORITHMS
 from .files import write_text
 from .policies import load_policy
-from .run.data_pickles import pickles_of_model
 from .run.stack import make_env
 
 Policy = Callable[[Any], Any]
-_OF_PACKAGE: Final = {"recurrent": "RecurrentPPO", "maskable": "MaskablePPO"}
 
 
 def diagnose_command(
@@ -38,18 +33,13 @@ def diagnose_command(
 
     Args:
         env_id: As `gym.make` takes it.
-        policy: A run's folder, or a model.zip; None: random and attacking drivers alone.
+        policy: A run's folder; None: random and attacking drivers alone.
         steps: Control steps of each driver.
         output: Where the JSON goes.
         console: Where the table goes.
         imports: As `load_policy` takes it.
     """
-    acts: Any = None
-    if policy is not None and policy.suffix != ".zip":
-        env, acts = of_run(policy, env_id, imports)
-    else:
-        env = make_env(env_id, {})
-        acts = acts if policy is None else of_file(policy)
+    env, acts = (make_env(env_id, {}), None) if policy is None else of_run(policy, env_id, imports)
     found = diagnose(env, acts, steps)
     env.close()
     write_text(output, found.as_json())
@@ -73,35 +63,3 @@ def of_run(folder: Path, env_id: str, imports: Collection[str] = ()) -> tuple[gy
     while isinstance(env, Monitor | RecordInterventions):  # they belong outside of filters that are tried
         env = env.env
     return env, trained
-
-
-def of_file(path: Path) -> Any:
-    """A model of Stable-Baselines3 or sb3-contrib; its class is found by its policy's.
-
-    Raises:
-        ConfigurationError: There is no such file, or it is no model.
-        RunStateError: A pickle in it names what is no data.
-    """
-    try:
-        pickled = pickles_of_model(path)
-        data, _, _ = load_from_zip_file(path, device="cpu", custom_objects=pickled)
-        assert data is not None
-        name = _algorithm(data)
-    except (OSError, zipfile.BadZipFile, ValueError, AssertionError, KeyError, AttributeError) as error:
-        raise ConfigurationError(
-            f"--policy: {str(path)!r} is no model that Stable-Baselines3 has saved ({error})"
-        ) from None
-    return ALGORITHMS[name].load(path, device="cpu", custom_objects=pickled)
-
-
-def _algorithm(data: dict[str, Any]) -> str:
-    """Whose model it is: the file names the policy's class alone."""
-    package = data["policy_class"].__module__.split(".")[-2]
-    if package in _OF_PACKAGE:
-        return _OF_PACKAGE[package]
-    if package == "common":  # PPO's, A2C's and TRPO's policies have one class
-        return "PPO" if "clip_range" in data else "TRPO" if "cg_max_steps" in data else "A2C"
-    found = [name for name in ALGORITHMS if name.lower() == package]
-    if not found:
-        raise ValueError(f"policies of {package!r} are not among {', '.join(ALGORITHMS)}")
-    return found[0]

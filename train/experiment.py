@@ -8,6 +8,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from safe_wrappers.errors import ConfigurationError
+
 from .config import ArmConfig, ExperimentConfig
 from .evaluation.evaluate import evaluate_run
 from .evaluation.summary import Summary, summarize, write_summary
@@ -19,7 +21,7 @@ from .run.model import check_task, whole_rollouts
 from .run.stack import make_training_env
 from .run.start import Start
 from .run.trackers import check_trackers
-from .run.training import check_start, train_run
+from .run.training import train_run
 from .videos.record import delete_videos, record_videos
 
 
@@ -60,8 +62,8 @@ def check_training(experiment: ExperimentConfig) -> None:
         check_trackers(arm)
         env.close()
         start = _start(experiment, arm, experiment.seeds[0])
-        if start is not None:
-            check_start(arm, start)
+        if start is not None and start.arm is None and not start.path.is_file():
+            raise ConfigurationError(f"arms.{arm.name}.start_from: there is no file {start.name!r}.")
         for seed in experiment.seeds:
             check_folder(arm, seed, experiment.run_folder(arm, seed))
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
-import re
-import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import gymnasium as gym
 from rich.console import Console
 
 import safe_wrappers
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.protect import recipe_names, recipe_of, remedy_for
+from safe_wrappers.protect import recipe_names, recipe_of
 
 from .config import parse_experiment, read_config
 from .config.algorithms import DETERMINISTIC, DISCRETE, MASKED, OFF_POLICY, ON_POLICY
@@ -24,8 +22,6 @@ from .config.types import check_name
 from .files import write_text
 
 _FILLED: Final = {"env": "SafePointGoal1-v0", "algorithm": "PPO"}
-_RECIPE: Final = 'protect  # this library\'s recipe; for a filter of your own {factory: "module:function"}'
-_OF_ITS_OWN: Final = '{{factory: "{module}:filtered"}}  # the function in {module}.py; protect has no recipe'
 _TEMPLATE: Final = """\
 # Trained without and with the filter, then evaluated on the same episodes:
 #   safe-wrappers compare {path} --report
@@ -42,34 +38,17 @@ n_envs: 4
 arms:  # what is compared
   unfiltered: {{filter: none}}
   filtered:
-    filter: {filter}
+    filter: protect  # this library's recipe; for a filter of your own {{factory: "module:function"}}
     #learner: {{kind: adaption_penalty, penalty: 0.1}}  # what the learner sees of a changed action
 seeds: [0]  # every arm is trained with each
 #workers: 2  # runs at a time; by default one per core
 #checkpoint_every: 10_000
 evaluation: {{episodes: 20}}
 """
-_MODULE: Final = """\
-import safe_wrappers as sw
-
-{given}
-def filtered(env):
-{body}
-"""
-_OPEN: Final = '''\
-horizon = 20  # steps to look ahead
-backup = {backup!r}  # or a function of the observation: the action that keeps h positive
-
-
-def h(observation):
-    """What must stay positive."""
-    raise sw.errors.ConfigurationError("say in {module} what must stay positive, by h(observation)")
-
-'''
 
 
 def init_command(path: Path, overrides: Sequence[str], console: Console) -> None:
-    """Writes a commented config, for an env without a recipe with a module of its filter beside it.
+    """Writes a commented config.
 
     Args:
         path: The file.
@@ -77,64 +56,36 @@ def init_command(path: Path, overrides: Sequence[str], console: Console) -> None
         console: Where it is told.
 
     Raises:
-        ConfigurationError: A file exists, or what the config would say is refused: the env cannot be made, no filter
-            fits it, or the algorithm does not.
+        ConfigurationError: The file exists, or what the config would say is refused: the env cannot be made, the
+            algorithm does not fit it, or there is no recipe for it; the message has the lines that filter it then.
     """
     from .run.model import check_task
-    from .run.stack import make_env
+    from .run.stack import make_stack
 
+    if path.exists():
+        raise ConfigurationError(
+            f"{str(path)!r} is there already; give another name: safe-wrappers init NAME.yaml"
+        )
     filled = dict(_FILLED)
     for override in overrides:
         key, _, value = override.partition("=")
         filled[check_name(key, _FILLED, "init")] = value
-    module = path.parent / f"{re.sub(r'[^A-Za-z0-9_]', '_', path.stem)}_filter.py"
-    env = make_env(filled["env"], {})
-    known = env.spec is not None and recipe_of(env.spec.id) is not None
-    code = "" if known else filter_module(env, module.name)
-    for written in [path, *([module] if code else [])]:
-        if written.exists():
-            raise ConfigurationError(
-                f"{str(written)!r} is there already; give another name: safe-wrappers init NAME.yaml"
-            )
     noisy = filled["algorithm"] in DETERMINISTIC  # they need a word on it
-    noise, rate = (
-        "hyperparameters: {action_noise: {normal: 0.1}}",
-        "#hyperparameters: {learning_rate: 1e-4}",
+    filled["hyperparameters"] = (
+        "hyperparameters: {action_noise: {normal: 0.1}}"
+        if noisy
+        else "#hyperparameters: {learning_rate: 1e-4}"
     )
-    chosen = _OF_ITS_OWN.format(module=module.stem) if code else _RECIPE
-    given = {"hyperparameters": noise if noisy else rate, "filter": chosen, **filled}
-    write_text(path, _TEMPLATE.format(name=path.stem, path=path, **given))
+    write_text(path, _TEMPLATE.format(name=path.stem, path=path, **filled))
     try:
         for arm in parse_experiment(read_config(path)).arms:
+            env = make_stack(arm.env, arm.filter)
             check_task(arm, env)
-        if not code:
-            safe_wrappers.protect(env)
+            env.close()
     except ConfigurationError:
         path.unlink()
         raise
     console.print(f"Written: {path}", soft_wrap=True, highlight=False)
-    if code:
-        write_text(module, code)
-        words = f"Written: {module}, the filter of the arm `filtered`, to be adapted"
-        console.print(words, soft_wrap=True, highlight=False)
-
-
-def filter_module(env: gym.Env[Any, Any], name: str) -> str:
-    """The text of a module whose function `filtered` filters an env that `protect` has no recipe for.
-
-    Args:
-        env: Without a filter; the lines are tried on it.
-        name: The module's file name.
-
-    Raises:
-        ConfigurationError: No filter fits the env.
-    """
-    remedy = remedy_for(env, env)
-    backup = "zero" if isinstance(env.action_space, gym.spaces.Box) else "hold"
-    *lines, last = remedy.code.splitlines()
-    body = textwrap.indent("\n".join([*lines, f"return {last.removeprefix('env = ')}"]), "    ")
-    given = _OPEN.format(module=name, backup=backup) if remedy.is_open else ""
-    return _MODULE.format(given=given, body=body)
 
 
 def list_command(kinds: Sequence[str], console: Console) -> None:

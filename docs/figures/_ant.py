@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.plants.mujoco.replay import Replay
+from safe_wrappers.plants.mujoco.contacts import Replay
 
 STEP_S = 0.05
 _PERIOD_S = 0.83

@@ -2,13 +2,16 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 
-from _rover import FULL_THROTTLE, STEP_S, rover
+import safe_wrappers as sw
 from _style import FORBIDDEN, GRID, INK, OFF, ON, SAFE
 from safe_wrappers.envs.ground import MAGIC_FORMULA
 
+FULL_THROTTLE = np.array([1.0, 1.0, 1.0, 1.0, 0.0], np.float32)
+STEP_S = 0.01
 ICE = {"ground": "ice", "center": [2.0, 0.0], "radius": 1.0}
 END = 5.0
 """m, of the way."""
@@ -16,7 +19,11 @@ END = 5.0
 
 def run(limited: bool) -> tuple[Any, list[dict[str, Any]]]:
     """Place and speed of the front left wheel, and whether it is on ice, at every step; the infos."""
-    env = rover(limited, patches=[ICE])
+    env: Any = gym.make("SafeRover-v0", max_episode_steps=10_000)
+    if limited:
+        env = sw.SlipLimiter(env, wheels=env.unwrapped.wheels)
+    layout = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": [ICE]}
+    env.reset(seed=0, options={"layout": layout})
     raw, seen, infos = env.unwrapped, [], []
     name = raw.wheels[0]
     wheel = raw.data.body(name)

@@ -20,7 +20,7 @@ from safe_wrappers.control.backup.stopping import (
     approach_rows_of,
     approaches,
 )
-from safe_wrappers.control.numerics.planar import squashed
+from safe_wrappers.control.numerics.shapes import squashed
 from safe_wrappers.drawing.marks import Mark, segment
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory

@@ -10,7 +10,7 @@ import numpy as np
 from safe_wrappers.checks import Array, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
-from safe_wrappers.control.numerics.surfaces import BLOCK, NUMBERS, PLANE, ROUND, nearest_points
+from safe_wrappers.control.numerics.shapes import BLOCK, PLANE, ROUND, SURFACE_NUMBERS, nearest_points
 from safe_wrappers.drawing.marks import Mark, ball, block, ellipsoid, pad, ring, spatial
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
@@ -89,7 +89,7 @@ class Plain(ABC):
 
 def _surface(kind: float, first: Sequence[float], second: Sequence[float]) -> Array:
     """One surface, shape (1, 8)."""
-    row = np.zeros((1, NUMBERS))
+    row = np.zeros((1, SURFACE_NUMBERS))
     row[0, :2] = kind, len(first)
     row[0, 2 : 2 + len(first)], row[0, 5 : 5 + len(second)] = first, second
     return row
@@ -106,7 +106,7 @@ class _Round(Plain):
 
     def surfaces(self, plant: Plant) -> Array:
         centers = self.centers(plant)
-        found = np.zeros((len(centers), NUMBERS))
+        found = np.zeros((len(centers), SURFACE_NUMBERS))
         found[:, 0], found[:, 1], found[:, 5] = ROUND, centers.shape[1], self.radius
         found[:, 2 : 2 + centers.shape[1]] = centers
         return found

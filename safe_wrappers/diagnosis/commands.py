@@ -1,5 +1,7 @@
 """Commands that spike at switches and seams; and energy that a late link makes."""
 
+from typing import Any
+
 import numpy as np
 
 from safe_wrappers import info as keys
@@ -89,14 +91,18 @@ def treatment_of_energy(env: Env, recording: Recording) -> Treatment:
     ceiling = np.isfinite(recording.of_info(keys.TELEOP_CEILING_S)).any()
     if not isinstance(env, TeleopChannel) or env.port is None or ceiling:
         return Treatment(advice=f'Give the TeleopChannel coding="wave" and an impedance. {advice}')
-    link = {
+    waves: dict[str, Any] = {
         name: given.delay_s if given == Link(given.delay_s) else given
         for name, given in (("uplink", env.uplink), ("downlink", env.downlink))
     }
-    impedance = env.port.feedthrough or 1.0  # that of the coupling reflects least
-    waves = {**link, "coding": "wave", "impedance": impedance}
+    # The damper of the coupling as impedance reflects least.
+    waves |= {"coding": "wave", "impedance": env.port.feedthrough or 1.0}
+
+    def wrap(outer: Any) -> Env:
+        return TeleopChannel(outer.env, **waves)
+
     code = wrapped(TeleopChannel, **waves).code.replace("(env,", "(env.env,")
-    return Treatment(code, lambda outer: TeleopChannel(outer.env, **waves), advice)
+    return Treatment(code, wrap, advice)
 
 
 STEPS = Symptom(

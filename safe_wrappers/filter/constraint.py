@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.planar import squashed
+from safe_wrappers.control.numerics.shapes import squashed
 from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant

@@ -111,37 +111,28 @@ def check_timing(env: gym.Env[Any, Any], control_dt: float | None) -> float:
 def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
     """The env's action space, refused unless it is a one-dimensional, floating Box."""
     space = env.action_space
+    if (
+        isinstance(space, gym.spaces.Box)
+        and len(space.shape) == 1
+        and np.issubdtype(space.dtype, np.floating)
+    ):
+        return space
     expected = f"expected a continuous Box action space of shape (m,), got {space}"
     if isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete):
         raise ConfigurationError(
             f"{expected}: use ActionShield(env, [PredictiveShield(...)]), which tries every action"
         )
-    parts = list(_parts(space))
-    discrete = [isinstance(part, gym.spaces.Discrete | gym.spaces.MultiDiscrete) for part in parts]
-    if all(discrete):
-        counts = [int(n) for p in parts for n in np.ravel(getattr(p, "n", getattr(p, "nvec", 0)))]
-        raise ConfigurationError(
-            f"{expected}: give the env one space of its own, `gymnasium.spaces.MultiDiscrete({counts})`, take its "
-            "entries apart in its step, and use ActionShield"
-        )
-    if any(discrete):
-        raise ConfigurationError(
-            f"{expected}: {parts[discrete.index(True)]} is discrete and other parts are not, and only one kind can "
-            "be filtered. Fix the parts of one kind in the env, and give it the space of the rest"
-        )
-    floating = [isinstance(p, gym.spaces.Box) and np.issubdtype(p.dtype, np.floating) for p in parts]
-    if not all(floating):
-        raise ConfigurationError(
-            f"{expected}: for {parts[floating.index(False)]} there is no closest safe action to project to. Give the "
-            "env a floating Box, or a Discrete or MultiDiscrete space for ActionShield, and translate in its step"
-        )
-    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-        raise ConfigurationError(
-            f"{expected}. Give the env one flat Box of its own, from this space: "
-            "`action_space = gymnasium.spaces.flatten_space(space)`, and in its step "
-            "`action = gymnasium.spaces.unflatten(space, action)`"
-        )
-    return space
+    for part in _parts(space):
+        if not (isinstance(part, gym.spaces.Box) and np.issubdtype(part.dtype, np.floating)):
+            raise ConfigurationError(
+                f"{expected}: for {part} there is no closest safe action to project to. Give the env a floating Box, "
+                "or one MultiDiscrete of discrete parts alone for ActionShield, and translate in its step"
+            )
+    raise ConfigurationError(
+        f"{expected}. Give the env one flat Box of its own, from this space: "
+        "`action_space = gymnasium.spaces.flatten_space(space)`, and in its step "
+        "`action = gymnasium.spaces.unflatten(space, action)`"
+    )
 
 
 def _parts(space: gym.Space[Any]) -> Iterator[gym.Space[Any]]:

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from safe_wrappers.plants.mujoco.replay import Replay
+from safe_wrappers.plants.mujoco.contacts import Replay
 
 
 def moves(model, body):

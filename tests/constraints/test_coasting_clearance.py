@@ -105,15 +105,6 @@ def test_the_outline_counts_where_it_should():
     assert all(bare.admits(np.array([s, -s])) for s in (1.0, -1.0))
 
 
-def test_a_reach_that_is_broken_is_dropped_with_a_warning():
-    _, constraint, _ = bound([[0.2055, 0.0]], max_decrease=0.001)
-    with pytest.warns(UserWarning, match=r"farther than the declared max_decrease of 0\.001 m"):
-        assert not constraint.admits(FULL)
-    with warnings.catch_warnings(action="error"):
-        assert not constraint.admits(FULL)
-    assert constraint.max_decrease is None
-
-
 def test_from_inside_it_drives_out():
     options = {"keep_out": [sw.constraints.Discs("hazard_positions", 0.2)], "robot_model_attr": "robot_model"}
     env = sw.CBFActionFilter(gym.make("SafeCarGoal1-v0"), [sw.constraints.CoastingClearance(**options)])

@@ -109,17 +109,3 @@ def test_clearance_draws_planes_moved_by_what_is_kept_free_and_the_way_that_brak
     ((start, end),) = rods([way])
     assert abs(v) > 0.1 and way.size[0] == 0.1
     assert sorted([start[0], end[0]]) == pytest.approx(sorted([x, x + v * abs(v) / 16.0]))
-
-
-def test_a_workspace_draws_its_planes_or_if_it_is_closed_its_edges():
-    half = sw.constraints.Workspace(high=[0.15, None, None], bodies=["fingertip"], margin=0.01)
-    box = sw.constraints.Workspace([-0.3, -0.2, -0.1], [0.3, 0.2, 0.1], bodies=["fingertip"], margin=0.01)
-    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [half, box])
-    env.reset(seed=0)
-    planes, closed = looked(env)
-    (pad,) = of(planes, "keep out")
-    tip = env.unwrapped.data.body("fingertip").xpos
-    np.testing.assert_allclose(pad.position, [0.14, tip[1], tip[2]], atol=1e-6)
-    edges = rods(of(closed, "limit")).reshape(-1, 3)
-    np.testing.assert_allclose(edges.min(axis=0), [-0.29, -0.19, -0.09])
-    np.testing.assert_allclose(edges.max(axis=0), [0.29, 0.19, 0.09])

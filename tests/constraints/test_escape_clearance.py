@@ -165,22 +165,6 @@ def test_under_a_delay_all_are_where_they_will_be():
         np.testing.assert_allclose(clearance.value(), expected, atol=1e-9)
 
 
-def test_from_outside_the_way_back_is_asked_for_and_taken():
-    env = sw.protect(gym.make("OccludedCrossing-v0"), cars="true")
-    # Closer to a pillar than the margin; the cars are far away.
-    layout = {
-        "agent": [0.0, -2.6, 0.0],
-        "pillars": [[0.0, -2.02], [2.5, -1.9], [-2, 1.9], [2, 1.9]],
-        "cars": [[-9.0, 1.0], [-14.0, 1.0], [-19.0, 1.0], [9.0, -1.0], [14.0, -1.0], [19.0, -1.0]],
-    }
-    env.reset(seed=0, options={"layout": layout})
-    gaps = []
-    for _ in range(40):
-        env.step(np.array([0.0, 1.0, 0.0]))
-        gaps.append(np.linalg.norm(env.unwrapped.agent_position - [0.0, -2.02]) - PILLAR - RADIUS)
-    assert gaps[-1] >= MARGIN - 2e-3 and min(gaps) >= 0.02
-
-
 @pytest.mark.parametrize(
     ("given", "words"),
     [

@@ -1,24 +1,17 @@
 """ImpactSpeedLimit: masses, pushes and peaks against independent answers, and closed loops before springy walls."""
 
-from types import SimpleNamespace
-
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 from asking import asked, bound
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from judged_loops import Scene
-from scipy.integrate import solve_ivp
 from scipy.optimize import lsq_linear
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
-from safe_wrappers.constraints.contact.impact_speed_limit import Contact
-from safe_wrappers.control.contact.impact import BODY_REGIONS, peak_force, time_to_peak
+from safe_wrappers.control.contact.impact import BODY_REGIONS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.plants.mujoco.forecast import Poses
 
 # A mass on a slide before a wall ------------------------------------------------------------------------------
 
@@ -76,28 +69,6 @@ def full(raw, k):
 
 
 # What a contact comes to --------------------------------------------------------------------------------------
-
-
-@settings(max_examples=40)
-@given(
-    speed=st.floats(0.0, 2.0),
-    mass=st.floats(0.5, 40.0),
-    stiffness=st.floats(1e3, 1e5),
-    push=st.floats(0.0, 300.0),
-    deflection=st.floats(0.0, 0.02),
-)
-def test_the_peak_is_that_of_the_differential_equation(speed, mass, stiffness, push, deflection):
-    contact = Contact(-deflection, speed, mass, stiffness, push, deflection)
-    period = 2.0 * np.pi * np.sqrt(mass / stiffness)
-    done = solve_ivp(
-        lambda _, s: [s[1], (push - stiffness * s[0]) / mass],
-        (0.0, period),
-        [deflection, speed],
-        max_step=period / 200.0,
-        rtol=1e-9,
-        atol=1e-12,
-    )
-    assert contact.peak == pytest.approx(stiffness * done.y[0].max(), rel=1e-3, abs=1e-3)
 
 
 ARM = """<mujoco><option timestep="0.001"/><worldbody>
@@ -244,34 +215,6 @@ def test_at_full_throttle_it_arrives_with_what_is_allowed_and_then_holds_it(mass
     assert unfiltered.max() > 3.0 * LIMIT
 
 
-def test_a_reactive_brake_comes_too_late_where_the_constraint_does_not():
-    env = slide()
-    latency = float(time_to_peak(MASS, K)) + env.model.opt.timestep
-    assert 0.02 < latency < 0.05
-
-    def hit(speed, brakes_after):
-        mujoco.mj_resetData(env.model, env.data)
-        env.data.qpos[0], env.data.qvel[0] = 0.3 - 1e-6, speed
-        peak, touched = 0.0, None
-        while env.data.time < 0.2:
-            touched = env.data.time if touched is None and env.data.ncon else touched
-            env.data.ctrl[:] = -float(touched is not None and env.data.time >= touched + brakes_after)
-            mujoco.mj_step(env.model, env.data)
-            peak = max(peak, float(env.data.efc_force[: env.data.nefc].sum()))
-        return peak
-
-    unmitigated = hit(1.0, np.inf)
-    assert unmitigated == pytest.approx(float(peak_force(1.0, MASS, K)), rel=0.02)
-    assert hit(1.0, latency) == unmitigated  # to the last bit
-    assert unmitigated > 2.0 * LIMIT
-    # Even a brake that acts at the touch itself would not do.
-    assert hit(1.0, 0.0) > LIMIT
-    filtered = sw.CBFActionFilter(slide(), [limit(margin=1.0, horizon=10)])
-    filtered.reset(seed=0)
-    filtered.unwrapped.data.qvel[0] = 1.0
-    assert peaks(filtered, full, 80, reset=False)[0].max() <= LIMIT
-
-
 def test_pushing_counts():
     # At rest at the surface: a push of half the limit springs up to the limit, more exceeds it.
     for share, passes in ((0.48, True), (0.52, False)):
@@ -395,20 +338,6 @@ def test_nothing_that_touches_is_skipped(plant):
     assert looked < 0.5 * 120 * len(gaps.pairs)  # and most of what cannot touch is
 
 
-def test_an_approach_that_follows_a_rebound_begins_anew(plant):
-    gaps = GeomGaps(plant, ["ball"], ["floor"])
-    distances = [9, 3, -1, -4, -5, -3, -2, -2.5, -4, -4.5, -4, -1, 2, -1, -3, -2, -3, -2, -1, -4]  # mm
-    ball, k = plant.named("body", "ball"), len(distances)
-    poses = Poses(*(np.zeros((k, plant.model.nbody, *shape)) for shape in ((3,), (3, 3), (3,))))
-    poses.axes[:] = np.eye(3)
-    poses.frames[:, ball, 2] = -0.4 + 0.05 + 1e-3 * np.array(distances)
-    poses.frames[:, 0] = 0.0
-    forecast = SimpleNamespace(poses=lambda: poses)
-    assert plant.substeps == 5
-    found = list(gaps.touched(plant, forecast, mujoco.MjData(plant.model), 0))
-    assert found == [2, 4, 7, 9, 13, 14, 16, 19]  # 2, 13: touch; 4, 9, 14, 19: ends; 7, 16, 19: approaches
-
-
 def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
     # MuJoCo alone says 0 of some that are far apart, up to 3.11; 3.12 has another algorithm for two boxes.
     boxes = """<mujoco><worldbody><geom name="a" type="box" size=".1 .05 .2"/>
@@ -433,21 +362,3 @@ def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
             wrong += mujoco.mj_geomDistance(m, data, 1, 0, 9.0, None) == 0.0
     assert apart > 1500
     assert wrong == 0 if mujoco.mj_version() >= 3_012_000 else wrong > 10
-
-
-@pytest.mark.parametrize(
-    ("machine", "world", "error", "message"),
-    [
-        (
-            ["hand"],
-            ["floor"],
-            UnknownNameError,
-            "no body or geom 'hand'; bodies: world, block, upper.*floor, post",
-        ),
-        (["lower"], ["upper"], ConfigurationError, "'upper' is part of the machine itself.*lower"),
-        (["lower"], ["bare"], ConfigurationError, "body 'bare' has no geoms"),
-    ],
-)
-def test_what_cannot_meet_is_refused(plant, machine, world, error, message):
-    with pytest.raises(error, match=message):
-        GeomGaps(plant, machine, world)

@@ -240,18 +240,6 @@ def test_a_margin_is_kept_free_and_covers_a_wrong_mass(monkeypatch):
     assert judge.largest.max() > 3.0
 
 
-def test_each_joint_has_its_own_limit(monkeypatch):
-    filtered = sw.CBFActionFilter(
-        gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit([2.0, 6.0], joints=["joint1", "joint0"])]
-    )
-    judge = SpeedJudge(monkeypatch, filtered, [0, 1])
-    filtered.reset(seed=0)
-    for k in range(300):
-        filtered.step(bang_bang(filtered, k, None).astype(np.float32))
-    assert judge.largest[0] <= 6.0 + 1e-6 and judge.largest[1] <= 2.0 + 1e-6
-    assert judge.largest[0] > 3.0 and judge.largest[1] > 1.8
-
-
 def test_value_and_rows_against_the_plants_own_prediction():
     env = gym.make("Reacher-v5")
     env.reset(seed=0)
@@ -274,7 +262,6 @@ def test_value_and_rows_against_the_plants_own_prediction():
     ("arguments", "message"),
     [
         ({"limit": 0.0}, "limit must be a finite number > 0 in rad/s or m/s, got 0.0"),
-        ({"limit": [4.0, -1.0]}, "limit must be a finite number > 0 .* got -1.0"),
         ({"limit": 4.0, "margin": -0.1}, "margin must be a finite number >= 0 in rad/s or m/s, got -0.1"),
         ({"limit": 4.0, "joints": []}, "joints is a list of names, or None"),
     ],
@@ -329,18 +316,6 @@ def test_no_step_that_is_not_flagged_leaves_the_range(env_id, driver):
     if env_id == "InvertedPendulum-v5":
         assert seen["flagged"] == seen["outside"] == 0
         assert seen["least"] < 0.1  # half of the rail is used
-
-
-def test_a_margin_covers_a_wrong_mass():
-    limit = sw.constraints.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], margin=0.1, horizon=10)
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5", disable_env_checker=True), [limit])
-    filtered.plant.perturb(mass=1.2, damping=0.8)
-    judge = Judge(filtered, room_of([0, 1], -1.5, 1.5))
-    filtered.reset(seed=0)
-    for k in range(150):
-        action = DRIVERS["pulse"](judge, filtered, k, None).astype(np.float32) * 0.3
-        assert judge.step(filtered, action)[0] >= 0.0
-    assert filtered.constraints[0].margin == 0.1
 
 
 def test_far_inside_the_actions_pass_bit_for_bit():
@@ -405,21 +380,11 @@ def test_one_value_per_bound_that_there_is():
     [
         ({"lower": np.nan}, ConfigurationError, "lower is a position in rad or m, or one per joint; got nan"),
         (
-            {"upper": "far"},
-            ConfigurationError,
-            "upper is a position in rad or m, or one per joint; got 'far'",
-        ),
-        (
             {"lower": 2.0, "upper": 1.0},
             ConfigurationError,
             "nothing is left of the range of joint 'joint0': 2 to 1",
         ),
         ({"margin": -1.0}, ConfigurationError, "margin must be a finite number >= 0 in rad or m, got -1.0"),
-        (
-            {"joints": []},
-            ConfigurationError,
-            r"joints is a list of names, or None for every driven joint; got \[\]",
-        ),
         (
             {"joints": ["joint0"]},
             ConfigurationError,

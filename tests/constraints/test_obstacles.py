@@ -308,18 +308,6 @@ def test_nothing_comes_nearer_faster_than_the_velocity_says(seed, sigmas, d):
     assert (away >= promised - 0.02 * (1.0 + np.abs(times * 1)[:, None] * np.abs(approach)))[:, outside].all()
 
 
-def test_a_flat_track_stands_upright_in_space_and_the_other_way_round_it_is_refused():
-    flat = some_tracks(1, d=2)
-    plane, space = (
-        sw.constraints.TrackedDiscs(RADIUS).nearest(np.array(p), Holding(flat))
-        for p in ([3.0, 1.0], [3.0, 1.0, 9.0])
-    )
-    np.testing.assert_allclose(plane.distance, space.distance)
-    assert not space.normal[:, 2].any()
-    with pytest.raises(ConfigurationError, match="3-dimensional tracks cannot meet a 2-dim"):
-        sw.constraints.TrackedDiscs(RADIUS).nearest(np.zeros(2), Holding(some_tracks(1, d=3)))
-
-
 def test_in_a_clearance_it_keeps_a_machine_out_and_what_is_missing_is_named():
     def clearance(**options):
         return sw.constraints.Clearance(

@@ -95,8 +95,3 @@ def test_what_loses_no_more_than_the_backup_is_admitted_where_the_margin_is_lost
     backup = bound.backup()
     assert bound.value()[0] < 0.0
     assert bound.admits(backup) and bound.admits(backup - 1.0) and not bound.admits(backup + 0.1)
-
-
-def test_what_is_not_a_number_is_not_admitted():
-    _, bound = filtered()
-    assert not bound.admits(np.array([np.nan]))

@@ -78,33 +78,6 @@ def test_any_backup_of_a_list_admits():
         assert found.admits(np.array([0.0])) == expected
 
 
-class Settable(gym.Env):
-    """The state is the last action."""
-
-    observation_space = gym.spaces.Box(-9.0, 9.0, (2,), np.float64)
-
-    def __init__(self, space):
-        self.action_space = space
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(2), {}
-
-    def step(self, action):
-        return np.ravel(action).astype(float)[:2], 0.0, False, False, {}
-
-
-def test_whole_numbers_are_one_action_of_many_parts_or_several_of_one():
-    parts = gym.spaces.MultiDiscrete([2, 3])
-    several = shield(h=lambda o: 1.0 if o[0] == 1.0 else -1.0, backup=[0, 1], terminal=None)
-    env = sw.ActionShield(Settable(gym.spaces.Discrete(3)), [several])
-    env.reset(seed=0)
-    assert env.step(2)[4]["executed_action"] == [1]
-    one = sw.ActionShield(Settable(parts), [shield(h=lambda o: float(o[1]), backup=[0, 2], terminal=None)])
-    one.reset(seed=0)
-    np.testing.assert_array_equal(one.filter.bound[0].backup(), [0.0, 2.0])
-
-
 @pytest.mark.parametrize(
     ("backup", "expected"),
     [("zero", 0.0), ("hold", 0.5), (np.array([-0.25]), -0.25), (lambda o: [-0.75], -0.75)],
@@ -234,19 +207,6 @@ def test_a_backup_without_an_answer_admits_nothing_and_ends_nothing():
     assert info["cbf/infeasible"] and np.isfinite(info["executed_action"]).all()
     with pytest.raises(ConfigurationError, match="must be a finite action"):
         sw.CBFActionFilter(Cart(), [shield(backup=lambda o: [np.nan])]).reset(seed=0)
-
-
-def test_the_envs_own_cost_is_an_h():
-    costly = dict(h="cost", terminal=None, horizon=20)
-    found = asked(shield(**costly), (WALL - 0.66, 1.0))
-    by_hand = asked(shield(terminal=None, horizon=20), (WALL - 0.66, 1.0))
-    for u in np.linspace(-1, 1, 21):
-        assert found.admits(np.array([u])) == by_hand.admits(np.array([u]))
-    np.testing.assert_array_equal(found.value(), [0.0])
-    unknown = asked(shield(**costly | {"h": "danger"}))
-    assert unknown.value().size == 0  # nothing was judged yet
-    with pytest.raises(ConfigurationError, match=r"reports no info\['danger'\]; it has \['cost'\]"):
-        unknown.admits(np.zeros(1))
 
 
 def test_functions_may_see_a_view():

@@ -130,28 +130,6 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
     assert spent[0.5] < spent[None] - 50
 
 
-def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
-    calls = count_forecasts(monkeypatch)
-    scene = sliders(range_="-1 1")
-    scene.start = [-0.9], [1.0]  # 5 cm in a control step
-    limit = sw.constraints.JointPositionLimit(None, 2.0, joints=["x0"], horizon=4, max_decrease=0.12)
-    filtered = sw.CBFActionFilter(scene, [limit])
-    filtered.reset(seed=0)
-    calls[0] = 0
-    with pytest.warns(UserWarning) as caught:
-        for _ in range(20):
-            filtered.step(np.array([0.0]))
-    assert [str(w.message) for w in caught] == [
-        "JointPositionLimit: what is left of the limit fell by 0.15 rad or m within 3 control steps, farther than "
-        "the declared max_decrease of 0.12; from now on every control is forecast"
-    ]
-    assert calls[0] == 17  # three steps were taken for granted
-    with warnings.catch_warnings(action="error"):  # nor is it believed again in the next episode
-        filtered.reset(seed=0)
-        filtered.step(np.array([0.0]))
-    assert calls[0] == 18
-
-
 # Numbers that are none, and machines that cannot be forecast --------------------------------------------------
 
 
@@ -286,20 +264,3 @@ def counted(monkeypatch):
 
     monkeypatch.setattr(Recorder, "record", record)
     return calls
-
-
-def test_what_a_changed_step_costs(monkeypatch):
-    calls, costs = counted(monkeypatch), []
-    env = protected("FetchReach-v4")
-    rng = np.random.default_rng(1)
-    for k in range(60):
-        if k % 15 == 0:
-            action = np.where(rng.random(4) < 0.5, -1.0, 1.0).astype(np.float32)
-        calls[0] = 0
-        info = env.step(action)[-1]
-        if info["cbf/intervened"]:
-            costs.append(calls[0])
-        else:
-            assert calls[0] <= 1
-    # Its own forecast, that of braking and of the answer; differences, of three displacements, every tenth step.
-    assert len(costs) > 25 and min(costs) == 3 and np.mean(costs) < 6.0

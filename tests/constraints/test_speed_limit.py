@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from judged_loops import Scene, flagged, sliders
 
 import safe_wrappers as sw
-from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
+from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 PLANAR = ("Ant", "Humanoid")

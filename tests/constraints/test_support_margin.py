@@ -9,7 +9,7 @@ from judged_loops import Scene, flagged
 from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.contact.support_margin import edge_distances
+from safe_wrappers.control.legged.support import support_distances
 from safe_wrappers.errors import ConfigurationError
 
 HALF, HEIGHT, MASS = 0.2, 0.5, 5.0
@@ -83,7 +83,8 @@ def test_at_every_evaluation_it_is_the_distance_to_the_hull_of_all_contact_point
     for _ in range(40):
         action = 0.1 * rng.normal(size=8)
         plant.observe()
-        mine = edge_distances(plant.contact_forecast(action))
+        found = plant.contact_forecast(action)
+        mine = support_distances(found.step, found.point, found.normal, found.force)
         judge.step(env, action)
         flat = [at for at in judge.instants if len(at) and np.ptp([c[1][2] for c in at]) < 0.009]
         theirs = [d for d in map(hull_distance, flat) if d is not None]
@@ -92,25 +93,6 @@ def test_at_every_evaluation_it_is_the_distance_to_the_hull_of_all_contact_point
         assert len(mine) == len(theirs)
         np.testing.assert_allclose([d for d in mine if d >= 0.0], inside, atol=1e-7)
     assert polygons > 10
-
-
-@pytest.mark.parametrize(
-    "env",
-    [
-        table([(-0.2, 0.0), (0.2, 0.0)]),  # a line
-        table([(0.0, 0.0)]),  # a point
-        table(step=0.05),  # two heights
-        table(gravity="0 0 0.1"),  # in the air
-    ],
-)
-def test_where_there_is_no_polygon_nothing_is_asked(env):
-    limit = settled(env, sw.constraints.SupportMargin(0.1), np.zeros(1), 20)
-    for push in (-1.0, 0.0, 1.0):
-        assert limit.admits(np.array([push]))
-        assert limit.info(np.zeros(1), np.array([push])) == {
-            "whole_body/zmp_margin": 0.0,
-            "whole_body/supported": 0.0,
-        }
 
 
 def closed_loop(env, pushes):

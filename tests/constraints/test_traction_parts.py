@@ -58,36 +58,6 @@ def test_the_truth_lies_within_the_estimates_standard_deviations(steering):
 # The rows ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("wheel_speed", "throttle"), [(6.0, 1.0), (0.5, -1.0), (-3.0, -1.0)])
-def test_from_outside_the_drives_bring_it_back_as_fast_as_they_can(wheel_speed, throttle):
-    """At 2 m/s on ice, wheels that spin, that are nearly locked, that turn backwards; and a policy that goes on."""
-    env = rover()
-    raw = start(env, ground="ice", speed=2.0, wheel_speed=wheel_speed)
-    outside = slip_ratio(wheel_speed, 2.0, 0.5) * np.ones(4)
-    for _ in range(40):
-        limit = env.constraints[0].max_slip
-        info = env.step(throttle * FULL)[4]
-        assert not info["cbf/infeasible"]
-        if (np.abs(outside) > 3.0 * limit).all():
-            np.testing.assert_array_equal(info["executed_action"][:4], -np.sign(outside))
-        outside = info["slip"]
-    assert np.abs(info["slip"]).max() < 0.12
-    assert raw.forward_speed > 1.0
-
-
-def test_a_row_that_no_torque_can_break_is_left_out():
-    env = rover(friction=1e6)
-    start(env, speed=1.0)
-    env.plant.observe()
-    assert env.filter.bound[0].rows().normals.shape == (0, 5)
-    tight = rover()
-    start(tight, speed=1.0)
-    tight.plant.observe()
-    normals = tight.filter.bound[0].rows().normals
-    assert normals.shape == (8, 5)
-    assert (normals[:, 4] == 0.0).all()  # the steering's
-
-
 SERVOS = {
     "speed": '<velocity joint="{}" kv="0.5" ctrlrange="-40 40"/>',
     "speed, geared": '<velocity joint="{}" kv="0.5" gear="2" ctrlrange="-40 40"/>',

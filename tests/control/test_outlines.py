@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 
-from safe_wrappers.control.numerics.planar import convex_outline, distance_to_outline
+from safe_wrappers.control.numerics.shapes import convex_outline, distance_to_outline
 
 GRID = st.integers(-20, 20).map(lambda n: n / 100.0)  # coarse: many points on one edge, many twice
 CLOUDS = arrays(np.float64, st.tuples(st.integers(3, 15), st.just(2)), elements=GRID)

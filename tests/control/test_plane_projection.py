@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from qpsolvers import solve_qp
 
-from safe_wrappers.control.numerics.plane_projection import project_in_plane
+from safe_wrappers.control.backup.drive_decision import project_in_plane
 
 NUMBERS = st.floats(-2.0, 2.0).map(lambda x: round(x, 3))
 PAIRS = st.tuples(NUMBERS, NUMBERS)

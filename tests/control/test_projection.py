@@ -390,6 +390,10 @@ def test_nonsense_is_refused(arguments, message):
         project(*arguments)
 
 
+def test_box_least_squares_of_no_numbers_is_none():
+    assert box_least_squares(np.zeros((3, 0)), np.ones(3), np.zeros(0), np.zeros(0)).shape == (0,)
+
+
 @given(st.integers(1, 6), st.integers(0, 6), st.integers(0, 2**31))
 def test_box_least_squares_agrees_with_scipy(n, more, seed):
     rng = np.random.default_rng(seed)

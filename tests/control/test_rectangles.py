@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.numerics.planar import apart, closer, gaps, merged, nearest
+from safe_wrappers.control.numerics.shapes import apart, closer, gaps, merged, nearest
 
 NUMBERS = st.floats(-3.0, 3.0).map(lambda x: round(x, 3))
 SIDES = st.lists(NUMBERS, min_size=2, max_size=2, unique=True).map(sorted)

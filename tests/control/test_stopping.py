@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from safe_wrappers.control.backup import stopping as of
 from safe_wrappers.control.backup.stopping import held_limit, held_stop
-from safe_wrappers.control.numerics import surfaces
-from safe_wrappers.control.numerics.planar import clearances_on_a_course, convex_outline
+from safe_wrappers.control.numerics import shapes
+from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline
 
 POSITIVE = st.floats(0.05, 5.0)
 
@@ -116,12 +116,12 @@ def test_the_held_stop_is_what_the_best_held_braking_needs():
 
 def some_surfaces(rng, d):
     """Planes, rounds and blocks of up to d coordinates."""
-    found = np.zeros((7, surfaces.NUMBERS))
+    found = np.zeros((7, shapes.SURFACE_NUMBERS))
     for row in found:
-        kind, n = rng.choice([surfaces.PLANE, surfaces.ROUND, surfaces.BLOCK]), rng.integers(1, d + 1)
+        kind, n = rng.choice([shapes.PLANE, shapes.ROUND, shapes.BLOCK]), rng.integers(1, d + 1)
         row[:2], row[2 : 2 + n] = (kind, n), rng.uniform(-1.0, 1.0, n)
         row[5 : 5 + n] = rng.uniform(0.1, 0.5, n)
-        if kind == surfaces.PLANE:
+        if kind == shapes.PLANE:
             row[5 : 5 + n] /= np.sqrt((row[5 : 5 + n] ** 2).sum())
     return found
 
@@ -140,7 +140,7 @@ def random_looks(count):
         always = low, high, 0.01, 0.05, 0.1, 2.0, 0.02
         scene = some_surfaces(rng, d)
         found = of.approach_rows_of(scene, point, v, drift, effect, always)
-        near = surfaces.nearest_points(scene, point)
+        near = shapes.nearest_points(scene, point)
         moving = rng.normal(size=near[1].shape)
         found += of.approach_rows(near[0], near[1], moving, near[2], v, drift, effect, always)
         outline = convex_outline(rng.normal(size=(6, 2))) if i % 2 else np.zeros((0, 2))
@@ -160,7 +160,7 @@ def test_the_random_scenes_have_rows():
 
 
 def test_a_row_that_is_not_a_number_is_kept():
-    wall = np.array([[surfaces.PLANE, 1.0, -9.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    wall = np.array([[shapes.PLANE, 1.0, -9.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     always = np.array([-1.0]), np.array([1.0]), 0.0, 0.05, 0.0, 2.0, 0.0
     for drift, rows in ((0.0, 0), (np.nan, 1)):
         found = of.approach_rows_of(

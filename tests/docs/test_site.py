@@ -22,7 +22,7 @@ LOADED = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src")
 class Page(html.parser.HTMLParser):
     def __init__(self, text):
         super().__init__()
-        self.ids, self.links, self.loaded = set(), [], []
+        self.ids, self.loaded = set(), []
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
@@ -31,8 +31,6 @@ class Page(html.parser.HTMLParser):
                 self.ids.add(value)
             if (tag, name) in LOADED and value:
                 self.loaded.append(value)
-            elif (tag, name) == ("a", "href") and value:
-                self.links.append(value)
 
 
 @pytest.fixture(scope="module")
@@ -64,18 +62,6 @@ def test_nothing_is_loaded_from_elsewhere(site, pages):
     for sheet in site.rglob("*.css"):
         text = sheet.read_text(encoding="utf-8")
         assert "@import" not in text and "url(http" not in text and "url(//" not in text, sheet
-
-
-def test_every_link_inside_the_site_leads_somewhere(site, pages):
-    for path, page in pages.items():
-        for address in page.links:
-            parts = urlsplit(address)
-            if parts.scheme:
-                continue
-            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
-            assert target.exists(), (path, address)
-            if parts.fragment and target in pages and target.name not in ("search.html", "genindex.html"):
-                assert unquote(parts.fragment) in pages[target].ids, (path, address)
 
 
 def test_every_info_key_is_explained(site):

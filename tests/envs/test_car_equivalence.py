@@ -41,8 +41,15 @@ What is left, and why:
 import mujoco
 import numpy as np
 import pytest
-from mujoco_2_3_3 import HALVES_ITSELF, OTHER_CORNERS, forward_as_2_3_3, step_as_2_3_3
-from recordings import EPISODES, Recording, replay
+from recordings import (
+    EPISODES,
+    HALVES_ITSELF,
+    OTHER_CORNERS,
+    Recording,
+    forward_as_2_3_3,
+    replay,
+    step_as_2_3_3,
+)
 
 AGREE = {"position": 5e-9, "velocity": 5e-7, "sensors": 2e-9, "lidar": 5e-9, "reward": 1e-12, "cost": 0.0}
 """Equivalence: some three times the worst measured."""

@@ -3,19 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from substep_costs import check_costs
+from recordings import check_costs
 
 from safe_wrappers.envs import EPISODE_STEPS, POINT_GOAL_IDS
-from safe_wrappers.errors import ActionError, ConfigurationError
-
-INFO_TYPES = {
-    "cost": float,
-    "cost_substep": float,
-    "cost_hazards": float,
-    "cost_vases": float,
-    "goal_met": bool,
-    "goals_reached": int,
-}
+from safe_wrappers.errors import ConfigurationError
 
 
 def chase(env, rng, target=None, noise=0.3):
@@ -108,15 +99,6 @@ def test_reward_is_distance_gained_plus_one_on_reaching(make_env):
     assert env.reset()[1]["goals_reached"] == 0
 
 
-def test_reward_is_clipped(make_env):
-    env = make_env(0)
-    env.reset(seed=0, options={"layout": {"agent": [0, 0, 0], "goal": [100.0, 0]}})
-    qvel = np.zeros(env.model.nv)
-    qvel[0] = 2000.0
-    env.set_state(env.data.qpos.copy(), qvel)
-    assert env.step(np.zeros(2))[1] == 10.0
-
-
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_set_state_refreshes_everything(make_env, level):
     env = make_env(level)
@@ -175,13 +157,6 @@ def test_sleeping_vases_change_nothing(make_env):
     assert asleep.vase_positions[0, 0] > 0.51
 
 
-def test_info_has_the_same_keys_and_types_always(env):
-    _, info = env.reset(seed=0)
-    for _ in range(30):
-        assert {key: type(value) for key, value in info.items()} == INFO_TYPES
-        info = env.step(env.action_space.sample())[4]
-
-
 def test_episode_is_truncated_at_its_length_and_never_terminated():
     env = gym.make(POINT_GOAL_IDS[0])
     env.reset(seed=0)
@@ -189,21 +164,6 @@ def test_episode_is_truncated_at_its_length_and_never_terminated():
         _, _, terminated, truncated, _ = env.step(np.zeros(2))
         assert not terminated
         assert truncated == (t == EPISODE_STEPS - 1)
-
-
-NO_NUMBERS = [[10**400, 0], np.ma.masked_array([0.0, 0.0], [True, False]), ["0.1", "0.1"]]
-
-
-@pytest.mark.parametrize(
-    "action", [np.zeros(3), np.array([0.0, np.nan]), np.array([np.inf, 0.0]), 0.5, *NO_NUMBERS]
-)
-def test_bad_actions_are_refused_and_the_env_not_stepped(make_env, action):
-    env = make_env(1)
-    env.reset(seed=0)
-    before = env.data.time
-    with pytest.raises(ActionError, match="2 finite numbers"):
-        env.step(action)
-    assert env.data.time == before
 
 
 def test_level_that_does_not_exist():

@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 
 import safe_wrappers as sw
 from benchmarks.cases import patrolled
-from benchmarks.drivers import corridor, patrol_seeking
+from benchmarks.drivers import patrol_seeking
 from safe_wrappers.envs import PATROLLED_MAZE_ID
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
@@ -143,24 +143,6 @@ def test_the_seed_alone_decides_the_way_whatever_the_ball_does():
     assert np.array_equal(first, pushed) and not np.array_equal(first, other)
 
 
-@pytest.mark.slow
-def test_the_trackers_model_covers_the_turns():
-    """Unseen from an exact fix on: how often the truth is beyond k sigma, over 200 starts anywhere on the way."""
-    env, beyond = shared(), np.zeros((3, 3))
-    for seed in range(100):
-        env.reset(seed=seed)
-        tracks = env.patrol_tracks
-        for i, after in enumerate((0.3, 1.0, 3.0)):
-            while env.data.time < after - 1e-9:
-                env.step(np.zeros(2))
-            (centres,), (covariances,) = tracks.ahead([after])
-            error = np.abs(env.patrol_positions[:, 0] - centres[:, 0]) / np.sqrt(covariances[:, 0, 0])
-            beyond[i] += [(error > k).mean() for k in (1, 2, 3)]
-    shares = beyond / 100
-    # Not normal, but within what any distribution of this covariance could do.
-    assert (shares[:, 1] < 1 / 4).all() and (shares[:, 2] < 1 / 9).all(), shares
-
-
 # Judging -------------------------------------------------------------------------------------------------------
 
 
@@ -237,29 +219,6 @@ def test_every_frame_and_the_window_are_given_the_patrols(monkeypatch, mode):
         drawn = np.array([marker["pos"][:2] for marker in viewer.drawn])
         np.testing.assert_array_equal(drawn, env.patrol_positions)
         assert all((marker["size"][:2] == env.patrol_radius).all() for marker in viewer.drawn)
-
-
-def test_frames_are_point_mazes_but_for_the_patrols(gl):
-    options = {"render_mode": "rgb_array", "width": 160, "height": 160}
-    ours, theirs = gym.make(PATROLLED_MAZE_ID, **options), gym.make("PointMaze_UMaze-v3", **options)
-    env, centres = ours.unwrapped, []
-    for each in (ours, theirs):
-        each.reset(seed=0)
-    for along in (0.3, 1.7):
-        # The upper corridor's patrol in the frame, the lower one's behind it at the same x.
-        env._gone[:] = along
-        frame, bare = ours.render().astype(int), theirs.render().astype(int)
-        changed = (frame != bare).any(axis=-1)
-        red, green, blue = np.moveaxis(frame[changed], -1, 0)
-        assert 30 < changed.sum() < 0.02 * changed.size
-        assert np.mean((red > green + 20) & (green > blue + 20)) > 0.8  # orange
-        centres.append(np.argwhere(changed)[:, 1].mean())
-        state = (ours.step(np.ones(2, np.float32)), theirs.step(np.ones(2, np.float32)))
-        np.testing.assert_array_equal(state[0][0]["observation"], state[1][0]["observation"])
-    # 1.4 m of the 5 m of maze, which are more than half of the picture's width.
-    assert 20 < centres[1] - centres[0] < 40
-    for each in (ours, theirs):
-        each.close()
 
 
 # Ways ----------------------------------------------------------------------------------------------------------
@@ -373,13 +332,3 @@ def test_the_estimate_keeps_a_driver_clear_that_collides_without():
         on,
     )
     assert on["changed"] > 100
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("driver", [patrol_seeking, corridor])
-@pytest.mark.filterwarnings("ignore::safe_wrappers.errors.UnsafeStateWarning")
-def test_twenty_thousand_steps(driver):
-    found = {name: drive(driver, 20_000, name) for name in (None, "last_seen", "true", "estimated")}
-    assert found[None]["collisions"] > 50, found
-    assert found["estimated"]["collisions"] <= 0.02 * found[None]["collisions"], found
-    assert found["last_seen"]["collisions"] > 5 * max(found["estimated"]["collisions"], 1), found

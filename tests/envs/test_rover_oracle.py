@@ -6,9 +6,6 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
-
-from safe_wrappers.control.vehicle.slip import slip_ratio
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 RADIUS, SLOWEST, SUBSTEPS = 0.1, 0.5, 5
@@ -194,42 +191,6 @@ def test_a_long_drive_stays_the_second_writings(env):
     assert grounds >= {"dry", "ice", "snow"}
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_an_episode_that_ends_in_a_vector_env(mode):
-    """Truncated after 4 steps: the next episode starts from its own layout, and infos have one shape throughout."""
-    envs = gym.vector.SyncVectorEnv(
-        [lambda: gym.make("SafeRover-v0", max_episode_steps=4)] * 2, autoreset_mode=mode
-    )
-    envs.reset(seed=3)
-    for k in range(14):
-        observation, _, terminated, _, infos = envs.step(np.ones((2, 5), dtype=np.float32))
-        assert np.isfinite(observation).all()
-        assert not terminated.any()
-        assert infos["slip"].shape == (2, 4)
-        assert infos["cost"].shape == (2,)
-        starts = (k % 5 == 4) if mode is AutoresetMode.NEXT_STEP else (k % 4 == 3)
-        if starts:
-            np.testing.assert_allclose(observation[:, :3], 0.0, atol=1e-9)
-            np.testing.assert_array_equal(infos["slip"], 0.0)
-    envs.close()
-
-
-def test_stepping_on_after_the_end_is_plain_physics(env):
-    """On its roof it has ended; another step is allowed, says so again, and reset starts clean."""
-    env.reset(seed=0, options={"layout": EMPTY})
-    qpos = env.data.qpos.copy()
-    qpos[2], qpos[3:7] = 0.2, [0.0, 1.0, 0.0, 0.0]
-    env.set_state(qpos, np.zeros(12))
-    for _ in range(5):
-        observation, _, terminated, _, info = env.step(np.ones(5))
-        assert terminated
-        assert np.isfinite(observation).all()
-        assert info["slip_max"] == 0.0
-    observation, info = env.reset(seed=0, options={"layout": EMPTY})
-    np.testing.assert_allclose(observation[:10], 0.0, atol=1e-9)
-    np.testing.assert_allclose(info["slip"], 0.0, atol=1e-12)
-
-
 def test_actions_beyond_the_box_act_as_its_edge(env):
     ends = []
     for size in (1.0, 50.0):
@@ -238,11 +199,3 @@ def test_actions_beyond_the_box_act_as_its_edge(env):
             env.step(size * np.array([1.0, -1.0, 1.0, -1.0, 1.0]))
         ends.append(np.concatenate([env.data.qpos, env.data.qvel]))
     np.testing.assert_array_equal(*ends)
-
-
-def test_resting_slip_is_the_ratio_that_the_docs_name(env):
-    env.reset(seed=0, options={"layout": EMPTY | {"speed": -2.0}})
-    for _ in range(5):
-        info = env.step(np.array([0.1, 0.1, 0.1, 0.1, 0.0]))[4]
-    rims, speed = RADIUS * env.data.qvel[RATES], env.data.qvel[0]
-    np.testing.assert_allclose(info["slip"], slip_ratio(rims, speed, SLOWEST), atol=5e-3)  # pitching aside

@@ -1,7 +1,5 @@
 """The cars' motion: drawn states against the process's own equations."""
 
-from decimal import Decimal, localcontext
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -24,28 +22,12 @@ Q = np.diag([0.0, CAR_ACCELERATION_NOISE])
 CARS = 4000
 
 
-def test_the_constants_are_one_process():
-    assert (CAR_MEAN_SPEED, CAR_TIME_CONSTANT_S, CAR_SPEED_STD) == (1.0, 2.0, 0.15)
-    # In the stationary state the noise puts in what the return to the mean takes out.
-    assert pytest.approx(2.0 * CAR_SPEED_STD**2 / CAR_TIME_CONSTANT_S) == CAR_ACCELERATION_NOISE
-
-
 @given(time_s=st.floats(0.01, 20.0))
 def test_a_step_is_van_loans(time_s):
     block = expm(np.block([[-A, Q], [np.zeros((2, 2)), A.T]]) * time_s)
     flow = block[2:, 2:].T
     np.testing.assert_allclose(transition(time_s), flow, rtol=1e-9, atol=1e-13)
     np.testing.assert_allclose(noise_covariance(time_s), flow @ block[:2, 2:], rtol=1e-6, atol=1e-14)
-
-
-@pytest.mark.parametrize("time_s", [0.001, 0.002, 0.01, 0.04, 1.0])
-def test_short_steps_lose_few_digits(time_s):
-    with localcontext() as context:
-        context.prec = 60
-        t, tau, q = Decimal(time_s), Decimal(CAR_TIME_CONSTANT_S), Decimal(CAR_ACCELERATION_NOISE)
-        kept = (-t / tau).exp()
-        exact = q * tau**2 * (t - 2 * tau * (1 - kept) + tau / 2 * (1 - kept**2))
-    assert noise_covariance(time_s)[0, 0] == pytest.approx(float(exact), rel=1e-8)
 
 
 def drawn(rng, step_s, steps, times, position, velocity, mean=CAR_MEAN_SPEED):
@@ -102,10 +84,3 @@ def test_drawing_several_steps_at_once_is_drawing_them_one_by_one():
         position, velocity = single.drive(rng, position, velocity)[0]
         np.testing.assert_allclose(state, [position, velocity], rtol=1e-13)
     assert rng.bit_generator.state["state"] != np.random.default_rng(3).bit_generator.state["state"]
-
-
-def test_cars_are_independent():
-    states = drawn(np.random.default_rng(4), 0.01, 4, [2.0, 2.04], 0.0, CAR_MEAN_SPEED)
-    for state in states:
-        across = np.corrcoef(state[:, : CARS // 2], state[:, CARS // 2 :])[0:2, 2:]
-        assert np.abs(across).max() < 4.5 / np.sqrt(CARS // 2)

@@ -7,8 +7,7 @@ import pytest
 from asking import bound
 from scenes import Scene
 
-from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
-from safe_wrappers.plants.mujoco.replay import Replay
+from safe_wrappers.plants.mujoco.contacts import Replay, can_touch_the_world
 
 ROBOTS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5")
 

@@ -7,7 +7,7 @@ import pytest
 from asking import bound
 from oracles import in_cone
 
-from safe_wrappers.control.legged.centroidal import centroidal_momentum
+from safe_wrappers.control.legged.support import centroidal_momentum
 from safe_wrappers.control.legged.whole_body import solve_cone, solve_pyramid
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import UnsupportedEnvError

@@ -7,8 +7,7 @@ import pytest
 from dropped_ball import DroppedBall
 from scipy.spatial.transform import Rotation
 
-from safe_wrappers.plants.mujoco.contacts import Contacts
-from safe_wrappers.plants.mujoco.replay import Replay, rotation_vector_rate
+from safe_wrappers.plants.mujoco.contacts import Contacts, Replay, rotation_vector_rate
 
 INTEGRATORS = ("Euler", "implicit", "implicitfast", "RK4")
 RAW = ("HalfCheetah-v5", "Pusher-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5", "SafePointGoal2-v0")

@@ -15,7 +15,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig
-from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, MASKED, OFF_POLICY, ON_POLICY
+from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, MASKED, OFF_POLICY
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.experiment import training_jobs
 from safe_wrappers.train.files import read_rows
@@ -145,32 +145,6 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
         assert len(read_rows(evaluation_folder(folder) / f"{condition}.csv")) == 2
 
 
-@pytest.mark.parametrize("algorithm", [name for name in (*ON_POLICY, *OFF_POLICY) if name not in MASKED])
-@pytest.mark.parametrize("kind", ["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"])
-def test_which_algorithm_can_have_which_learner(fake_experiment, algorithm, kind):
-    installed(algorithm)
-    penalty = ", penalty: 0.1" if kind in ("adaption_penalty", "both") else ""
-    arm = f"{FILTERED}, learner: {{kind: {kind}{penalty}}}"
-    if algorithm in ON_POLICY and kind in ("safe_action", "both"):
-        reason = rf"{algorithm} cannot learn from the executed action.* or {kind} with SAC, TD3, DDPG, TQC or CrossQ"
-        with pytest.raises(ConfigurationError, match=reason):
-            one_arm(fake_experiment, algorithm, arm)
-    else:
-        assert one_arm(fake_experiment, algorithm, arm).arms[0].learner.kind == kind
-
-
-@pytest.mark.parametrize("algorithm", [*DISCRETE, *MASKED])
-def test_learners_of_continuous_actions_are_refused_for_discrete_ones(fake_experiment, algorithm):
-    installed(algorithm)
-    for kind in ("safe_action", "safe_set_map", "{kind: both, penalty: 1.0}"):
-        with pytest.raises(
-            ConfigurationError, match=rf"is for continuous actions, and {algorithm} has discrete"
-        ):
-            one_arm(fake_experiment, algorithm, f"{FILTERED}, learner: {kind}")
-    with pytest.raises(ConfigurationError, match="without a filter no action is ever changed"):
-        one_arm(fake_experiment, algorithm, "learner: safe_action")
-
-
 def test_masks_need_somebody_who_has_them(fake_experiment):
     pytest.importorskip("sb3_contrib")
     (arm,) = one_arm(fake_experiment, "MaskablePPO", "filter: none").arms
@@ -266,15 +240,8 @@ def test_a_deterministic_policy_needs_a_word_on_noise(fake_experiment, algorithm
     "noise", ["0.1", "{normal: 0}", "{normal: -1}", "{normal: .nan}", "{normal: [1, 2]}", "{}"]
 )
 def test_noise_that_is_none_is_refused(fake_experiment, noise):
-    with pytest.raises(
-        ConfigurationError, match=r"hyperparameters.action_noise: expected none, \{normal: 0.1\} or"
-    ):
+    with pytest.raises(ConfigurationError, match=r"^hyperparameters\.action_noise"):
         one_arm(fake_experiment, "TD3", FILTERED, f"hyperparameters.action_noise={noise}")
-
-
-def test_training_in_episodes_as_yaml_writes_it(fake_experiment):
-    (arm,) = one_arm(fake_experiment, "TD3", FILTERED, "hyperparameters.train_freq=[1, episode]").arms
-    assert constructor_arguments(arm, make_vec_env(arm))["train_freq"] == (1, "episode")
 
 
 @pytest.mark.parametrize(

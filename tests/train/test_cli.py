@@ -59,7 +59,9 @@ def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path, star
     assert "training filtered seed 0: done" in out
     assert "evaluation unfiltered seed 0: done" in out
     assert "fake: one seed, no interval" in " ".join(out.split())
-    assert "One seed: no interval." in out and "With the filter" in out  # the verdict, after the table
+    assert (
+        "one seed says little" in " ".join(out.split()) and "With the filter" in out
+    )  # the verdict, after the table
     sections = ("Training, all episodes", "Evaluation, filter off", "Evaluation, filter on", "Cost / episode")
     for text in sections:
         assert text in out
@@ -106,48 +108,6 @@ def test_a_stopped_or_killed_comparison_leaves_no_process_behind_and_goes_on(tmp
     assert steps == sorted(steps)
     assert sum(row["length"] for row in rows) <= 24_064  # nothing counted twice; whole rollouts
     assert json.loads((folder / "finished.json").read_text())["timesteps"] == 24_064
-
-
-def test_sigterm_saves_also_where_a_shell_has_other_signals_ignored(tmp_path, start):
-    """`nohup safe-wrappers ... &` in a script: SIGHUP and SIGINT are ignored there."""
-    overrides = [
-        f"output={tmp_path}",
-        "total_steps=200000",
-        "seeds=[0]",
-        "checkpoint_every=1000000",
-        FILTERED,
-    ]
-    ignoring = ["nohup", "sh", "-c", 'trap \'\' INT; exec "$0" "$@"']
-    process = start("train", *overrides, before=ignoring)
-    folder = tmp_path / "fake" / "filtered" / "seed_0"
-    wait_for(lambda: len(read_rows(folder / "episodes.csv")) > 20)
-    for ignored in (signal.SIGHUP, signal.SIGINT):
-        process.send_signal(ignored)
-    rows = len(read_rows(folder / "episodes.csv"))
-    wait_for(lambda: len(read_rows(folder / "episodes.csv")) > rows + 20)
-    process.send_signal(signal.SIGTERM)
-    _, err = process.communicate()
-    assert process.returncode == 128 + signal.SIGTERM
-    assert err.endswith("Stopped. The same command goes on.\n")
-    assert len(list((folder / "checkpoints").iterdir())) == 1
-
-
-@pytest.mark.slow
-def test_a_second_interrupt_stops_at_once(tmp_path, start):
-    folder = tmp_path / "fake" / "filtered" / "seed_0"
-    # A rollout that does not end: the run would wait for it.
-    long = ("total_steps=20000000", "hyperparameters.n_steps=1000000")
-    process = start("train", f"output={tmp_path}", "seeds=[0]", *long, FILTERED)
-    wait_for(lambda: len(read_rows(folder / "episodes.csv")) > 20)
-    process.send_signal(signal.SIGINT)
-    time.sleep(0.8)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate()
-    assert process.returncode == 130
-    assert "another signal stops at once" in out
-    assert "stopped; goes on" not in out  # the run was not waited for
-    assert err == "Stopped. The same command goes on.\n"
-    assert not _held(folder / ".lock")
 
 
 def test_help_and_mistakes_in_the_command_do_not_wait_for_torch():
@@ -236,7 +196,7 @@ def test_errors_are_lines_and_not_tracebacks(tmp_path, capsys):
         (["env=Reachr-v5"], "Reachr-v5"),
         (["arms.filtered.filter={factory: 'nowhere:shield'}"], "cannot import 'nowhere'"),
         (["total_steps=-1"], "total_steps"),
-        (["arms.filtered.start_from=nowhere.zip"], "'nowhere.zip' is no model"),
+        (["arms.filtered.start_from=nowhere.zip"], "no file 'nowhere.zip'"),
     ],
 )
 def test_arms_that_cannot_be_made_are_refused_before_anything_starts(tmp_path, capsys, overrides, message):

@@ -12,13 +12,11 @@ from test_run import Reports
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.diagnose import of_file
 from safe_wrappers.train.enjoy import enjoy_command
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import resume
 from safe_wrappers.train.run.data_pickles import read_pickle
 from safe_wrappers.train.run.stack import make_vec_env
-from safe_wrappers.train.run.start import policy_of_file
 from safe_wrappers.train.run.training import train_run
 
 
@@ -66,15 +64,6 @@ def poison(checkpoint, name, payload):
         path.write_bytes(pickle.dumps(payload))
 
 
-def test_a_file_to_diagnose_that_would_run_something_is_refused(run, tmp_path):
-    _, _, checkpoint = run
-    assert of_file(checkpoint / "model.zip").num_timesteps == 32
-    poison(checkpoint, "model.zip", Touch(tmp_path / "made"))
-    with pytest.raises(RunStateError, match=r"model\.zip' is refused"):
-        of_file(checkpoint / "model.zip")
-    assert not (tmp_path / "made").exists()
-
-
 @pytest.mark.parametrize("name", ["model.zip", "vecnormalize.pkl"])
 def test_a_policy_that_would_run_something_is_refused(run, fake_experiment, tmp_path, name):
     _, folder, checkpoint = run
@@ -83,7 +72,6 @@ def test_a_policy_that_would_run_something_is_refused(run, fake_experiment, tmp_
     for use in (
         lambda: load_policy(folder),
         lambda: enjoy_command(str(folder), 1, "trained", False, None, Console(quiet=True)),
-        lambda: policy_of_file(checkpoint / "model.zip"),
         lambda: train_run(longer, 0, folder, Reports().progress),
     ):
         with pytest.raises(RunStateError, match=rf"{name}' is refused: its pickle names pathlib\.Path"):

@@ -21,27 +21,26 @@ def told(experiment, **more):
             {"violations": 5, "return": 20},
             {"return": 10},
             "With the filter none of 2,400 steps was in violation; without it 120 of 2,400 steps (5 %) were."
-            " Trained without the filter, the policy returned",
+            " Return per evaluation episode: Trained without the filter, filter off 20 [20, 20] with 20 of 400",
         ),
         (
             {"violations": 5, "return": -20},
             {"violations": 1, "return": -10},
             "The filter lowered violations without removing them: 24 of 2,400 steps (1 %) with it,"
-            " 120 of 2,400 steps (5 %) without. Trained without the filter, the policy returned per evaluation"
-            " episode -20 [-20, -20] with the filter off",
+            " 120 of 2,400 steps (5 %) without. Return per evaluation episode: Trained without the filter,"
+            " filter off -20 [-20, -20] with 20 of",
         ),
         (
             {"violations": 1, "return": 10},
             {"violations": 1, "return": 10},
             "The filter did not lower violations: 24 of 2,400 steps (1 %) with it, 24 of 2,400 steps (1 %)"
-            " without. Trained without the filter, the policy returned per evaluation"
-            " episode 10",
+            " without. Return per evaluation episode: Trained without the filter, filter off 10",
         ),
         (
             {"return": 10},
             {"return": 12},
             "No violation with the filter, and none without it: the task did not put it to the test."
-            " Trained without the filter, the policy returned per evaluation episode 10 [10, 10] with the filter off",
+            " Return per evaluation episode: Trained without the filter, filter off 10 [10, 10] with 0",
         ),
         (
             {"violations": 1},
@@ -58,7 +57,7 @@ def told(experiment, **more):
         (
             {"violations": 5, "collisions": 2, "return": 10},
             {"return": 10},
-            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. Trained",
+            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. Return",
         ),
         ({"violations": 1}, {}, "The filter changed none of the evaluation steps; no step was infeasible"),
     ],
@@ -96,12 +95,12 @@ def four_ways(experiment, spread=0.0):
 def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filter(fake_experiment):
     experiment = fake_experiment()
     numbers = four_ways(experiment, spread=1.0)
-    assert verdict(experiment, numbers)[:4] == [
+    assert verdict(experiment, numbers)[:3] == [
         "With the filter none of 200 steps was in violation; without it 10 of 200 steps (5 %) were.",
-        "Trained without the filter, the policy returned per evaluation episode 21.1 [20.6, 21.6] with the filter off"
-        " (10 of 200 steps in violation, 5 %) and 12.7 [12.2, 13.2] with it on (no step in violation).",
-        "Trained through the filter, the policy returned per evaluation episode 9.4 [8.9, 9.9] with the filter off"
-        " (6 of 200 steps in violation, 3 %) and 5.03 [4.53, 5.53] with it on (no step in violation).",
+        "Return per evaluation episode: Trained without the filter, filter off 21.1 [20.6, 21.6] with 10 of 200"
+        " steps in violation; Trained without the filter, filter on 12.7 [12.2, 13.2] with 0 of 200 steps in"
+        " violation; Trained through the filter, filter off 9.4 [8.9, 9.9] with 6 of 200 steps in violation;"
+        " Trained through the filter, filter on 5.03 [4.53, 5.53] with 0 of 200 steps in violation.",
         "With the filter on, the policy trained without it returned more (2 seeds say little).",
     ]
 
@@ -132,7 +131,8 @@ def test_more_return_through_training_with_the_filter_is_said_too(fake_experimen
     assert "the policy trained through it returned more" in said
     # What has not been evaluated is not told.
     assert (
-        "Trained through the filter, the policy returned per evaluation episode 2 with it on (no step" in said
+        "Trained through the filter, filter on 2 [n/a]" in said
+        and "through the filter, filter off" not in said
     )
 
 

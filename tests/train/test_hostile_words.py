@@ -61,9 +61,8 @@ def test_no_word_becomes_markup_in_the_card(fake_experiment, tmp_path):
     arm = renamed(fake_experiment, HOSTILE).arms[1]
     policy = tmp_path / "policy"
     policy.mkdir()
-    versions = {HOSTILE: HOSTILE}
-    (policy / "config.json").write_text(json.dumps({"timesteps": 10, "versions": versions}))
-    (policy / "filter.json").write_text(json.dumps({"constraints": [HOSTILE]}))
+    config = {"timesteps": 10, "versions": {HOSTILE: HOSTILE}, "constraints": [HOSTILE]}
+    (policy / "config.json").write_text(json.dumps(config))
     write_card(arm, 0, tmp_path, FilterConfig())
     card = (policy / "README.md").read_text()
     code = re.findall(r"^`[^`\n]+`", card) + re.findall(r"(?<!`)`[^`\n]+`(?!`)", card)

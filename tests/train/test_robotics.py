@@ -1,14 +1,11 @@
 """Envs of gymnasium-robotics in a config, which nobody has registered and whose observations are dicts."""
 
-import importlib.util
 import json
 import subprocess
 import sys
 
 import pytest
 
-from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.train.config import check_env_id
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import Progress, train_run
@@ -45,12 +42,3 @@ def test_a_new_process_registers_them_when_asked():
         "assert 'FetchReach-v4' in gym.registry"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-
-
-@pytest.mark.parametrize("env_id", ["FetchRaech-v4", "HandReachh-v3", "PointMaze_Ummaze-v3"])
-def test_without_the_package_its_families_name_the_extra(env_id, monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigurationError, match=r"pip install 'safe-wrappers\[robotics\]'"):
-        check_env_id(env_id)
-    with pytest.raises(ConfigurationError, match=r"Did you mean 'Reacher-v5'"):
-        check_env_id("Reachr-v5")

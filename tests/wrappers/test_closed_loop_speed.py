@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
+from safe_wrappers.envs import SPEED_LIMITS
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
 

@@ -6,7 +6,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.mujoco.replay import Replay
+from safe_wrappers.plants.mujoco.contacts import Replay
 
 KINDS = ("forecast", "pyramid", "cone")
 

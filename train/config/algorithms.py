@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from pydantic import Field, StrictBool
+from pydantic import BeforeValidator, Field, StrictBool
 
 from safe_wrappers.errors import ConfigurationError
 
@@ -50,7 +50,9 @@ _Noise = Annotated[
 _OF_DEFAULT: Final[Mapping[type, Any]] = {bool: StrictBool, int: Integer, float: Number}
 _TYPES: Final[Mapping[str, Any]] = {
     "learning_rate": Annotated[Number, Field(gt=0)],
-    "action_noise": Literal["none"] | _Noise | None,
+    "action_noise": Annotated[
+        _Noise | None, BeforeValidator(lambda given: None if given == "none" else given)
+    ],
     "replay_buffer_class": Literal["HerReplayBuffer"],
     "train_freq": Any,  # may be [4, "episode"]
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "buffer_size"), Count),

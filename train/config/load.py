@@ -206,18 +206,12 @@ def _check_start(arm: ArmConfig, experiment: ExperimentConfig) -> None:
     where = f"arms.{arm.name}.start_from"
     if arm.start_from is None or arm.start_from.endswith(".zip"):
         return
-    others = [other.name for other in experiment.arms if other is not arm]
-    check_name(arm.start_from, others, f"{where} (an arm, or a file *.zip)")
-    chain, source = [arm], experiment.begins_with(arm)
-    while source is not None:
-        if source in chain:
-            names = " <- ".join(each.name for each in [*chain, source])
-            raise ConfigurationError(f"{where}: no arm can be trained first: {names}.")
-        chain, source = [*chain, source], experiment.begins_with(source)
-    if chain[1].algorithm != arm.algorithm:
+    before = {other.name: other for other in experiment.arms[: experiment.arms.index(arm)]}
+    source = before[check_name(arm.start_from, before, f"{where} (an arm before this one, or a file *.zip)")]
+    if source.algorithm != arm.algorithm:
         raise ConfigurationError(
-            f"{where}: {chain[1].name} is trained with {chain[1].algorithm}, this arm with {arm.algorithm}; a policy"
-            " goes on with the algorithm that it was trained with."
+            f"{where}: {source.name} is trained with {source.algorithm}, this arm with {arm.algorithm}; a policy goes"
+            " on with the algorithm that it was trained with."
         )
 
 

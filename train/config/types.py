@@ -6,7 +6,7 @@ import difflib
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from typing import Annotated, Any, ClassVar
 
 from pydantic import (
@@ -113,7 +113,7 @@ class Section:
         """What JSON can keep, without the keys that are None; `validate` makes the same section of it."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {
-            name: value.plain() if is_dataclass(value) else value
+            name: value.plain() if isinstance(value, Section) else value
             for name, value in values.items()
             if value is not None
         }

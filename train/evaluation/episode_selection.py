@@ -68,13 +68,11 @@ def shown_episode(experiment: ExperimentConfig) -> ShownEpisode | None:
         return None
     typical, worst = typical_and_worst({int(row["episode_seed"]): row["return"] for row in rows})
     words = f"“{arm.name}” with the {condition.replace('_', ' ')}"
-    return ShownEpisode(
-        seed,
-        typical,
-        worst,
+    reason = (
         f"Episode seed {typical}, policies of training seed {seed}: of the {len(rows)} evaluation episodes the one"
-        f" with the median return of {words}. The worst, {worst}, is the one with its lowest return.",
+        f" with the median return of {words}. The worst, {worst}, is the one with its lowest return."
     )
+    return ShownEpisode(seed, typical, worst, reason)
 
 
 def typical_and_worst(returns: Mapping[int, float]) -> tuple[int, int]:

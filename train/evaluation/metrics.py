@@ -18,14 +18,8 @@ class Metric(NamedTuple):
 REGISTRY: Final[dict[str, Metric]] = {
     "return": Metric("Return / episode", "The task's own reward, summed over an episode", "reward"),
     "length": Metric("Steps / episode", "Control steps of an episode", "steps"),
-    "cost": Metric(
-        "Cost / episode", "The task's cost at the ends of control steps, summed over an episode", "cost"
-    ),
-    "cost_substep": Metric(
-        "Cost in substeps / episode",
-        "Steps of an episode with a cost at any physics substep, also between their ends",
-        "steps",
-    ),
+    "cost": Metric("Cost / episode", "The task's cost at the ends of control steps, summed", "cost"),
+    "cost_substep": Metric("Cost in substeps / episode", "Steps with a cost at any physics substep", "steps"),
     "violations": Metric(
         "Steps in violation, total",
         "Control steps in which the task itself reports a cost, at their end or at any physics substep; the"
@@ -34,56 +28,41 @@ REGISTRY: Final[dict[str, Metric]] = {
     ),
     "violations_per_1000": Metric("Steps in violation / 1000", "Steps in violation", "per 1000 steps"),
     "intervention_rate": Metric(
-        "Share of steps changed",
-        "Steps whose executed action is not the proposed one, per steps of an episode",
+        "Share of steps changed", "Steps whose executed action is not the proposed one"
     ),
     "correction_mean": Metric(
-        "Correction, mean",
-        "L2 norm of executed minus proposed action, over all steps of an episode, also those left alone",
-        "action units",
+        "Correction, mean", "L2 norm of executed minus proposed action, over all steps", "action units"
     ),
     "correction_p95": Metric(
         "Correction, 95th pct.", "The correction that 95 % of an episode's steps stay below", "action units"
     ),
     "infeasible": Metric(
         "Infeasible steps, total",
-        "Steps at which no admissible action satisfied every constraint of the filter",
+        "Steps at which no action satisfied every constraint of the filter",
         "steps",
     ),
     "infeasible_per_1000": Metric("Infeasible steps / 1000", "Infeasible steps", "per 1000 steps"),
-    "fallback": Metric(
-        "Fallback steps, total", "Steps at which the filter's last resort chose the action", "steps"
-    ),
+    "fallback": Metric("Fallback steps, total", "Steps at which the filter's last resort acted", "steps"),
     "unsafe": Metric(
-        "Steps begun with h < 0, total", "Steps that began outside of the filter's own safe set", "steps"
+        "Steps begun with h < 0, total", "Steps begun outside of the filter's safe set", "steps"
     ),
     "stuck": Metric(
         "Stuck steps, total",
-        "Steps at which the filter had changed most of the last actions, and the reward stood still",
+        "Steps with most of the last actions changed, while the reward stood still",
         "steps",
     ),
     "lease_braking": Metric(
-        "Steps braked by the lease, total",
-        "Steps at which the fallback acted because the lease had run out",
-        "steps",
+        "Steps braked by the lease, total", "Fallback steps of an expired lease", "steps"
     ),
-    "lease_expired": Metric(
-        "Leases run out, total", "Leases that ran out before the next action came", "leases"
-    ),
+    "lease_expired": Metric("Leases run out, total", "Leases that ran out before the next action", "leases"),
     "goals_reached": Metric("Goals / episode", "Goals reached in an episode", "goals"),
-    "spin_outs": Metric(
-        "Steps in spin-out, total", "Steps in which a loaded wheel spun or locked (slip above 0.5)", "steps"
-    ),
+    "spin_outs": Metric("Steps in spin-out, total", "Steps with a loaded wheel's slip above 0.5", "steps"),
     "spin_outs_per_million": Metric("Steps in spin-out / million", "Steps in spin-out", "per million steps"),
     "collisions": Metric("Collisions, total", "Collisions begun", "collisions"),
     "collisions_per_million": Metric("Collisions / million steps", "Collisions begun", "per million steps"),
-    "seen": Metric(
-        "Share of time that a track is seen",
-        "Share of steps and tracks with a measurement at the end of the step",
-    ),
+    "seen": Metric("Share of time that a track is seen", "Steps and tracks with a measurement at the end"),
     "expiries": Metric(
-        "Permissions to rely on a track run out, total",
-        "Times that a track's uncertainty grew beyond its tolerance",
+        "Permissions to rely on a track run out, total", "Times that an uncertainty grew beyond its tolerance"
     ),
     "expiries_per_1000": Metric("Permissions run out / 1000 steps", "Permissions run out", "per 1000 steps"),
 }

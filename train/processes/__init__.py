@@ -57,7 +57,7 @@ class Job:
     arguments: tuple[Any, ...]
 
 
-def work(job: Job, tell: Callable[[Message], object], stopping: Callable[[], bool]) -> str:
+def work(job: Job, tell: Callable[[Message], None], stopping: Callable[[], bool]) -> str:
     """Does a job in this process; returns what stopped it, "" for nothing."""
     import torch
 

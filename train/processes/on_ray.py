@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import pickle
-import socket
 import sys
 import time
 from collections.abc import Iterator
@@ -109,15 +108,15 @@ class _Post:
     def __init__(self) -> None:
         self._said: list[tuple[str, Message]] = []
         self._stopped: set[str] = set()
-        self._places: dict[str, str] = {}
+        self._begun: set[str] = set()
 
     def put(self, name: str, message: Message) -> None:
         self._said.append((name, message))
 
-    def begun(self, name: str, place: str) -> None:
-        if name in self._places:
-            self.put(name, ("say", f"was lost on {self._places[name]}; begun again on {place}"))
-        self._places[name] = place
+    def begin(self, name: str) -> None:
+        if name in self._begun:
+            self.put(name, ("say", "its process was lost; begun again"))
+        self._begun.add(name)
 
     def take(self) -> list[tuple[str, Message]]:
         taken, self._said = self._said, []
@@ -138,8 +137,7 @@ def _work(pickled: bytes, name: str, path: list[str], folder: str, post: Any) ->
     os.chdir(folder)
     # For processes that it starts; Ray gave this one its own.
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-    place = f"{socket.gethostname()} ({ray.get_runtime_context().get_node_id()[:8]})"
-    ray.get(post.begun.remote(name, place))
+    ray.get(post.begin.remote(name))
     asked, stopped = 0.0, False
 
     def stopping() -> bool:

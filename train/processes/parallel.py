@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID, TextColumn
 
 from . import STOPPED, Interrupted, Job, RunsFailedError, environment
 from .local import LocalWorkers
@@ -60,7 +60,8 @@ def run_jobs(
         stack.enter_context(environment(one))
         place = _workers(on, workers)
         stack.callback(place.kill)
-        shown = stack.enter_context(_Shown(title, console))
+        shown = _Shown(console)
+        stack.enter_context(shown.bars)
         while running or (waiting and not signals):
             while waiting and len(running) < place.at_once and not signals:
                 job = waiting.pop(0)
@@ -107,9 +108,8 @@ def _workers(on: str | None, at_once: int | None) -> Any:
 def _noted_signals() -> Iterator[list[int]]:
     """In this block signals that would end the process are noted instead; those that it ignores stay ignored."""
     noted: list[int] = []
-    ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
-        ending = ()
+    main = threading.current_thread() is threading.main_thread()  # no other thread may set handlers
+    ending = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP] if main else []
     first = 0.0
 
     def note(signum: int, _: object) -> None:
@@ -131,51 +131,32 @@ def _noted_signals() -> Iterator[list[int]]:
 class _Shown:
     """A bar for each running job on a terminal; now and then a line for each in a file or a pipe."""
 
-    def __init__(self, title: str, console: Console) -> None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(10),
-            TaskProgressColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[figures]}"),
-        )
-        self._bars = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self._console = console
-        self._title = title
-        self._tasks: dict[str, Any] = {}
+    def __init__(self, console: Console) -> None:
+        columns = (*Progress.get_default_columns(), TextColumn("{task.fields[figures]}"))
+        self.bars = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._tasks: dict[str, TaskID] = {}
         self._said_at = time.monotonic()
 
-    def __enter__(self) -> _Shown:
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
     def start(self, job: Job) -> None:
-        self._tasks[job.name] = self._bars.add_task(job.name, total=job.total, figures="")
-        if not self._console.is_terminal:
+        self._tasks[job.name] = self.bars.add_task(job.name, total=job.total, figures="")
+        if not self.bars.console.is_terminal:
             self.say(f"{job.name}: started ({job.total:,} {job.unit})")
 
     def update(self, name: str, kind: str, told: Any) -> None:
         """A job's `steps` or `figures`."""
-        if kind == "steps":
-            self._bars.update(self._tasks[name], completed=told)
-        else:
-            text = ", ".join(f"{key} {value}" for key, value in told.items())
-            self._bars.update(self._tasks[name], figures=text)
+        figures = {} if kind == "steps" else {"figures": ", ".join(f"{key} {told[key]}" for key in told)}
+        self.bars.update(self._tasks[name], completed=told if kind == "steps" else None, **figures)
 
     def end(self, name: str, how: str) -> None:
-        self._bars.remove_task(self._tasks.pop(name))
+        self.bars.remove_task(self._tasks.pop(name))
         self.say(f"{name}: {how}")
 
     def say(self, text: str) -> None:
-        self._bars.console.print(text, soft_wrap=True, highlight=False, markup=False)
+        self.bars.console.print(text, soft_wrap=True, highlight=False, markup=False)
 
     def tick(self) -> None:
         """To be called often."""
-        if self._console.is_terminal or time.monotonic() - self._said_at < _LINES_S:
-            return
-        self._said_at = time.monotonic()
-        for task in self._bars.tasks:
-            self.say(f"  {task.description}: {task.percentage:.0f} % {task.fields['figures']}".rstrip())
+        if not self.bars.console.is_terminal and time.monotonic() - self._said_at > _LINES_S:
+            self._said_at = time.monotonic()
+            for task in self.bars.tasks:
+                self.say(f"  {task.description}: {task.percentage:.0f} % {task.fields['figures']}".rstrip())

@@ -151,31 +151,17 @@ def _price(found: Comparison) -> list[str]:
             for pair, off, on in zip(found.pairs, found.off.returns, found.on.returns, strict=False)
         ]
         return [f"The return per episode went: {', '.join(went)}."] if went else []
-    if not found.outcomes:
-        return []
-    told = [_policy(found, arm) for arm in dict.fromkeys(arm for arm, _ in found.outcomes)]
-    return [*told, _choice(found)]
+    return [_returns(found), _choice(found)]
 
 
-def _policy(found: Comparison, arm: str) -> str:
-    """What one arm's policies returned in evaluation, without and with the filter."""
-    parts = []
-    for condition, phrase in (("filter_off", "with the filter off"), ("filter_on", "with it on")):
-        side = found.outcomes.get((arm, condition))
-        if side is not None:
-            returns = side.returns[0]
-            told = number(returns.iqm) if returns.low is None else str(returns)
-            parts.append(f"{told} {phrase}{_in_brackets(side)}")
-    who = found.who(arm) + ("" if found.same_policies else ", the policy")
-    return f"{who} returned per evaluation episode {' and '.join(parts)}."
-
-
-def _in_brackets(side: Side) -> str:
-    if side.violations is None:
-        return ""
-    if not side.violations:
-        return " (no step in violation)"
-    return f" ({side.violations:,} of {side.steps:,} steps in violation, {percent(side.share)})"
+def _returns(found: Comparison) -> str:
+    """What either policy returned in evaluation, without and with the filter."""
+    told = []
+    for (arm, condition), side in found.outcomes.items():
+        told.append(f"{found.who(arm)}, {condition.replace('_', ' ')} {side.returns[0]}")
+        if side.violations is not None:
+            told[-1] += f" with {side.violations:,} of {side.steps:,} steps in violation"
+    return f"Return per evaluation episode: {'; '.join(told)}." if told else ""
 
 
 def _choice(found: Comparison) -> str:

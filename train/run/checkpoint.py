@@ -93,7 +93,7 @@ def resume(folder: Path, algorithm: str, env: VecEnv, device: str, buffer_size: 
 
 
 def _load(
-    folder: Path, algorithm: str, device: str, env: VecEnv | None, changed: Mapping[str, Any]
+    folder: Path, algorithm: str, device: str, env: VecEnv | None, changed: dict[str, Any]
 ) -> BaseAlgorithm:
     path = folder / MODEL
     try:

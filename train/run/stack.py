@@ -138,8 +138,8 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
             return sw.protect(task, **action_filter.protect)
         except UnsupportedEnvError as error:
             raise ConfigurationError(
-                f"filter: {error}\n`safe-wrappers init FILE.yaml env=ID` writes these lines as a module with a"
-                ' function, for filter: {factory: "module:function"}.'
+                f"filter: {error}\nPut these lines into a function of the env, in a module beside the config; then"
+                ' filter: {factory: "module:function"}.'
             ) from None
     if action_filter.factory is not None:
         factory = _factory(action_filter.factory)

@@ -11,10 +11,9 @@ import importlib.util
 import json
 import math
 import warnings
-from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
@@ -24,32 +23,35 @@ from safe_wrappers.errors import ConfigurationError
 from ..config import ArmConfig
 from .folder import TENSORBOARD
 
+Log = Callable[[dict[str, float], int], object]
+"""Takes numbers by their names, and the step."""
 
-class Tracker(KVWriter):
-    """A run in one tracker; a run that goes on is still one run there.
 
-    What fails later is told in a warning, and training goes on.
+def run_logger(arm: ArmConfig, seed: int, folder: Path) -> Logger:
+    """SB3's logger of a run: TensorBoard, and the arm's trackers, in which a run that goes on is still one run.
 
     Args:
-        arm: The run's arm; its settings are the tracker's.
+        arm: The run's arm; its settings are the trackers'.
         seed: Its seed.
         folder: The run's folder, `EXPERIMENT/ARM/seed_N`.
     """
+    where = folder / TENSORBOARD
+    where.mkdir(parents=True, exist_ok=True)
+    settings = {**arm.fingerprint(), "seed": seed, "folder": str(folder.resolve())}
+    lasting = {**settings, "total_steps": None}  # it may be raised
+    known = hashlib.sha256(json.dumps(lasting, sort_keys=True).encode()).hexdigest()[:16]
+    opened = {"wandb": _wandb, "mlflow": _mlflow}
+    experiment, name = folder.resolve().parents[1].name, f"{arm.name} seed {seed}"
+    trackers = [_Tracker(which, *opened[which](experiment, name, known, settings)) for which in arm.trackers]
+    return Logger(str(where), [TensorBoardOutputFormat(str(where)), *trackers])
 
-    def __init__(self, arm: ArmConfig, seed: int, folder: Path) -> None:
-        settings = {**arm.fingerprint(), "seed": seed}
-        settings.pop("total_steps")  # it may be raised
-        known = hashlib.sha256(f"{folder.resolve()} {json.dumps(settings, sort_keys=True)}".encode())
-        self._lost = False
-        self._open(folder, arm, f"{arm.name} seed {seed}", known.hexdigest()[:16], settings)
 
-    @abstractmethod
-    def _open(self, folder: Path, arm: ArmConfig, name: str, known: str, settings: dict[str, Any]) -> None:
-        """Begins a run, or goes on with the one that is known by this text."""
+class _Tracker(KVWriter):
+    """A run in one tracker. What fails there is told in a warning, and training goes on."""
 
-    @abstractmethod
-    def _log(self, numbers: Mapping[str, float], step: int) -> None:
-        """Takes numbers by their names."""
+    def __init__(self, name: str, log: Log, close: Callable[[], object]) -> None:
+        self._name, self._log, self._lost = name, log, False
+        self.close = close  # type: ignore[method-assign, assignment]
 
     def write(
         self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
@@ -68,66 +70,36 @@ class Tracker(KVWriter):
             self._log(numbers, step)
         except Exception as error:  # whatever a network does: the training is worth more than its curve
             self._lost = True
-            warnings.warn(f"{type(self).__name__}: what follows is not tracked: {error}", stacklevel=2)
+            warnings.warn(f"{self._name}: what follows is not tracked: {error}", stacklevel=2)
 
 
-class Wandb(Tracker):
-    """Weights & Biases; `WANDB_MODE=offline` and the like are read by itself."""
-
-    def _open(self, folder: Path, arm: ArmConfig, name: str, known: str, settings: dict[str, Any]) -> None:
-        self._run = importlib.import_module("wandb").init(
-            project=folder.resolve().parents[1].name,
-            group=arm.name,
-            name=name,
-            id=known,
-            resume="allow",
-            dir=str(folder),
-            config=settings,
-        )
-        # By their own count: a run that goes on from a checkpoint makes some steps again.
-        self._run.define_metric("timesteps")
-        self._run.define_metric("*", step_metric="timesteps")
-
-    def _log(self, numbers: Mapping[str, float], step: int) -> None:
-        self._run.log({**numbers, "timesteps": step})
-
-    def close(self) -> None:
-        """Ends the run there, until it goes on."""
-        self._run.finish()
+def _wandb(
+    experiment: str, name: str, known: str, settings: dict[str, Any]
+) -> tuple[Log, Callable[[], object]]:
+    run = importlib.import_module("wandb").init(
+        project=experiment, name=name, id=known, resume="allow", dir=settings["folder"], config=settings
+    )
+    # By their own count: a run that goes on from a checkpoint makes some steps again.
+    run.define_metric("timesteps")
+    run.define_metric("*", step_metric="timesteps")
+    return lambda numbers, step: run.log({**numbers, "timesteps": step}), run.finish
 
 
-class Mlflow(Tracker):
-    """MLflow; `MLFLOW_TRACKING_URI` is read by itself."""
+def _mlflow(
+    experiment: str, name: str, known: str, settings: dict[str, Any]
+) -> tuple[Log, Callable[[], object]]:
+    mlflow = importlib.import_module("mlflow")
+    of, client = mlflow.set_experiment(experiment).experiment_id, mlflow.MlflowClient()
+    found = client.search_runs([of], f"tags.known = '{known}'")
+    run = (found[0] if found else client.create_run(of, tags={"known": known}, run_name=name)).info.run_id
+    for key, value in {} if found else settings.items():
+        client.log_param(run, key, value)
 
-    def _open(self, folder: Path, arm: ArmConfig, name: str, known: str, settings: dict[str, Any]) -> None:
-        mlflow = importlib.import_module("mlflow")
-        mlflow.set_experiment(folder.resolve().parents[1].name)
-        self._client = mlflow.MlflowClient()
-        of = mlflow.get_experiment_by_name(folder.resolve().parents[1].name).experiment_id
-        found = self._client.search_runs([of], f"tags.known = '{known}'")
-        run = found[0] if found else self._client.create_run(of, tags={"known": known}, run_name=name)
-        self._id = run.info.run_id
-        for key, value in {} if found else settings.items():
-            self._client.log_param(self._id, key, value)
-
-    def _log(self, numbers: Mapping[str, float], step: int) -> None:
+    def log(numbers: dict[str, float], step: int) -> None:
         for key, value in numbers.items():
-            self._client.log_metric(self._id, key, value, step=step, synchronous=False)
+            client.log_metric(run, key, value, step=step)
 
-    def close(self) -> None:
-        """Ends the run there, until it goes on."""
-        self._client.set_terminated(self._id)
-
-
-_TRACKERS: Final[Mapping[str, type[Tracker]]] = {"wandb": Wandb, "mlflow": Mlflow}
-
-
-def run_logger(arm: ArmConfig, seed: int, folder: Path) -> Logger:
-    """SB3's logger of a run: TensorBoard, and the arm's trackers."""
-    where = str(folder / TENSORBOARD)
-    (folder / TENSORBOARD).mkdir(parents=True, exist_ok=True)
-    trackers = [_TRACKERS[name](arm, seed, folder) for name in arm.trackers]
-    return Logger(where, [TensorBoardOutputFormat(where), *trackers])
+    return log, lambda: client.set_terminated(run)
 
 
 def check_trackers(arm: ArmConfig) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import shutil
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
@@ -38,8 +37,8 @@ from .folder import (
 )
 from .model import buffer_size, learner_callbacks, learning_starts, new_model, whole_rollouts
 from .policy import write_policy
-from .stack import make_training_env, make_vec_env
-from .start import Policy, Start, begin_with, policy_of_file, policy_of_model, refuse_misfit
+from .stack import make_vec_env
+from .start import Start, begin_with
 from .trackers import run_logger
 
 
@@ -184,25 +183,6 @@ def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
             f"{str(folder / CHECKPOINTS)!r} is empty; delete {str(folder)!r} and train again."
         )
     return checkpoint
-
-
-def check_start(arm: ArmConfig, start: Start) -> None:
-    """Refuses a policy to begin with that does not fit, before anything is trained.
-
-    Raises:
-        ConfigurationError: Other spaces, another policy or other scaling of observations; or no such file.
-    """
-    theirs = policy_of_file(start.path) if start.arm is None else _untrained(start.arm)
-    refuse_misfit(f"arms.{arm.name}", start.name, theirs, _untrained(arm))
-
-
-def _untrained(arm: ArmConfig) -> Policy:
-    envs = DummyVecEnv([lambda: make_training_env(arm)])
-    small = replace(arm, total_steps=1, hyperparameters={**arm.hyperparameters})
-    small.hyperparameters.pop("buffer_size", None)  # nothing will be replayed
-    policy = policy_of_model(new_model(small, 0, envs))
-    envs.close()
-    return policy
 
 
 def _file_of(start: Start, seed: int) -> Path:

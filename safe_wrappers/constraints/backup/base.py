@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.planar import NUMBERS
+from safe_wrappers.control.numerics.shapes import NUMBERS
 from safe_wrappers.filter.constraint import BoundConstraint, Memory
 from safe_wrappers.plants.plant import Plant
 

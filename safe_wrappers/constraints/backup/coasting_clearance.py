@@ -12,7 +12,7 @@ import numpy as np
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
-from safe_wrappers.control.numerics.planar import clearances_on_a_course, convex_outline, nearest_discs
+from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline, nearest_discs
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint

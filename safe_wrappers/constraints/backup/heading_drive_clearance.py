@@ -12,7 +12,7 @@ from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
-from safe_wrappers.control.numerics.planar import nearest_discs
+from safe_wrappers.control.numerics.shapes import nearest_discs
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, ConstraintBatch, HalfSpaces

@@ -60,7 +60,8 @@ class BoundSupportMargin(BoundSlacks):
         for other, distances in self._known:
             if other is found:
                 return distances
-        distances = edge_distances(found)
+        of = found.step, found.point, found.normal, found.force
+        distances: list[float] = support_distances(*of).tolist()
         self._known.append((found, distances))
         return distances
 
@@ -80,9 +81,3 @@ class BoundSupportMargin(BoundSlacks):
             distances = self._distances(found) if found.finite else []
             least, share = min(distances, default=0.0), len(distances) / found.steps
         return {keys.WHOLE_BODY_ZMP_MARGIN: least, keys.WHOLE_BODY_SUPPORTED: share}
-
-
-def edge_distances(contacts: ContactForecast) -> list[float]:
-    """Distance of the zero moment point from the polygon's edge, at every evaluation at which there is one, m."""
-    found = support_distances(contacts.step, contacts.point, contacts.normal, contacts.force)
-    return [float(distance) for distance in found]

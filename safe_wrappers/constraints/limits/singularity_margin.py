@@ -131,10 +131,12 @@ class BoundSingularityMargin(BoundRollout):
         if most < _STILL:
             nowhere = "cannot be moved in all of these directions at once in any configuration"
             raise ConfigurationError(f"{what} {nowhere}: {task}")
-        if spec.threshold is None:
+        if spec.threshold is not None:
+            self._threshold = spec.threshold
+        else:
             assert spec.task_speed is not None and spec.rate_limit is not None
             spec.validated = of_arm.validated_threshold(jacobians, spec.task_speed, spec.rate_limit)
-        self._threshold = spec.threshold if spec.validated is None else spec.validated.threshold
+            self._threshold = spec.validated.threshold
         if self._threshold * (1.0 + self.spec.margin) >= most:
             raise ConfigurationError(
                 f"no configuration has a manipulability above {self._threshold:g} with a margin of "

@@ -99,10 +99,10 @@ def _swivel(body: HeadingDrive) -> float:
 
 @compiled
 def _to_disc(body: HeadingDrive, path: StoppingPath, disc: Array) -> float:
-    x, y = disc[0], disc[1]
+    x, y, room = float(disc[0]), float(disc[1]), float(disc[2])
     if path.spread:  # it may come to rest anywhere in the area
-        return path_distance(path, x, y) - _swivel(body) - disc[2]
-    return min(path_distance(path, x, y), end_distance(path, x, y) - _swivel(body)) - disc[2]
+        return path_distance(path, x, y) - _swivel(body) - room
+    return min(path_distance(path, x, y), end_distance(path, x, y) - _swivel(body)) - room
 
 
 @compiled

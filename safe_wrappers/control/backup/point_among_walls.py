@@ -15,7 +15,7 @@ from safe_wrappers.checks import Array
 from safe_wrappers.control.backup import damped_axis as along
 from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.numerics.compiled import compiled
-from safe_wrappers.control.numerics.planar import Rectangle, apart, closer, nearest, one_of
+from safe_wrappers.control.numerics.shapes import Rectangle, apart, closer, nearest, one_of
 
 Pair = tuple[float, float]
 """Numbers along x and along y."""

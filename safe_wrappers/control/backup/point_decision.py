@@ -26,7 +26,7 @@ from safe_wrappers.control.backup.point_among_walls import (
     stop,
 )
 from safe_wrappers.control.numerics.compiled import compiled, hypot
-from safe_wrappers.control.numerics.planar import Rectangle, closer, gaps, nearest, one_of
+from safe_wrappers.control.numerics.shapes import Rectangle, closer, gaps, nearest, one_of
 
 PROPOSAL, CANDIDATE, UNRESOLVED = 0, 2, 7
 """What `closest_admitted` returns: a `Stage` of the search, or that it has found no admitted control."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
-from safe_wrappers.control.numerics.surfaces import nearest_points
+from safe_wrappers.control.numerics.shapes import nearest_points
 
 _RETREAT_RATE: Final = 1.0
 """1/s: rate at which a violation is to shrink."""

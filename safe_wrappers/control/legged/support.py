@@ -1,8 +1,8 @@
-"""Support plane and support polygon of contacts, and the inset as rows on contact forces.
+"""Support of contacts: its plane, the zero moment point in its polygon, an inset as rows; centroidal momentum.
 
-Source: appendix "Physical contact feasibility constraints", third condition. The zero moment point is where, on the
-plane of support, the contact forces have no tangential moment. Forces that push keep it inside the support polygon,
-the convex hull of their points; an inset keeps a distance from its edges.
+Source: appendix "Centroidal momentum dynamics" and "Physical contact feasibility constraints", third condition. The
+zero moment point is where, on the plane of support, the contact forces have no tangential moment. Forces that push
+keep it inside the support polygon, the convex hull of their points; an inset keeps a distance from its edges.
 
 It assumes contacts in one plane that do not slip; contacts at several heights need `whole_body`. Distances from the
 polygon's edge need no polygon: the distance of a point inside a convex hull from its boundary is the least of
@@ -209,3 +209,30 @@ def _dot(a: Array, b: Array) -> float:
 def _cross(a: Array, b: Array) -> Array:
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     return np.array([x, y, z])
+
+
+class CentroidalMomentum(NamedTuple):
+    """Momentum: `linear`, kg m/s, and `angular` about the centre of mass, kg m^2/s, shape (3,) each."""
+
+    mass: float  # kg
+    com: Array  # centre of mass, shape (3,), m
+    linear: Array
+    angular: Array
+
+
+def centroidal_momentum(
+    masses: Array, positions: Array, velocities: Array, angular_momenta: Array
+) -> CentroidalMomentum:
+    """Of n parts together.
+
+    Args:
+        masses: Shape (n,), kg, their sum positive.
+        positions: Of the parts' own centres of mass, shape (n, 3), m.
+        velocities: Of the same points, shape (n, 3), m/s.
+        angular_momenta: Of the parts about them, shape (n, 3), kg m^2/s.
+    """
+    total = float(masses.sum())
+    com, momenta = masses @ positions / total, masses[:, None] * velocities
+    # Relative to the centre of mass; the velocities need no such shift, since sum m (p - c) = 0.
+    angular = (np.cross(positions - com, momenta) + angular_momenta).sum(axis=0)
+    return CentroidalMomentum(total, com, momenta.sum(axis=0), angular)

@@ -6,12 +6,12 @@ their ranges until a horizon, which is no shorter than stopping takes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import Array, finite_arrays, non_negative, positive
+from safe_wrappers.checks import Array, finite_arrays, positive
 from safe_wrappers.control.contact.friction_cone import checked_friction
 from safe_wrappers.errors import ConfigurationError
 
@@ -90,53 +90,20 @@ class WholeBodyProblem:
     """Wanted `J qacc`: `contact_acceleration`, or zeros, minus the drift, shape (k, 3)."""
 
     def __post_init__(self) -> None:
-        for one, other in (("acceleration_rows", "acceleration_limits"), ("force_rows", "force_limits")):
-            if (getattr(self, one) is None) != (getattr(self, other) is None):
-                raise ConfigurationError(f"{one} and {other} come together")
-        nv, nu, k = len(self.bias), len(self.nominal), len(self.normals)
-        limits = 0 if self.acceleration_limits is None else len(self.acceleration_limits)
-        force_limits = 0 if self.force_limits is None else len(self.force_limits)
-        for name, shape in (
-            ("inertia", (nv, nv)),
-            ("bias", (nv,)),
-            ("actuation", (nv, nu)),
-            ("jacobians", (k, 3, nv)),
-            ("drift", (k, 3)),
-            ("normals", (k, 3)),
-            ("friction", (k,)),
-            ("lower", (nu,)),
-            ("upper", (nu,)),
-            ("nominal", (nu,)),
-            ("contact_acceleration", (k, 3)),
-            ("breaking", (k,)),
-            ("first_tangents", (k, 3)),
-            ("acceleration_rows", (limits, nv)),
-            ("acceleration_limits", (limits,)),
-            ("force_rows", (force_limits, 3 * k)),
-            ("force_limits", (force_limits,)),
-        ):
-            value = getattr(self, name)
-            if value is None:
-                continue
-            if value.shape != shape:
-                raise ConfigurationError(f"expected {name} of shape {shape}, got {value.shape}")
-            if name not in ("lower", "upper") and not np.isfinite(value).all():
-                raise ConfigurationError(f"{name} must be finite, got {value}")
-        for task in self.tasks:
-            non_negative("a task's weight", task.weight, "its own unit")
+        for part in fields(self):
+            value = getattr(self, part.name, None)
+            array = isinstance(value, np.ndarray) and part.name not in ("lower", "upper")
+            if array and not np.isfinite(np.asarray(value)).all():
+                raise ConfigurationError(f"{part.name} must be finite, got {value}")
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
         checked_friction(self.friction)
-        given = np.asarray(self.control_weight, dtype=np.float64)
-        weights = np.full(nu, given) if given.ndim == 0 else given
-        if not (weights.shape == (nu,) and np.isfinite(weights).all() and (weights > 0.0).all()):
-            raise ConfigurationError(f"control_weight must be positive, one or of shape ({nu},), got {given}")
         positive("force_weight", self.force_weight, "1/N^2")
-        opens = np.zeros(k, bool) if self.breaking is None else np.asarray(self.breaking, bool)
+        opens = np.zeros(len(self.normals), bool) if self.breaking is None else self.breaking
         acceleration = 0.0 if self.contact_acceleration is None else self.contact_acceleration
         object.__setattr__(self, "stance", np.flatnonzero(~opens))
         object.__setattr__(self, "opening", np.flatnonzero(opens))
-        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "weights", np.broadcast_to(self.control_weight, self.nominal.shape))
         object.__setattr__(self, "wanted", acceleration - self.drift)
 
 

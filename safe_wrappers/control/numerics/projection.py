@@ -133,10 +133,10 @@ class _Problem(NamedTuple):
     @staticmethod
     def of(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> "_Problem":
         """Copied where compiled code would have to be compiled anew: strides, read-only memory."""
-        given = [part if part.flags.carray else part.copy() for part in (u, a, b, lo, hi)]
+        u, a, b, lo, hi = (part if part.flags.carray else part.copy() for part in (u, a, b, lo, hi))
         m, k = u.size, b.size
-        sizes = np.empty(m), np.empty((3, k)), np.empty(m), np.empty((k, m)), np.empty(m + k), np.empty(m + k)
-        return _Problem(*given, *sizes)
+        program = np.empty(m), np.empty((k, m)), np.empty(m + k), np.empty(m + k)
+        return _Problem(u, a, b, lo, hi, np.empty(m), np.empty((3, k)), *program)
 
 
 @compiled
@@ -439,6 +439,8 @@ def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upp
 def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
     """The x in the box that minimises `|a x - b|^2`, shape (n,); `a` has full column rank."""
     hessian, linear, n = a.T @ a, -(a.T @ b), len(lower)
+    if not n:
+        return np.zeros(0)
     clipped = np.clip(np.linalg.solve(hessian, -linear), lower, upper)
     unit = float(np.abs(clipped).max()) or 1.0
     bounds = np.minimum(upper / unit, _UNBOUNDED), np.maximum(lower / unit, -_UNBOUNDED)

@@ -209,7 +209,7 @@ class Recorder(Remade):
     def _against_motion(self, data: mujoco.MjData) -> Array:
         rest, per_length, damping = self._servos
         told = rest + per_length * data.actuator_length - damping * data.actuator_velocity
-        return np.minimum(np.maximum(told, self._low), self._high)
+        return np.asarray(np.minimum(np.maximum(told, self._low), self._high))
 
     def place(self, data: mujoco.MjData) -> None:
         """Take the places of mocap bodies, which positions do not determine, for later calls of `poses`."""

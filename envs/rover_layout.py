@@ -1,18 +1,18 @@
-"""Where everything stands when the rover's episode starts, and how a user asks for it."""
+"""Where everything stands when the rover's episode starts, how a user asks for it, and what a viewer sees of it."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
-from ..goal.layout import layout_option, numbers, points
-from ..goal.placement import Kind, place_objects, place_one
-from ..ground import GROUNDS, Patch
+from .goal_layout import Given, known, layout_option, numbers, place_objects, place_one, points
+from .ground import GROUNDS, Patch
 
 ROVER_LAYOUT_KEYS: Final = ("agent", "goal", "hazards", "patches", "ground", "speed")
 """What the rover's ``reset(options={"layout": {...}})`` understands."""
@@ -51,19 +51,7 @@ class RoverLayout:
     speed: float
 
 
-@dataclass(frozen=True)
-class PartialRoverLayout:
-    """The same parts; None means "sample it"."""
-
-    agent: Array | None
-    goal: Array | None
-    hazards: Array | None
-    patches: tuple[Patch, ...] | None
-    ground: str
-    speed: float
-
-
-def parse_rover_layout(options: Mapping[str, Any] | None) -> PartialRoverLayout:
+def parse_rover_layout(options: Mapping[str, Any] | None) -> Given:
     """Read the layout out of `reset`'s options; without a word the ground is dry and the speed 0.
 
     Given positions are taken as they are: no keepouts are enforced among them. Options other than ``"layout"``
@@ -79,7 +67,7 @@ def parse_rover_layout(options: Mapping[str, Any] | None) -> PartialRoverLayout:
     given = layout_option(options, ROVER_LAYOUT_KEYS)
     speed = numbers(given, "speed", "a number of m/s", ())
     ground = given.get("ground")
-    return PartialRoverLayout(
+    return known(
         agent=numbers(given, "agent", "[x, y, heading]", (3,)),
         goal=numbers(given, "goal", "[x, y]", (2,)),
         hazards=points(given, "hazards", HAZARDS),
@@ -89,7 +77,7 @@ def parse_rover_layout(options: Mapping[str, Any] | None) -> PartialRoverLayout:
     )
 
 
-def sample_rover_layout(rng: np.random.Generator, given: PartialRoverLayout) -> RoverLayout:
+def sample_rover_layout(rng: np.random.Generator, given: Given) -> RoverLayout:
     """Sample what is missing of a layout; given parts are kept as they are.
 
     Agent, goal and hazards keep their keepouts from each other; patches lie anywhere, under whatever stands there,
@@ -102,26 +90,14 @@ def sample_rover_layout(rng: np.random.Generator, given: PartialRoverLayout) -> 
     Raises:
         ConfigurationError: The given parts leave no room for the rest.
     """
-    agent = None if given.agent is None else given.agent[None, :2]
-    goal = None if given.goal is None else given.goal[None]
-    placed = place_objects(
-        rng,
-        HALF_EXTENT,
-        {
-            "agent": Kind(1, _AGENT_KEEPOUT, agent),
-            "goal": Kind(1, _GOAL_KEEPOUT, goal),
-            "hazards": Kind(HAZARDS, _HAZARD_KEEPOUT, given.hazards),
-        },
-    )
-    heading = rng.uniform(-np.pi, np.pi) if given.agent is None else given.agent[2]
-    return RoverLayout(
-        agent=np.append(placed["agent"][0], heading),
-        goal=placed["goal"][0],
-        hazards=placed["hazards"],
-        patches=_sample_patches(rng) if given.patches is None else given.patches,
-        ground=given.ground,
-        speed=given.speed,
-    )
+    kinds = {
+        "agent": (1, _AGENT_KEEPOUT),
+        "goal": (1, _GOAL_KEEPOUT),
+        "hazards": (HAZARDS, _HAZARD_KEEPOUT),
+    }
+    placed = place_objects(rng, HALF_EXTENT, kinds, given)
+    patches = given["patches"] if "patches" in given else _sample_patches(rng)
+    return RoverLayout(**placed, patches=patches, ground=given["ground"], speed=given["speed"])
 
 
 def sample_rover_goal(rng: np.random.Generator, agent: Array, hazards: Array) -> Array:
@@ -191,3 +167,35 @@ def start_state(layout: RoverLayout, rest: Array, velocities: int) -> tuple[Arra
     qpos[3:7] = math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading)
     qvel[:2] = layout.speed * math.cos(heading), layout.speed * math.sin(heading)
     return qpos, qvel
+
+
+_PARKED: Final = 1000.0  # m: farther than the rover gets in an episode
+_COLOURS: Final = {
+    "dry": (0.55, 0.5, 0.45, 0.6),
+    "wet": (0.25, 0.35, 0.45, 0.6),
+    "snow": (1.0, 1.0, 1.0, 0.9),
+    "ice": (0.65, 0.9, 1.0, 0.9),
+}
+
+
+class Scene:
+    """Markers of a model; none of them touches anything."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._floor = int(model.geom("floor").id)
+        self._floor_colour = model.geom_rgba[self._floor].copy()
+        self._patch_geoms = [g for g in range(model.ngeom) if model.geom(g).name.startswith("patch")]
+
+    def show(self, model: mujoco.MjModel, data: mujoco.MjData, layout: RoverLayout) -> None:
+        """Move hazards and patches where the layout has them."""
+        mocap = data.mocap_pos
+        mocap[1:, :2] = _PARKED
+        n = len(layout.hazards)
+        mocap[1 : 1 + n, :2] = layout.hazards
+        first = len(mocap) - len(self._patch_geoms)
+        for i, (patch, geom) in enumerate(zip(layout.patches, self._patch_geoms, strict=False)):
+            mocap[first + i, :2] = patch.center
+            model.geom_size[geom, 0] = model.geom_rbound[geom] = patch.radius
+            model.geom_rgba[geom] = _COLOURS[patch.ground]
+        bare = layout.ground == "dry"
+        model.geom_rgba[self._floor] = self._floor_colour if bare else (*_COLOURS[layout.ground][:3], 1.0)

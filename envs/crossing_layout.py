@@ -9,8 +9,8 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
-from ..goal.layout import layout_option, numbers
-from ..traffic import CAR_MEAN_SPEED, CAR_SPEED_STD
+from .goal_layout import Given, known, layout_option, numbers
+from .traffic import CAR_MEAN_SPEED, CAR_SPEED_STD
 
 CROSSING_LAYOUT_KEYS: Final = ("agent", "goal", "cars", "pillars")
 """What the crossing's ``reset(options={"layout": {...}})`` understands."""
@@ -56,17 +56,7 @@ class CrossingLayout:
     pillars: Array
 
 
-@dataclass(frozen=True)
-class PartialCrossingLayout:
-    """The same parts; None means "sample it"."""
-
-    agent: Array | None
-    goal: Array | None
-    cars: Array | None
-    pillars: Array | None
-
-
-def parse_crossing_layout(options: Mapping[str, Any] | None) -> PartialCrossingLayout:
+def parse_crossing_layout(options: Mapping[str, Any] | None) -> Given:
     """Read the layout out of `reset`'s options.
 
     Given positions are taken as they are, but for a robot that would stand outside the field or in a given pillar:
@@ -80,14 +70,14 @@ def parse_crossing_layout(options: Mapping[str, Any] | None) -> PartialCrossingL
         ConfigurationError: A wrong shape, a number that is not finite, or a robot where it cannot stand.
     """
     given = layout_option(options, CROSSING_LAYOUT_KEYS)
-    parsed = PartialCrossingLayout(
+    parsed = known(
         agent=numbers(given, "agent", "[x, y, heading]", (3,)),
         goal=numbers(given, "goal", "[x, y]", (2,)),
         cars=numbers(given, "cars", f"[[x, v], ...] of {CARS} cars", (CARS, 2)),
         pillars=numbers(given, "pillars", f"[[x, y], ...] of {PILLARS} pillars", (PILLARS, 2)),
     )
-    if parsed.agent is not None:
-        _check_agent(parsed.agent, parsed.pillars)
+    if "agent" in parsed:
+        _check_agent(parsed["agent"], parsed.get("pillars"))
     return parsed
 
 
@@ -105,7 +95,7 @@ def _check_agent(agent: Array, pillars: Array | None) -> None:
         )
 
 
-def sample_crossing_layout(rng: np.random.Generator, given: PartialCrossingLayout) -> CrossingLayout:
+def sample_crossing_layout(rng: np.random.Generator, given: Given) -> CrossingLayout:
     """Sample what is missing of a layout; given parts are kept as they are.
 
     The robot starts on the lower pavement and faces the road; the goal lies on the other side. In each lane the first
@@ -119,11 +109,16 @@ def sample_crossing_layout(rng: np.random.Generator, given: PartialCrossingLayou
     Raises:
         ConfigurationError: The given pillars leave the robot no place to start from.
     """
-    agent = _sample_agent(rng, given.pillars) if given.agent is None else given.agent
-    pillars = _sample_pillars(rng, agent, given.goal) if given.pillars is None else given.pillars
-    goal = sample_crossing_goal(rng, agent[:2], pillars) if given.goal is None else given.goal
-    cars = _sample_cars(rng) if given.cars is None else given.cars
-    return CrossingLayout(agent=agent, goal=goal, cars=cars, pillars=pillars)
+    parts = dict(given)
+    if "agent" not in parts:
+        parts["agent"] = _sample_agent(rng, given.get("pillars"))
+    if "pillars" not in parts:
+        parts["pillars"] = _sample_pillars(rng, parts["agent"], given.get("goal"))
+    if "goal" not in parts:
+        parts["goal"] = sample_crossing_goal(rng, parts["agent"][:2], parts["pillars"])
+    if "cars" not in parts:
+        parts["cars"] = _sample_cars(rng)
+    return CrossingLayout(**parts)
 
 
 def sample_crossing_goal(rng: np.random.Generator, agent: Array, pillars: Array) -> Array:

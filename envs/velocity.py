@@ -1,6 +1,7 @@
 """The velocity tasks: a standard Gymnasium robot that must not go faster than a published limit."""
 
 import importlib
+import itertools
 import math
 from typing import Any, ClassVar, Final
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP
 
-from .speed_limits import SPEED_LIMITS
+from . import SPEED_LIMITS
 
 SPEED: Final = "speed"
 """float64, m/s: the speed that the cost judges, of this control step; 0 at reset, where nothing has moved."""
@@ -34,7 +35,7 @@ class SafeVelocityEnv(MujocoEnv):
     step, so there is no such thing as a violation at one physics substep, and ``qvel`` may well exceed the
     limit within a step that keeps it.
 
-    A subclass names one robot's standard env as its second base and sets `speed_limit`.
+    A subclass has one robot's standard env as its second base, and sets `speed_limit`.
     """
 
     speed_limit: ClassVar[float]
@@ -96,9 +97,24 @@ def make_velocity_env(robot: str, version: str = "v5", **kwargs: Any) -> SafeVel
     for name, value, known in (("robot", robot, tuple(SPEED_LIMITS)), ("version", version, VERSIONS)):
         if value not in known:
             raise UnknownNameError(f"{name} must be one of {', '.join(map(repr, known))}; got {value!r}")
-    module = importlib.import_module(f".{version}", __package__)
-    env: SafeVelocityEnv = getattr(module, f"Safe{robot}VelocityEnv")(**kwargs)
+    env: SafeVelocityEnv = __getattr__(f"Safe{robot}Velocity{version}Env")(**kwargs)
     return env
+
+
+def __getattr__(name: str) -> Any:
+    """The class of a robot and a version, as in `SafeAntVelocityv5Env`: made when it is asked for, also by pickle."""
+    for robot, version in itertools.product(SPEED_LIMITS, VERSIONS):
+        if name == f"Safe{robot}Velocity{version}Env":
+            break
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in globals():
+        file = "half_cheetah" if robot == "HalfCheetah" else robot.lower()
+        standard = getattr(importlib.import_module(f"gymnasium.envs.mujoco.{file}_{version}"), f"{robot}Env")
+        base = SafePlanarVelocityEnv if robot in ("Ant", "Humanoid") else SafeVelocityEnv
+        about = {"__module__": __name__, "__doc__": f"{robot}-{version} with the cost of speed."}
+        globals()[name] = type(name, (base, standard), {**about, "speed_limit": SPEED_LIMITS[robot]})
+    return globals()[name]
 
 
 # Without it `gymnasium.make` does not know "rgb_array_list"; every robot and version has the same render modes.

@@ -1,1 +1,0 @@
-"""Parts of the crossing and of the patrolled maze."""

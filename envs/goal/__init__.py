@@ -1,1 +1,0 @@
-"""Parts of the goal tasks: robots, levels, layouts, what the lidar sees."""

@@ -1,0 +1,271 @@
+"""Every exported wrapper under faults in the middle of an episode: refused, flagged, harmless or an error.
+
+Whatever comes of a fault: no number that is not finite reaches the env, no action outside the action space through a
+wrapper that decides, and the next episode is bit for bit that of a wrapper that never saw the fault. What is wrong
+about an action in other ways is in test_wrapper_contract.py and test_stateful.py, a step before the first reset in
+test_stateful.py, the answers of solvers in tests/control.
+"""
+
+import copy
+import functools
+import pickle
+import threading
+import warnings
+from unittest import mock
+
+import clarabel
+import daqp
+import gymnasium as gym
+import numpy as np
+import pytest
+from episodes import actions, plain, trace
+from wrapper_examples import CHUNKED, EXAMPLES, EXPORTED, ONLY_LOOKING, build
+
+from safe_wrappers.errors import SafeWrappersError
+
+BEFORE, LONG = 7, 25
+"""Steps before the fault, and of an episode."""
+OURS = (SafeWrappersError, gym.error.ResetNeeded)
+PASSING = (*ONLY_LOOKING, "LeaseExpiry", "TeleopChannel")
+"""They judge no action: what is finite goes on as it is."""
+FLAGS = (
+    "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/clipped", "cbf/intervened",
+    "handover/refused", "handover/starved", "handover/limited", "handover/clipped", "lease/refused", "lease/braking",
+    "lease/expired", "lease/clipped", "teleop/revoked", "teleop/lost", "teleop/clipped", "contact/partial",
+    "balance/partial", "occlusion/expired",
+)  # fmt: skip
+LESS_KNOWN = {"lease/remaining_s": -1, "teleop/round_trip_s": 1, "handover/latency": -1, "cbf/correction": 1}
+"""Figures that say that something is not as usual, and in which direction."""
+GATES = {}
+"""By the id of a `Bottom`: events that a step is inside, and that it may go on. A copy has none."""
+
+
+class BrokenError(RuntimeError):
+    """What breaks raises it."""
+
+
+class Bottom(gym.Wrapper):
+    """The env itself: keeps what reached it, and breaks, blocks or leaves a wrong state when it is told to."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.given, self.breaks, self.leaves = [], "", None
+
+    def step(self, action):
+        if gate := GATES.pop(id(self), None):
+            gate[0].set()
+            gate[1].wait(20.0)
+        if self.breaks == "step":
+            raise BrokenError("the env broke in step")
+        self.given.append(np.array(action))
+        observation, *rest = self.env.step(action)
+        if self.leaves is not None:
+            self.unwrapped.data.qpos[0] = self.unwrapped.data.qvel[0] = self.leaves
+            observation, self.leaves = filled(observation, self.leaves), None
+        return observation, *rest
+
+    def reset(self, **options):
+        if self.breaks == "reset":
+            raise BrokenError("the env broke in reset")
+        return self.env.reset(**options)
+
+
+def filled(observation, value):
+    if isinstance(observation, dict):
+        return {key: filled(one, value) for key, one in observation.items()}
+    return np.full_like(observation, value)
+
+
+class Session:
+    """A wrapper of the contract around a `Bottom`."""
+
+    def __init__(self, name):
+        self.name, found = name, []
+
+        def around(env):
+            found.append(Bottom(env))
+            return found[-1]
+
+        with warnings.catch_warnings(action="ignore"):
+            self.env = build(name, next(iter(EXAMPLES[name])), around)
+        (self.bottom,) = found
+        self.actions = actions(self.env, LONG)
+
+    def begin(self, steps=BEFORE):
+        with warnings.catch_warnings(action="ignore"):
+            self.env.reset(seed=0)
+            for action in self.actions[:steps]:
+                self.env.step(action)
+        return self
+
+    def step(self, action, env=None):
+        """What a step returns, or raises, what is warned of, and what reaches the env."""
+        before, returned, error = len(self.bottom.given), None, None
+        with warnings.catch_warnings(record=True, action="always") as warned:
+            try:
+                returned = (env or self.env).step(action)
+            except Exception as raised:
+                error = raised
+        said = [str(one.message) for one in warned]
+        return returned, error, said, self.bottom.given[before:]
+
+    def episode(self, env=None):
+        with warnings.catch_warnings(action="ignore"):
+            return trace(env or self.env, steps=LONG)
+
+
+@functools.cache
+def undisturbed(name):
+    """An episode, and the first step that a fault would hit, of a session without one."""
+    session = Session(name)
+    return session.episode(), session.begin().step(session.actions[BEFORE])
+
+
+@pytest.fixture(scope="module", params=EXPORTED)
+def session(request):
+    made = Session(request.param)
+    yield made
+    made.env.close()
+
+
+@pytest.fixture(autouse=True)
+def as_if_nothing_had_been(session):
+    """Each test leaves a session whose next episode is the first one's."""
+    session.begin()
+    yield
+    session.bottom.breaks, session.bottom.leaves = "", None
+    assert session.episode() == undisturbed(session.name)[0]
+
+
+def check(session, answer, allowed=()):
+    """That a fault was refused, flagged, harmless or an error that is allowed."""
+    returned, error, said, reached = answer
+    usual = undisturbed(session.name)[1]
+    _, usual_said, usual_reached = usual[1:]
+    space = session.bottom.action_space
+    for given in reached:
+        assert given.dtype.kind in "fiu" and np.isfinite(given).all()
+        assert session.name in PASSING or space.contains(given.astype(space.dtype))
+    if error is not None:
+        assert isinstance(error, allowed) or (isinstance(error, OURS) and not reached), repr(error)
+        return
+    if plain(returned) == plain(usual[0]):
+        return
+    info, expected = returned[4], usual[0][4]
+    flagged = any(np.any(info.get(key, False)) and not np.any(expected.get(key, False)) for key in FLAGS)
+    flagged |= any(
+        np.any(sign * (np.asarray(info[key]) - np.asarray(expected[key])) > 0.0)
+        for key, sign in LESS_KNOWN.items()
+        if key in info and key in expected
+    )
+    flagged |= any(text not in usual_said for text in said)
+    passed = session.name in PASSING and len(reached) == len(usual_reached)
+    assert flagged or passed, "something else happened than without the fault, and nothing says so"
+
+
+def wrong(space, value):
+    return np.full(space.shape, value, np.float64)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30], ids=str)
+def test_a_wrong_action(session, value):
+    space = session.env.action_space
+    check(session, session.step(wrong(space, value) if space.shape else value))
+
+
+@pytest.mark.parametrize("shape", [(0,), (1, 7), (50,)], ids=str)
+def test_an_action_of_a_wrong_shape(session, shape):
+    returned, error, _, reached = session.step(np.zeros(shape))
+    assert returned is None and error is not None
+    # A wrapper that judges no action leaves it to the env.
+    assert session.name in ONLY_LOOKING or (isinstance(error, OURS) and not reached)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_state_that_is_no_number(session, value):
+    """A step ends in it and returns it: then, or at the next step, it is said, unless nothing reads the state."""
+    session.bottom.leaves = value
+    returned, error, _, reached = session.step(session.actions[BEFORE])
+    if error is not None:
+        assert isinstance(error, (*OURS, ValueError)), repr(error)
+        return
+    second = session.step(session.actions[BEFORE + 1])
+    assert all(np.isfinite(given).all() for given in (*reached, *second[3]))
+    told = [flag for flag in FLAGS if flag != "cbf/intervened"]
+    said = any(
+        np.any(info.get(flag, False)) for info in (returned[4], (second[0] or returned)[4]) for flag in told
+    )
+    assert said or isinstance(second[1], OURS) or session.name in (*ONLY_LOOKING, *CHUNKED, "TeleopChannel")
+
+
+@pytest.mark.parametrize("kind", ["raises", "has no answer"])
+def test_a_solver_that_fails(session, kind):
+    def failing(*arguments, **options):
+        if kind == "raises":
+            raise BrokenError("the solver broke")
+        hessian, _, _, upper = arguments[:4]
+        return (
+            np.full(len(hessian), np.nan),
+            np.nan,
+            -1,
+            {"lam": np.full(len(upper), np.nan), "iterations": 0},
+        )
+
+    with (
+        mock.patch.object(daqp, "solve", failing),
+        mock.patch.object(clarabel, "DefaultSolver", mock.Mock(side_effect=BrokenError("broken, too"))),
+    ):
+        answer = session.step(session.actions[BEFORE])
+    check(session, answer, allowed=(BrokenError,))
+    assert answer[1] is None or not answer[3], "no step is made where the filter has no answer"
+
+
+def test_a_plant_that_raises(session):
+    layer, found = session.env, None
+    while found is None and layer is not session.bottom:
+        found, layer = vars(layer).get("plant"), layer.env
+    if found is None:
+        pytest.skip("it has no plant")
+    with mock.patch.object(type(found), "observe", mock.Mock(side_effect=BrokenError("no state"))):
+        _, error, _, reached = session.step(session.actions[BEFORE])
+    assert isinstance(error, BrokenError) and (not reached or session.name == "FilterObservation")
+
+
+@pytest.mark.parametrize("where", ["step", "reset"])
+def test_an_env_that_raises(session, where):
+    session.bottom.breaks = where
+    with pytest.raises(BrokenError), warnings.catch_warnings(action="ignore"):
+        session.env.reset(seed=1) if where == "reset" else session.env.step(session.actions[BEFORE])
+
+
+@pytest.mark.parametrize("by_s", [-100.0, 100.0])
+def test_a_clock_that_is_set(session, by_s):
+    """Of the simulation, and of who stamps commands."""
+    if hasattr(session.env, "set_observation_time"):
+        session.env.set_observation_time(session.env.now_s + by_s)
+    session.bottom.unwrapped.data.time += by_s
+    check(session, session.step(session.actions[BEFORE]), allowed=OURS)
+
+
+@pytest.mark.parametrize("call", ["step", "reset"])
+def test_a_second_thread_is_refused(session, call):
+    gate = GATES[id(session.bottom)] = threading.Event(), threading.Event()
+    first = threading.Thread(target=session.step, args=(session.actions[BEFORE],))
+    first.start()
+    try:
+        assert gate[0].wait(20.0)
+        with pytest.raises(SafeWrappersError, match="thread"):
+            session.env.reset(seed=0) if call == "reset" else session.env.step(session.actions[BEFORE])
+    finally:
+        gate[1].set()
+        first.join(20.0)
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_or_refuses_and_has_the_same_episodes(session, again):
+    copied = again(session.env)
+    for action in session.actions[BEFORE : BEFORE + 3]:
+        returned, error, _, _ = session.step(action, copied)
+        expected = session.step(action)[0]
+        assert isinstance(error, OURS) or plain(returned) == plain(expected)
+    assert session.episode(copied) == undisturbed(session.name)[0]
