@@ -34,7 +34,7 @@ from benchmarks.drivers import Maker
 from benchmarks.mujoco_drivers import corner_seeking
 from benchmarks.searching_drivers import SEARCHES, SearchingDriver
 from benchmarks.tables import keep, measured, options
-from benchmarks.trained_adversary import EXAMPLES, FLAGS, Tally
+from benchmarks.trained_adversary import FLAGS, Tally
 from safe_wrappers.errors import UnsafeStateWarning
 
 ENVS = (
@@ -127,7 +127,9 @@ def attack(chunk: Chunk) -> dict[str, Any]:
             info = {key: infos[key][i] for key in ("cost_substep",) if key in infos}
             missed = judges[i].after(infos["executed_action"][i] if chunk.filtered else actions[i], info)
             if not missed <= 0.0:  # so that what is not a number counts
-                _count_violation(tally, chunk, infos, i, missed)
+                tally.violations += 1
+                flags = [name for name in FLAGS if chunk.filtered and infos[f"cbf/{name}"][i]]
+                tally.unflagged += not {*flags} - {"intervened"}
         if chunk.filtered and judged:
             for name in FLAGS:
                 setattr(tally, name, getattr(tally, name) + int(infos[f"cbf/{name}"][judged].sum()))
@@ -157,16 +159,6 @@ def attacked(chunk: Chunk) -> tuple[Any, list[Any]]:
         return envs, [SearchingDriver(env, rng, search) for env, rng in zip(envs.envs, rngs, strict=True)]
     make = hand_written(chunk.env)[chunk.driver]
     return envs, [make(env.unwrapped, rng) for env, rng in zip(envs.unwrapped.envs, rngs, strict=True)]
-
-
-def _count_violation(tally: Tally, chunk: Chunk, infos: dict[str, Any], i: int, missed: float) -> None:
-    flags = [name for name in FLAGS if chunk.filtered and infos[f"cbf/{name}"][i]]
-    tally.violations += 1
-    tally.unflagged += not {*flags} - {"intervened"}
-    if chunk.filtered and len(tally.examples) < EXAMPLES:
-        # The chunk makes it again, in its env of this number, when it has made so many steps.
-        found = {"seed": chunk.seed, "of": i, "after": tally.steps, "missed": missed, "flags": flags}
-        tally.examples.append(found | {"executed": infos["executed_action"][i].tolist()})
 
 
 def learn(chunk: Chunk) -> dict[str, Any]:

@@ -4,8 +4,8 @@
 
 The policies are those of `configs/policies`, deterministic, each as it was trained. The film shows the first seconds
 of the episodes with seeds 0, 1 and 2, each from the same reset on both sides. Whole episodes of the first hundred
-seeds are counted beside it, and the README's caption is made of the counts. Colours, rings and trails are the
-renderer's alone; the physics is the env's.
+seeds are counted beside it, for the README's caption. Colours, rings and trails are the renderer's alone; the
+physics is the env's.
 """
 
 import io
@@ -231,22 +231,6 @@ def whole_episodes() -> dict[str, Any]:
     return found
 
 
-def caption(counts: dict[str, Any]) -> str:
-    """What the README says below the picture."""
-    free, safe = counts["unfiltered"], counts["filtered"]
-    returned = {name: count["reward"] / count["episodes"] for name, count in counts.items()}
-    hurt = f"in a hazard in {safe['violations']:,}" if safe["violations"] else "never in a hazard"
-    return (
-        f"Two {free['algorithm']} agents on the same maps, each trained for {free['trained_for']:,} control steps:"
-        f" left without a filter, right through `sw.protect`. The first {SECONDS:.0f} s of the episodes with seeds"
-        " 0, 1 and 2, at double speed. An amber ring marks an action that the filter changed. Over whole episodes of"
-        f" seeds 0 to {free['episodes'] - 1} the left one returns {returned['unfiltered']:.1f} and is in a hazard in"
-        f" {free['violations']:,} of {free['steps']:,} steps; the right one returns {returned['filtered']:.1f}"
-        f" ({100 * returned['filtered'] / returned['unfiltered']:.0f} %) and is {hurt};"
-        f" {100 * safe['changed'] / safe['steps']:.0f} % of its actions are changed"
-    )
-
-
 def main() -> None:
     """Film, count."""
     options(__doc__)
@@ -256,4 +240,3 @@ def main() -> None:
     COUNTS.write_text(json.dumps(counts, indent=1) + "\n")
     print(f"{FILM}: {len(frames)} frames, {FILM.stat().st_size / 1e6:.2f} MB")
     print(json.dumps(counts, indent=1))
-    print(caption(counts))

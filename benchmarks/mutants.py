@@ -68,7 +68,7 @@ _MATTER = {
     " SafeActionSearch._nearby not; SafeActionSearch._search not; SafeActionSearch.relinearize not",
     "filter/linearize.py": "Tangents._corrected not",
     "control/numerics/projection.py": "_judge comparison; project_unchecked not",
-    "constraints/rollout.py": "BoundRollout.executed not; BoundRollout._back_inside min/max; BoundRollout.rows not;"
+    "constraints/rollout.py": "BoundRollout._back_inside min/max; BoundRollout.rows not;"
     " BoundSlacks.slack min/max",
     "constraints/backup/base.py": "BoundDetourClearance.executed arithmetic; BoundDetourClearance._kept_side not",
     "control/backup/drive_among_discs.py": "admits not; backup_drive not; look min/max; _to_disc not",

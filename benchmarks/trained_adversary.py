@@ -12,7 +12,7 @@ began unsafe.
 """
 
 import warnings
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,7 +41,6 @@ EPISODES: Final = 20
 _FIRST_SEED: Final = 1_000_000
 """Of the evaluation: no training episode has it."""
 FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
-EXAMPLES: Final = 20
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,6 @@ class Tally:
     fallback: int = 0
     unsafe: int = 0
     smallest: float | None = None
-    examples: list[dict[str, Any]] = field(default_factory=list)
-    """States and actions of the first unflagged violations, to make them again."""
 
     def plus(self, other: "Tally") -> "Tally":
         """Both together."""
@@ -75,8 +72,7 @@ class Tally:
             name: getattr(self, name) + getattr(other, name)
             for name in ("steps", "violations", "unflagged", *FLAGS)
         }
-        examples = (self.examples + other.examples)[:EXAMPLES]
-        return Tally(**sums, smallest=min(least, default=None), examples=examples)
+        return Tally(**sums, smallest=min(least, default=None))
 
 
 class Adversary(gym.Wrapper[Any, Any, Any, Any]):
@@ -101,8 +97,6 @@ class Adversary(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Steps, judges, counts and pays."""
         self._judge.before()
-        raw: Any = self.unwrapped
-        before = raw.data.qpos.tolist(), raw.data.qvel.tolist()
         observation, _, terminated, truncated, info = self.env.step(action)
         executed = np.asarray(info["executed_action"] if self._filtered else action)
         missed = self._judge.after(executed, info)
@@ -117,12 +111,8 @@ class Adversary(gym.Wrapper[Any, Any, Any, Any]):
             margin = float(info["cbf/margin"])
             tally.smallest = margin if tally.smallest is None else min(tally.smallest, margin)
             reward += NEARNESS * nearness(margin, self._scale)
-            if violated and not (info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]):
-                tally.unflagged += 1
-                if len(tally.examples) < EXAMPLES:
-                    names = {"qpos": before[0], "qvel": before[1], "missed": missed, "margin": margin}
-                    actions = {"proposed": np.asarray(action).tolist(), "executed": executed.tolist()}
-                    tally.examples.append(names | actions | {"stage": int(info["cbf/stage"])})
+            flagged = info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]
+            tally.unflagged += int(violated and not flagged)
         return observation, reward, terminated, truncated, info
 
 

@@ -3,7 +3,7 @@
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
@@ -32,7 +32,7 @@ class FieldEnv(MujocoEnv, EzPickle):
         "render_fps": 50,
     }
 
-    goal_radius: float
+    goal_radius: ClassVar[float]
     """Distance from the goal's centre at which it counts as reached, m."""
     _given: Given = {}  # noqa: RUF012 (never changed)
     _targets: Array
@@ -95,7 +95,7 @@ class FieldEnv(MujocoEnv, EzPickle):
         """
         control = finite_action(action, self.model.nu)
         before = self._goal_distance()
-        self._step_mujoco_simulation(control, self.frame_skip)
+        self._step_mujoco_simulation(control, self.frame_skip)  # type: ignore[no-untyped-call]
         distance = self._goal_distance()
         reward = before - distance
         self._goal_met = distance <= self.goal_radius

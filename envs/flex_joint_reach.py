@@ -97,19 +97,6 @@ class FlexibleArm:
             joint_damping=model.dof_damping[SPRINGS].copy(),
         )
 
-    def link_inertia(self, q: Array) -> Array:
-        """M at link angles, shape (..., 2); shape (..., 2, 2), kg m^2."""
-        cos = self.coupling * np.cos(q[..., 1])
-        side = self.forearm + cos
-        rows = [self.inertia + 2.0 * cos, side, side, np.full_like(side, self.forearm)]
-        return np.stack(rows, axis=-1).reshape(*side.shape, 2, 2)
-
-    def link_bias(self, q: Array, q_dot: Array) -> Array:
-        """Coriolis and centripetal torque C(q, q_dot) q_dot, shape (..., 2), N m; the arm is level."""
-        sin = self.coupling * np.sin(q[..., 1])
-        v0, v1 = q_dot[..., 0], q_dot[..., 1]
-        return np.stack([-sin * v1 * (2.0 * v0 + v1), sin * v0 * v0], axis=-1)
-
     def fingertip(self, q: Array) -> Array:
         """Position of the fingertip at link angles, shape (..., 2), in the plane; shape (..., 2), m."""
         first, both = q[..., 0], q[..., 0] + q[..., 1]

@@ -84,7 +84,7 @@ class SafeGoalEnv(FieldEnv):
     """
 
     hazard_radius: Final = HAZARD_RADIUS
-    goal_radius: Final = GOAL_RADIUS
+    goal_radius = GOAL_RADIUS
     vase_half_size: Final = VASE_HALF_SIZE
 
     def __init__(self, robot: Robot, level: int, **kwargs: Any) -> None:
@@ -165,8 +165,8 @@ class SafeGoalEnv(FieldEnv):
         Raises:
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
         """
-        observation, reward, *rest = super().step(action)
-        return observation, max(-_REWARD_LIMIT, min(_REWARD_LIMIT, reward)), *rest
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, max(-_REWARD_LIMIT, min(_REWARD_LIMIT, reward)), terminated, truncated, info
 
     def _next_goal(self) -> Array:
         return sample_goal(

@@ -97,7 +97,7 @@ class OccludedCrossingEnv(FieldEnv):
     robot_radius: Final = ROBOT_RADIUS
     car_radius: Final = CAR_RADIUS
     pillar_radius: Final = PILLAR_RADIUS
-    goal_radius: Final = CROSSING_GOAL_RADIUS
+    goal_radius = CROSSING_GOAL_RADIUS
     car_bodies: Final = CAR_BODIES
     lane_centres: Final = LANE_CENTRES
 

@@ -1,7 +1,6 @@
 """PointMaze with patrols: discs that go up and down its corridors, hidden by its walls."""
 
 import math
-from collections.abc import Sequence
 from typing import Any, Final
 
 import mujoco
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
-from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
 from .markers import MarkingRenderer
@@ -41,7 +39,6 @@ _CONTACT: Final = BALL_RADIUS + PATROL_RADIUS
 _HEIGHT: Final = 0.1  # m: half of a patrol's, drawn about the ball's own height
 _COLOUR: Final = (1.0, 0.5, 0.0, 1.0)
 _CAMERA: Final = {"elevation": -75.0}  # from lower the walls would hide the patrols
-_SHORTEST: Final = 2.0  # m: on a shorter way the ball may leave no place to start at
 _TRIES: Final = 1000
 U_MAZE_PATROLS: Final = (((1, 1), (1, 3)), ((3, 1), (3, 3)))
 """The two long corridors of the U maze, each from its first cell to its last (row, column)."""
@@ -50,14 +47,14 @@ U_MAZE_PATROLS: Final = (((1, 1), (1, 3)), ((3, 1), (3, 3)))
 class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     """gymnasium-robotics' PointMaze with discs that patrol; the ball's physics, observations and rewards stay.
 
-    Each patrol (radius 0.15 m) goes up and down between the centres of two cells of one row or column, always on the
-    straight line between them. Its speed wanders about 0.5 m/s by the law of the crossing's cars (standard deviation
-    0.15 m/s, time constant 2 s; `safe_wrappers.envs.traffic`), drawn without a discretisation error; at an end it
-    turns about, as a ball off a wall. Patrols are no bodies of the model: they pass through the ball, and walls hide
-    them from whoever looks along the floor. The observation has nothing of them. Frames show them in orange, which
-    the renderer adds (`safe_wrappers.envs.markers`).
+    Two patrols (radius 0.15 m) go up and down the two long corridors of the U maze, on the straight line between the
+    centres of their first and last cells. Their speeds wander about 0.5 m/s by the law of the crossing's cars
+    (standard deviation 0.15 m/s, time constant 2 s; `safe_wrappers.envs.traffic`), drawn without a discretisation
+    error; at an end they turn about, as a ball off a wall. Patrols are no bodies of the model: they pass through the
+    ball, and walls hide them from whoever looks along the floor. The observation has nothing of them. Frames show
+    them in orange, which the renderer adds (`safe_wrappers.envs.markers`).
 
-    **Attributes**: `patrol_positions` and `patrol_velocities`, shape (k, 2), m and m/s; `patrol_tracks` (a
+    **Attributes**: `patrol_positions` and `patrol_velocities`, shape (2, 2), m and m/s; `patrol_tracks` (a
     `control.estimation.tracks.Tracks`): the same as tracks that are known exactly now. `agent_position`,
     `agent_velocity`.
 
@@ -68,13 +65,7 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     starts at least 0.3 m off the ball.
 
     Args:
-        maze_map: As PointMaze's.
-        patrols: A way each: its first and its last cell, (row, column) both, at least 2 m apart, in one row or
-            column, with no wall between. None: the two long corridors of the U maze.
         kwargs: Passed to PointMaze (``reward_type``, ``continuing_task``, ``reset_target``, ``render_mode``, ...).
-
-    Raises:
-        ConfigurationError: A way that is none; a map of one's own without ways.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers
@@ -87,38 +78,27 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     ball_radius: Final = BALL_RADIUS
     patrol_radius: Final = PATROL_RADIUS
 
-    def __init__(
-        self,
-        maze_map: Sequence[Sequence[int | str]] = U_MAZE,
-        patrols: Sequence[Sequence[Sequence[int]]] | None = None,
-        **kwargs: Any,
-    ) -> None:
-        if patrols is None:
-            if [list(row) for row in maze_map] != U_MAZE:
-                raise ConfigurationError(
-                    "name the patrols' ways on a map of your own: patrols=[[[row, column], [row, column]], ...]"
-                )
-            patrols = U_MAZE_PATROLS
-        super().__init__(maze_map=[list(row) for row in maze_map], **kwargs)
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(maze_map=[list(row) for row in U_MAZE], **kwargs)
         self._ezpickle_args = ()
-        self._ezpickle_kwargs = {"maze_map": maze_map, "patrols": patrols, **kwargs}
-        ways = [self._way(way) for way in patrols]
-        if not ways:
-            raise ConfigurationError("patrols is a list with at least one way, got none")
-        self._starts = np.array([start for start, _ in ways])
-        offsets = np.array([end for _, end in ways]) - self._starts
+        self._ezpickle_kwargs = kwargs
+        ends = [[self.maze.cell_rowcol_to_xy(np.array(cell)) for cell in way] for way in U_MAZE_PATROLS]
+        self._starts, offsets = np.array(ends, dtype=np.float64)[:, 0], np.diff(ends, axis=1)[:, 0]
         self._lengths = np.hypot(*offsets.T)
         self._directions = offsets / self._lengths[:, None]
-        self._traffic = Traffic(np.full(len(ways), PATROL_MEAN_SPEED), self.dt, 1)
+        self._traffic = Traffic(np.full(len(U_MAZE_PATROLS), PATROL_MEAN_SPEED), self.dt, 1)
         # Where each would be on a way without turns, and its speed along it.
-        self._gone, self._speeds = np.zeros(len(ways)), np.full(len(ways), PATROL_MEAN_SPEED)
+        self._gone, self._speeds = (
+            np.zeros(len(U_MAZE_PATROLS)),
+            np.full(len(U_MAZE_PATROLS), PATROL_MEAN_SPEED),
+        )
         self._patrols_random = np.random.default_rng(0)  # until the first reset
         motions = [
             Motion(PATROL_ACCELERATION_NOISE * np.outer(along, along), PATROL_REVERSION_S, np.zeros(2))
             for along in self._directions
         ]
         self._tracks = Tracks(motions)
-        self._touching = np.zeros(len(ways), dtype=bool)
+        self._touching = np.zeros(len(U_MAZE_PATROLS), dtype=bool)
         renderer = self.point_env.mujoco_renderer
         renderer.default_cam_config = {**renderer.default_cam_config, **_CAMERA}
         self.point_env.mujoco_renderer = MarkingRenderer(renderer, self._markers)
@@ -131,35 +111,6 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
             {"type": kind, "size": size, "pos": np.array([x, y, 0.0]), "rgba": np.array(_COLOUR)}
             for x, y in self.patrol_positions
         ]
-
-    def _way(self, given: Sequence[Sequence[int]]) -> tuple[Array, Array]:
-        """The ends of a way, m."""
-        cells = np.asarray(given)
-        grid = self.maze.maze_map
-        rows, columns = len(grid), len(grid[0])
-        if (
-            cells.shape != (2, 2)
-            or not np.issubdtype(cells.dtype, np.integer)
-            or (cells < 0).any()
-            or (cells >= (rows, columns)).any()
-            or (cells[0] != cells[1]).sum() != 1
-        ):
-            raise ConfigurationError(
-                f"a patrol's way is two cells (row, column) of one row or column of a map of {rows} x {columns}, "
-                f"got {given!r}"
-            )
-        count = int(np.abs(cells[1] - cells[0]).max())
-        step = np.sign(cells[1] - cells[0])
-        for k in range(count + 1):
-            row, column = (int(i) for i in cells[0] + k * step)
-            if grid[row][column] == 1:
-                raise ConfigurationError(f"there is a wall in cell {[row, column]}, on the way {given!r}")
-        start, end = (np.array(self.maze.cell_rowcol_to_xy(cell), dtype=np.float64) for cell in cells)
-        if math.dist(start, end) < _SHORTEST:
-            raise ConfigurationError(
-                f"a patrol's way is at least {_SHORTEST:g} m long, {given!r} is {math.dist(start, end):g} m"
-            )
-        return start, end
 
     # What a constraint, a sensor or a judge may read ---------------------------------------------------------
 

@@ -103,7 +103,7 @@ class SafeRoverEnv(FieldEnv):
     metadata: dict[str, Any] = {**FieldEnv.metadata, "render_fps": 100}  # noqa: RUF012 (Gymnasium's)
 
     hazard_radius: Final = ROVER_HAZARD_RADIUS
-    goal_radius: Final = ROVER_GOAL_RADIUS
+    goal_radius = ROVER_GOAL_RADIUS
     wheels: Final = WHEELS
 
     def __init__(self, **kwargs: Any) -> None:

@@ -15,7 +15,6 @@ settings.load_profile("reproducible")
 
 BEGIN = (
     # Each worker compiles other parts of the package first and finds those of the other one compiled.
-    "test_active_set",
     "test_drive_among_discs",
     "test_point_decision",
     "test_support_distances",

@@ -46,3 +46,18 @@ def _modes(stiffness: Array, rotor_inertia: Array, link_inertia: Array) -> tuple
     both = link_inertia + np.diag(rotor_inertia)
     carried = np.linalg.solve(both, link_inertia).swapaxes(-1, -2)  # W^-1 J^-1 = M (M + J)^-1
     return np.sqrt(squares), np.asarray(shapes.swapaxes(-1, -2) @ (carried / root[:, None]))
+
+
+def inertia_of(arm, q):
+    """M of the env's arm at link angles, shape (..., 2); shape (..., 2, 2), kg m^2."""
+    cos = arm.coupling * np.cos(q[..., 1])
+    side = arm.forearm + cos
+    rows = [arm.inertia + 2.0 * cos, side, side, np.full_like(side, arm.forearm)]
+    return np.stack(rows, axis=-1).reshape(*side.shape, 2, 2)
+
+
+def bias_of(arm, q, q_dot):
+    """Coriolis and centripetal torque C(q, q_dot) q_dot, shape (..., 2), N m; the arm is level."""
+    sin = arm.coupling * np.sin(q[..., 1])
+    v0, v1 = q_dot[..., 0], q_dot[..., 1]
+    return np.stack([-sin * v1 * (2.0 * v0 + v1), sin * v0 * v0], axis=-1)

@@ -96,7 +96,7 @@ def test_the_wheel_has_every_module_and_asset_of_the_repository(wheel):
         ("train", "safe_wrappers/train"),
     ):
         for path in (ROOT / folder).rglob("*"):
-            if path.suffix in (".py", ".xml") or path.name == "py.typed":
+            if path.suffix in (".py", ".xml", ".html") or path.name == "py.typed":
                 assert f"{inside}/{path.relative_to(ROOT / folder).as_posix()}" in names, path
     assert sum(n.startswith("safe_wrappers/envs/assets/") and n.endswith(".xml") for n in names) >= 5
 
@@ -121,7 +121,6 @@ def test_metadata(wheel):
         "mujoco",
         "numba",
         "pillow",
-        "qpsolvers",
         "daqp",
         "clarabel",
         "ruckig",
@@ -182,17 +181,6 @@ def test_the_blocks_of_the_package_page_run(wheel, python, tmp_path):
     assert done.stdout.split() == ["True"] * len(blocks), done.stderr
 
 
-def test_links_of_the_package_page_lead_to_files_of_the_repository(wheel):
-    links = re.findall(r"\]\(([^)#]+)", metadata_of(wheel).get_payload())
-    ours = [link.removeprefix(f"{HOME}/") for link in links if link.startswith(HOME)]
-    assert len(ours) > 20
-    for link in links:
-        assert link.startswith("https://"), link
-    for kind, branch, path in (link.split("/", 2) for link in ours):
-        assert (ROOT / path).exists() and branch == "main", path
-        assert kind == ("raw" if path.endswith(".webp") else "blob"), path
-
-
 def test_addresses_and_versions_agree():
     yaml = pytest.importorskip("yaml")  # of the training scripts
     assert all(url.startswith(HOME) for url in PROJECT["urls"].values())
@@ -204,17 +192,6 @@ def test_addresses_and_versions_agree():
     assert [f"Programming Language :: Python :: {one}" for one in pythons] == [
         one for one in PROJECT["classifiers"] if " :: 3." in one
     ]
-
-
-def test_what_contributing_names_is_there():
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    targets = set(" ".join(re.findall(r"^([a-z -]+):", makefile, re.MULTILINE)).split())
-    assert set(re.findall(r"`make ([a-z-]+)`", text)) <= targets
-    for path in re.findall(
-        r"\]\(([\w./-]+)\)|`((?:\w+/)+(?:[\w.]+)?|[\w/.]+\.(?:py|toml|cff|yml|md))`", text
-    ):
-        assert (ROOT / "".join(path)).exists(), path
 
 
 def test_what_needs_stable_baselines_says_so(python, tmp_path):

@@ -138,15 +138,6 @@ def test_what_a_fetch_arm_keeps_can_be_chosen():
     assert only.keep_out == [ball]
 
 
-def test_a_car_keeps_clear_of_vases_with_its_outline_where_they_cost():
-    for level, attributes in ((1, []), (2, ["vase_positions"])):
-        [clearance] = sw.protect(gym.make(f"SafeCarGoal{level}-v0")).constraints
-        assert [o.attribute for o in clearance.keep_out] == ["hazard_positions"]
-        assert [o.attribute for o in clearance.untouched] == attributes
-        assert clearance.detour
-    assert not sw.protect(gym.make("SafeCarGoal1-v0"), detour=False).constraints[0].detour
-
-
 def test_the_cars_outline_encloses_every_geom():
     from safe_wrappers.control.numerics.shapes import distance_to_outline
 
@@ -357,14 +348,6 @@ def test_an_asynchronous_vector_env_is_told_how_to_protect_each_env():
     protected.close()
 
 
-def test_a_vector_env_of_discrete_actions_is_told_to_protect_each_env():
-    vector = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
-    protected = eval(refusal(vector).partition("protect each env of it: ")[2], {"gym": gym, "sw": sw})
-    protected.reset(seed=0)
-    infos = protected.step(np.array([1, 0]))[4]
-    assert infos["cbf/margin"].shape == (2,) and (infos["cbf/margin"] > 0.0).all()
-
-
 def test_a_synchronous_vector_env_gets_one_filter_for_all_and_takes_the_same_options():
     envs = sw.protect(
         gym.make_vec("SafePointGoal1-v0", 2, vectorization_mode="sync"), detour=False, margin=0.1
@@ -375,22 +358,6 @@ def test_a_synchronous_vector_env_gets_one_filter_for_all_and_takes_the_same_opt
     ids = [lambda: gym.make("SafePointGoal1-v0"), lambda: gym.make("SafePointGoal2-v0")]
     mixed = gym.vector.SyncVectorEnv(ids, observation_mode="different")
     assert "expected a vector env of one id, got ['SafePointGoal1-v0', 'SafePointGoal2-v0']" in refusal(mixed)
-
-
-def test_vector_envs_of_other_makes_are_told_too():
-    by_hand = gym.vector.AsyncVectorEnv([lambda: gym.make("Reacher-v5")] * 3)
-    code = refusal(by_hand).partition("protect each env of it: ")[2]
-    by_hand.close()
-    made = eval(code.replace("...", "'Reacher-v5'"), {"gym": gym, "sw": sw})
-    assert made.reset(seed=0)[1]["cbf/margin"].size == 3
-    made.close()
-    make_vec_env = pytest.importorskip("stable_baselines3.common.env_util").make_vec_env
-    code = refusal(make_vec_env("Reacher-v5", 2)).partition("protect each env of it: ")[2]
-    made = eval(code.replace("...", "'Reacher-v5'"), {"make_vec_env": make_vec_env, "sw": sw})
-    assert made.num_envs == 2 and all(
-        f is not None for f in made.env_method("get_wrapper_attr", "filter_calls")
-    )
-    assert "write protect(gym.make(...))" in refusal(7)
 
 
 def balancing(raw):

@@ -11,10 +11,10 @@ import contextlib
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 
@@ -109,7 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         with importable([*(config.parent for config in getattr(options, "configs", [])), Path.cwd()]):
-            _RUN.get(command, _experiment)(command, options, overrides, Console())
+            run = _report if command == "report" else _experiment if command in _OF_EXPERIMENTS else _other
+            run(command, options, overrides, Console())
     except (SafeWrappersError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -179,52 +180,36 @@ def _report(_: str, options: argparse.Namespace, overrides: list[str], console: 
         _say(console, f"Report: {path}")
 
 
-def _diagnose(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
-    from .diagnose import diagnose_command
+def _other(command: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
+    """The commands that take no experiment."""
+    match command:
+        case "diagnose":
+            from .diagnose import diagnose_command
 
-    diagnose_command(options.env, options.policy, options.steps, options.output, console, options.imports)
+            diagnose_command(
+                options.env, options.policy, options.steps, options.output, console, options.imports
+            )
+        case "enjoy":
+            from .enjoy import enjoy_command
 
+            how = options.filter, options.render, options.output
+            enjoy_command(options.run, options.episodes, *how, console, options.imports)
+        case "push":
+            from .policies import upload
 
-def _enjoy(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
-    from .enjoy import enjoy_command
+            _say(console, f"Uploaded: {', '.join(upload(options.run, options.repository))}")
+        case "list":
+            from .init import list_command
 
-    how = options.filter, options.render, options.output
-    enjoy_command(options.run, options.episodes, *how, console, options.imports)
+            list_command(options.kinds, console)
+        case "init":
+            from .init import init_command
 
+            init_command(options.config, overrides, console)
+        case "schema":
+            from .config.schema import config_schema
 
-def _push(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
-    from .policies import upload
-
-    _say(console, f"Uploaded: {', '.join(upload(options.run, options.repository))}")
-
-
-def _list(_: str, options: argparse.Namespace, __: list[str], console: Console) -> None:
-    from .init import list_command
-
-    list_command(options.kinds, console)
-
-
-def _init(_: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
-    from .init import init_command
-
-    init_command(options.config, overrides, console)
-
-
-def _schema(*_: Any) -> None:
-    from .config.schema import config_schema
-
-    print(json.dumps(config_schema(), indent=1))
-
-
-_RUN: Final[dict[str, Callable[[str, argparse.Namespace, list[str], Console], None]]] = {
-    "report": _report,
-    "diagnose": _diagnose,
-    "enjoy": _enjoy,
-    "push": _push,
-    "list": _list,
-    "init": _init,
-    "schema": _schema,
-}
+            print(json.dumps(config_schema(), indent=1))
 
 
 def _say(console: Console, text: str) -> None:

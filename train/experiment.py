@@ -16,10 +16,9 @@ from .evaluation.summary import Summary, summarize, write_summary
 from .policies import write_card
 from .processes import Job
 from .processes.parallel import run_jobs
-from .run.folder import check_finished, check_folder, is_outgrown
+from .run.folder import check_finished, check_folder, is_finished
 from .run.model import check_task, whole_rollouts
 from .run.stack import make_training_env
-from .run.start import Start
 from .run.trackers import check_trackers
 from .run.training import train_run
 from .videos.record import delete_videos, record_videos
@@ -41,7 +40,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console, on: str | N
     """
     check_training(experiment)
     for arm in experiment.arms:
-        if any(is_outgrown(arm, experiment.run_folder(arm, seed)) for seed in experiment.seeds):
+        if not all(is_finished(arm, experiment.run_folder(arm, seed)) for seed in experiment.seeds):
             delete_videos(experiment, arm)
     for arms in generations(experiment):
         run_jobs(training_jobs(experiment, arms), experiment.workers, console, "Training", on=on)
@@ -61,9 +60,8 @@ def check_training(experiment: ExperimentConfig) -> None:
         env.reset()  # the task alone knows its options, and a filter of one's own is asked here first
         check_trackers(arm)
         env.close()
-        start = _start(experiment, arm, experiment.seeds[0])
-        if start is not None and start.arm is None and not start.path.is_file():
-            raise ConfigurationError(f"arms.{arm.name}.start_from: there is no file {start.name!r}.")
+        if arm.start_from and not (experiment.begins_with(arm) or Path(arm.start_from).is_file()):
+            raise ConfigurationError(f"arms.{arm.name}.start_from: there is no file {arm.start_from!r}.")
         for seed in experiment.seeds:
             check_folder(arm, seed, experiment.run_folder(arm, seed))
 
@@ -103,14 +101,12 @@ def write_cards(experiment: ExperimentConfig) -> None:
             write_card(arm, seed, experiment.run_folder(arm, seed), experiment.evaluation_filter)
 
 
-def _start(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> Start | None:
-    """Whose policy a run begins with."""
+def _start(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> tuple[str, Path] | None:
+    """Whose policy a run begins with, and where that is."""
     if arm.start_from is None:
         return None
     source = experiment.begins_with(arm)
-    if source is None:
-        return Start(arm.start_from, Path(arm.start_from))
-    return Start(source.name, experiment.run_folder(source, seed), source)
+    return arm.start_from, Path(arm.start_from) if source is None else experiment.run_folder(source, seed)
 
 
 def generations(experiment: ExperimentConfig) -> Iterator[list[ArmConfig]]:

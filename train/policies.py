@@ -212,9 +212,8 @@ def _table(run: Path) -> str:
 
 
 def _cell(row: Mapping[str, Any], key: str) -> str:
-    if key in row:
-        return number(float(row[key]))
-    return NOT_JUDGED if key in OF_THE_JUDGE else "-"
+    missing = NOT_JUDGED if key in OF_THE_JUDGE else "-"
+    return number(float(row[key])) if key in row else missing
 
 
 def _line(value: object) -> str:

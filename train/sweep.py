@@ -16,14 +16,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import yaml
 from rich.console import Console
-from rich.table import Table
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
 from .config import ArmConfig, ExperimentConfig, SweepConfig, parse_experiment, set_value
 from .config.types import check_name
 from .evaluation.evaluate import conditions
-from .evaluation.metrics import METRICS
 from .evaluation.summary import number
 from .experiment import (
     check_training,
@@ -47,7 +45,7 @@ CONFIG_FILE: Final = "config.yaml"
 VIOLATIONS: Final = "violations_per_1000"
 """The constraint: 0 is kept."""
 _FILTERED: Final = "filter_on"
-_SHOWN: Final = 10
+RESULTS_FILE: Final = "sweep.csv"
 
 
 def sweep_experiment(
@@ -83,14 +81,17 @@ def sweep_experiment(
             console.print(f"Trial {numbers} of 0 to {space.config.trials - 1}", highlight=False)
             run_batch(space, trials, console, on)
             _write_results(study, list(space.config.parameters), folder)
-    ranking = ranked(study)
-    console.print(_table(ranking, space))
-    best, line = ranking[0], "No trial came to an evaluation without violations: none is recommended."
+    best, line = ranked(study)[0], "No trial came to an evaluation without violations: none is recommended."
     if is_kept(best):
         values = [f"{key}={best.params[key]}" for key in space.config.parameters]
         command = shlex.join(["safe-wrappers", "compare", str(config), *overrides, *values])
         line = f"Best: trial {best.number}, return {number(best.values[0])} at cost zero: {command}"
-    console.print(f"{line}\nFiles: {folder}", highlight=False, markup=False, soft_wrap=True)
+    console.print(
+        f"{line}\nFiles: {folder / RESULTS_FILE}, and a folder for each trial beside it",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
 
 
 class Space:
@@ -120,7 +121,7 @@ class Space:
         self.distributions = {key: self._checked(key, given) for key, given in self.config.parameters.items()}
 
     def trial(self, name: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], ExperimentConfig]:
-        """The experiment of a trial, as settings and checked: the ranked arm, and those that it begins with.
+        """The experiment of a trial, as settings and checked: the ranked arm, after those that it begins with.
 
         Raises:
             ConfigurationError: The values do not go together.
@@ -139,9 +140,10 @@ class Space:
             arms[arm.name] = settings["arms"][arm.name]
             arm = self.experiment.begins_with(arm)
         output = self.experiment.folder / FOLDER
+        arms = dict(reversed(arms.items()))  # those first that others begin with
         settings |= {"arms": arms, "evaluation": evaluation, "name": name, "output": str(output)}
         experiment = parse_experiment(settings)
-        if _FILTERED not in conditions(experiment.arms[0], experiment.evaluation_filter):
+        if _FILTERED not in conditions(experiment.arms[-1], experiment.evaluation_filter):
             raise ConfigurationError(
                 "trials are ranked by their return with the filter on, and there is no filter; give an arm or the"
                 " evaluation one (evaluation: {filter: protect})."
@@ -280,7 +282,7 @@ def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: st
     run(evaluation_jobs, {name: found.arms for name, (_, found) in attempts.items()}, "Evaluation of trials")
     for name, (trial, experiment) in attempts.items():
         write_cards(experiment)
-        arm = experiment.arms[0].name
+        arm = experiment.arms[-1].name
         rows = [
             row
             for row in summarize_experiment(experiment).per_seed
@@ -315,30 +317,16 @@ def ranked(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
     return sorted(study.get_trials(deepcopy=False), key=place)
 
 
-def _row(trial: optuna.trial.FrozenTrial) -> dict[str, Any]:
-    row = {"trial": trial.number, "state": trial.state.name.lower(), **trial.params}
-    if trial.state.name == "COMPLETE":
-        state = "at cost zero" if is_kept(trial) else "in violation"
-        row |= {"state": state, "return": trial.values[0], VIOLATIONS: trial.constraints[VIOLATIONS]}
-    return row
-
-
 def _write_results(study: optuna.Study, parameters: Sequence[str], folder: Path) -> None:
-    """Writes `sweep.csv`, a row per trial in their order; what was not evaluated has empty cells."""
-    rows = [_row(trial) for trial in study.get_trials(deepcopy=False)]
-    write_rows(folder / "sweep.csv", ("trial", "state", "return", VIOLATIONS, *parameters), rows)
-
-
-def _table(trials: Sequence[optuna.trial.FrozenTrial], space: Space) -> Table:
-    """The best trials."""
-    shown, columns = trials[:_SHOWN], ("trial", "state", "return", VIOLATIONS, *space.config.parameters)
-    table = Table(title=f"{space.experiment.name}: the best {len(shown)} of {len(trials)} trials")
-    for column in columns:
-        table.add_column(METRICS.get(column, column), justify="right")
-    for row in map(_row, shown):
-        values = (row.get(column, "-") for column in columns)
-        table.add_row(*(number(value) if isinstance(value, float) else str(value) for value in values))
-    return table
+    """Writes `sweep.csv`, a row per trial, the best first; what was not evaluated has empty cells."""
+    rows = []
+    for trial in ranked(study):
+        row = {"trial": trial.number, "state": trial.state.name.lower(), **trial.params}
+        if trial.state.name == "COMPLETE":
+            state = "at cost zero" if is_kept(trial) else "in violation"
+            row |= {"state": state, "return": trial.values[0], VIOLATIONS: trial.constraints[VIOLATIONS]}
+        rows.append(row)
+    write_rows(folder / RESULTS_FILE, ("trial", "state", "return", VIOLATIONS, *parameters), rows)
 
 
 def _text(value: Any) -> str:

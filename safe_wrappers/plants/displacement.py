@@ -54,6 +54,8 @@ class DisplacementRecorder(Recorder):
         data.mocap_quat[self._mocap] = data.xquat[self._gripper] + _TURN
         data.ctrl[:] = data.qpos[self._servoed] + self._servo_acts * step[3]
 
+    settles: ClassVar[bool] = True
+
     def settle(self, data: mujoco.MjData) -> None:
         """Put a blocked gripper's fingers back to zero, and update the poses."""
         if self._closed.size:

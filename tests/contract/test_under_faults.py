@@ -18,6 +18,7 @@ import daqp
 import gymnasium as gym
 import numpy as np
 import pytest
+import scipy.optimize
 from episodes import actions, plain, trace
 from wrapper_examples import CHUNKED, EXAMPLES, EXPORTED, ONLY_LOOKING, build
 
@@ -213,6 +214,7 @@ def test_a_solver_that_fails(session, kind):
 
     with (
         mock.patch.object(daqp, "solve", failing),
+        mock.patch.object(scipy.optimize, "nnls", mock.Mock(side_effect=BrokenError("broken, too"))),
         mock.patch.object(clarabel, "DefaultSolver", mock.Mock(side_effect=BrokenError("broken, too"))),
     ):
         answer = session.step(session.actions[BEFORE])

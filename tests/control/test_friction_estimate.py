@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.vehicle.friction_estimate import PEAK_SLIPS, FrictionEstimate
-from safe_wrappers.envs.ground import MAGIC_FORMULA, MagicFormula
+from safe_wrappers.envs.ground import MagicFormula
 
 
 def learn(estimate, curve, slips, noise=0.02, seed=0, travel=0.01):
@@ -58,14 +58,6 @@ def test_the_interval_covers_the_truth():
         learn(estimate, curve, rng.uniform(0.0, 1.2 * slip, 40), seed=seed)
         inside.append(abs(estimate.mean[0] - curve.peak_friction) <= 2.0 * estimate.std[0])
     assert np.mean(inside) >= 0.9
-
-
-def test_another_ground_is_noticed_at_once():
-    estimate = FrictionEstimate(1)
-    learn(estimate, MAGIC_FORMULA["dry"], np.linspace(0.02, 0.14, 80))
-    assert estimate.mean[0] == pytest.approx(1.0, abs=0.05)
-    learn(estimate, MAGIC_FORMULA["ice"], [0.12, 0.1, 0.1])
-    assert estimate.mean[0] < 0.2
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 2.0), st.floats(0.0, 1e3), st.floats(1e-3, 10.0)), max_size=40))

@@ -11,7 +11,6 @@ from safe_wrappers.control.numerics.shapes import convex_outline, distance_to_ou
 
 GRID = st.integers(-20, 20).map(lambda n: n / 100.0)  # coarse: many points on one edge, many twice
 CLOUDS = arrays(np.float64, st.tuples(st.integers(3, 15), st.just(2)), elements=GRID)
-SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
 def spread(points):
@@ -45,14 +44,6 @@ def test_distances_are_those_to_the_boundary_negative_inside(cloud, points):
     beyond = (points @ planes[:, :2].T + planes[:, 2]).max(axis=1)
     clear = np.abs(beyond) > 1e-9
     assert ((found > 0.0) == (beyond > 0.0))[clear].all()
-
-
-@pytest.mark.parametrize(
-    ("point", "distance"),
-    [((2.0, 0.5), 1.0), ((2.0, 2.0), np.sqrt(2.0)), ((0.5, 0.9), -0.1), ((1.0, 0.5), 0.0)],
-)
-def test_a_square(point, distance):
-    assert distance_to_outline(SQUARE, *point) == pytest.approx(distance)
 
 
 @pytest.mark.parametrize("points", [[[0, 0], [1, 1]], [[0, 0], [1, 1], [2, 2]], [[1, 1]] * 4])

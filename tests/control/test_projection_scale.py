@@ -84,21 +84,6 @@ def test_a_bound_that_is_far_away_lets_nothing_through(bound, rows):
     np.testing.assert_allclose(answer.control, [0.9 - 1e-6, 0.5 if rows == 2 else 0.8], rtol=0.0, atol=1e-9)
 
 
-@given(st.integers(0, 2**31), st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=2))
-def test_components_in_units_of_their_own(seed, exponents):
-    rng = np.random.default_rng(seed)
-    unit = 10.0 ** np.array(exponents)
-    normals = rng.normal(size=(3, 2))
-    offsets = normals @ rng.uniform(-0.9, 0.9, 2) + rng.normal(0.1, 0.3, 3)
-    feasible = room(normals, offsets, -np.ones(2), np.ones(2))
-    assume(abs(feasible) > 1e-5)
-    u = rng.uniform(-1.0, 1.0, 2) * unit
-    answer = project(u, normals / unit, offsets, -unit, unit)
-    assert (answer.status == "infeasible") == (feasible < 0.0)
-    if feasible > 0.0:
-        assert (normals @ (answer.control / unit) <= offsets + 1e-7).all()
-
-
 @pytest.mark.parametrize("size", [1e200, math.nan])
 def test_a_row_that_cannot_be_checked_is_not_kept(size):
     one = np.ones(1)

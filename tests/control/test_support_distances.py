@@ -42,12 +42,6 @@ def test_a_pressed_square(shares, distance):
     assert one_by_one(np.zeros(4), CORNERS, UPRIGHT, forces) == pytest.approx([distance], abs=1e-12)
 
 
-def test_a_sideways_force_moves_the_point_by_its_height_over_the_plane_and_not_along_it():
-    # All at the corners themselves: friction has no arm.
-    pushed = UPRIGHT + np.array([0.4, -0.3, 0.0])
-    assert support_distances(np.zeros(4), CORNERS, UPRIGHT, pushed) == pytest.approx([0.1])
-
-
 @pytest.mark.parametrize(
     "change",
     [

@@ -12,7 +12,6 @@ from scipy.optimize import lsq_linear, minimize
 
 from safe_wrappers.control.contact.friction_cone import friction_pyramid
 from safe_wrappers.control.legged import whole_body
-from safe_wrappers.control.legged.support import Plane, support_rows
 from safe_wrappers.control.legged.whole_body import (
     attainable_contact_acceleration,
     rigid_forces,
@@ -251,23 +250,6 @@ def table(load_at, legs, friction=0.5):
     )  # fmt: skip
 
 
-def test_a_table_with_four_legs_stands_with_inner_forces_to_spare():
-    problem = table((0.8, 0.5), [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    for solve in SOLVERS.values():
-        found = solve(problem)
-        assert found.status == "inactive"
-        assert found.forces.sum(axis=0) == pytest.approx([0.0, 0.0, 98.1], abs=1e-5)
-        right = found.forces[[1, 2], 2].sum()
-        assert right == pytest.approx(0.8 * 98.1, abs=1e-4)
-    # A support row with an inset that the load's line misses leaves no forces at all.
-    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
-    for inset, status in ((0.15, "inactive"), (0.25, "infeasible")):
-        rows = support_rows(points, Plane(np.zeros(3), UP, np.eye(3)[:2]), inset)
-        asked = dataclasses.replace(problem, force_rows=rows, force_limits=np.zeros(len(rows)))
-        assert solve_pyramid(asked).status == status
-        assert solve_cone(asked).status == status
-
-
 @pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS)
 def test_what_no_control_does_is_infeasible_and_misses_least(solve):
     # The floor is to rise at 3 m/s^2: with motors of 5 N the mass can follow, but sink at 20 it cannot.
@@ -422,17 +404,3 @@ def test_a_backend_is_not_believed(monkeypatch, lie):
     assert found.status == "failed"
     assert np.isfinite(found.control).all() and (np.abs(found.control) <= 100.0).all()
     assert np.isfinite(found.forces).all() and np.isfinite(found.acceleration).all()
-
-
-def test_nor_is_the_elimination(monkeypatch):
-    true = whole_body.eliminate
-
-    def wrong(motion):
-        rigid, loose = true(motion)
-        return rigid._replace(offset=rigid.offset + np.array([0.5, 0.0, 0.0])), loose
-
-    problem = foot([3.0, 1.0, -2.0])
-    assert solve_pyramid(problem).status == "inactive"
-    monkeypatch.setattr(whole_body, "eliminate", wrong)
-    for solve in SOLVERS.values():
-        assert solve(problem).status == "failed"  # the contact would slide, and forces alone do not say so

@@ -9,8 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from safe_wrappers.envs.goal_robots import CAR
 
-EMPTY = {"hazards": [], "vases": []}
-
 
 def pose_of(env):
     """The car's rotation from its quaternion (scalar last in SciPy)."""
@@ -101,13 +99,3 @@ def test_hull_is_the_model_s(make_car):
         turned = (corners + model.geom_aabb[g, :3]) @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
         farthest = max(farthest, np.hypot(*(turned[:, :2] - env.agent_position).T).max())
     assert pytest.approx(farthest) == CAR.radius
-
-
-def test_a_standing_car_s_wheels_touch_the_floor(make_car):
-    env = make_car(0)
-    env.reset(seed=0)
-    for _ in range(25):
-        env.step(np.zeros(2))
-    assert np.linalg.norm(env.data.qvel[:3]) < 1e-3
-    touching = {env.model.geom(g).name for g in env.data.contact.geom.ravel()}
-    assert touching == {"floor", "left", "right", "rear"}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from recordings import check_costs
 
-from safe_wrappers.envs import EPISODE_STEPS, POINT_GOAL_IDS
+from safe_wrappers.envs import POINT_GOAL_IDS
 from safe_wrappers.errors import ConfigurationError
 
 
@@ -155,15 +155,6 @@ def test_sleeping_vases_change_nothing(make_env):
             break
     assert hits == 8
     assert asleep.vase_positions[0, 0] > 0.51
-
-
-def test_episode_is_truncated_at_its_length_and_never_terminated():
-    env = gym.make(POINT_GOAL_IDS[0])
-    env.reset(seed=0)
-    for t in range(EPISODE_STEPS):
-        _, _, terminated, truncated, _ = env.step(np.zeros(2))
-        assert not terminated
-        assert truncated == (t == EPISODE_STEPS - 1)
 
 
 def test_level_that_does_not_exist():

@@ -113,23 +113,6 @@ def test_spaces_and_timing(env):
     assert env.metadata["render_fps"] == round(1 / bare.dt)
 
 
-@pytest.mark.parametrize("mode", ["sync", "async"])
-@pytest.mark.parametrize("env_id", [POINT_GOAL_IDS[1], CAR_GOAL_IDS[2]])
-def test_vector_env_steps_and_reports(mode, env_id):
-    envs = gym.make_vec(env_id, num_envs=2, vectorization_mode=mode)
-    observations, _ = envs.reset(seed=0)
-    assert not np.array_equal(observations[0], observations[1])
-    single = gym.make(env_id)
-    single.reset(seed=0)
-    expected = single.step(np.array([1.0, 0.5]))
-    observations, rewards, _, _, infos = envs.step(np.tile([1.0, 0.5], (2, 1)))
-    np.testing.assert_allclose(observations[0], expected[0], atol=1e-12)
-    assert rewards[0] == pytest.approx(expected[1])
-    assert infos["cost"].dtype == np.float64
-    assert infos["goals_reached"].dtype.kind == "i"
-    envs.close()
-
-
 def test_registering_imports_no_physics():
     # Loaded by its file, because the package around it may import MuJoCo for its plants.
     code = (

@@ -219,15 +219,6 @@ def test_a_speed_that_is_not_a_number_costs(monkeypatch):
     assert env.step(np.zeros(6))[4]["cost"] == 1.0
 
 
-def test_a_reset_reports_no_speed_and_no_cost():
-    env = make("Swimmer")
-    env.reset(seed=0)
-    launch(env, 1.0)
-    assert env.step(np.zeros(2, dtype=np.float32))[4]["cost"] == 1.0
-    _, info = env.reset()
-    assert {key: info[key] for key in ADDED} == {"speed": 0.0, "cost": 0.0, "cost_substep": 0.0}
-
-
 # What is refused ---------------------------------------------------------------------------------------------
 
 
@@ -242,34 +233,4 @@ def test_an_unknown_robot_is_refused_with_the_options():
         make_velocity_env("Reacher")
 
 
-# What Gymnasium asks of an env -------------------------------------------------------------------------------
-
-
-def test_the_training_stack_counts_the_cost():
-    pytest.importorskip("stable_baselines3")
-    from safe_wrappers.train.config import EnvConfig, FilterConfig
-    from safe_wrappers.train.run.stack import make_stack
-
-    task = EnvConfig(VELOCITY_IDS[0], {"version": "v4", "max_episode_steps": 50})
-    stack = make_stack(task, FilterConfig())
-    stack.reset(seed=0)
-    stack.action_space.seed(0)
-    launch(stack, 6.0)
-    costs = []
-    truncated = False
-    while not truncated:
-        *_, truncated, info = stack.step(stack.action_space.sample())
-        costs.append(info["cost"])
-    assert 0 < sum(costs) < 50
-    assert info["interventions"]["violations"] == info["interventions"]["cost"] == sum(costs)
-
-
 # Frames ------------------------------------------------------------------------------------------------------
-
-
-@versions
-def test_a_list_of_frames_is_collected_without_gl(version):
-    # gymnasium.make collects frames only for an entry point that says which single frames it can make.
-    env = make("Hopper", version, render_mode="rgb_array_list")
-    assert isinstance(env, gym.wrappers.RenderCollection)
-    assert env.unwrapped.render_mode == "rgb_array"

@@ -226,18 +226,3 @@ def test_a_map_may_be_given_and_is_tried_where_that_can_be_done():
     for wrong in (3.0, (1.0,), "ab", (0.0, [1.0, 2.0, 3.0]), (np.nan, 1.0)):
         with pytest.raises(ConfigurationError, match=r"action_map is \(offset, scale\)"):
             bound(Machine(), action_map=wrong)
-
-
-@pytest.mark.parametrize(
-    "constraint",
-    [
-        sw.constraints.Stance(),
-        sw.constraints.Traction(["turn"], max_slip=0.1),
-        sw.constraints.WallClearance(),
-        sw.constraints.HeadingDriveClearance([sw.constraints.Disc([5.0, 0.0], 1.0)], body="box"),
-    ],
-    ids=lambda one: type(one).__name__,
-)
-def test_what_reads_controls_off_the_model_is_refused(constraint):
-    with pytest.raises(UnsupportedEnvError, match="needs actions that are the model's controls"):
-        sw.CBFActionFilter(Machine(), [constraint])

@@ -63,16 +63,6 @@ def test_rest_is_rest():
         assert np.linalg.norm(long.places[k:] - course.places[-1], axis=1).max(initial=0.0) < 1e-3
 
 
-@pytest.mark.parametrize("level", [1, 2])
-def test_the_machine_alone_moves_as_in_the_whole_model(level):
-    vases = [[5.0, float(i)] for i in range(1 if level == 1 else 10)]
-    env, plant, alone = car(level, vases=vases)
-    whole = Coasting(plant, "agent")
-    gather_speed(env, plant, 25)
-    first, second = (c.run(np.array([0.01, 1.0]), 12, RADIUS) for c in (alone, whole))
-    np.testing.assert_allclose(first.places, second.places, rtol=0, atol=1e-5)
-
-
 def test_the_machine_alone_takes_over_what_the_plant_has_wrong_on_purpose():
     env, plant, alone = car(1, vases=[[8.0, 8.0]])
     gather_speed(env, plant, 25)

@@ -51,24 +51,6 @@ def test_forces_are_mujocos_for_every_kind_of_contact(cone, condim):
     assert sum(env.step(np.zeros(3)) is not None and assert_same(env.model, env.data) for _ in range(20)) > 20
 
 
-def test_a_gap_inside_the_margin_without_force_is_a_contact_with_none():
-    env = DroppedBall(height=0.11)
-    env.model.geom_gap[:] = 0.05
-    env.reset()
-    if not env.data.ncon:  # before MuJoCo 3.5 the gap was counted from the margin down
-        env.model.geom_margin[:] = 0.05
-        env.reset()
-    (found,) = Contacts(env.model, ["ball"]).read(env.data)
-    assert found.force == 0.0 and found.gap == pytest.approx(0.01)
-    # Nor does it borrow the force of another one.
-    env.model.geom_condim[: env.model.geom("ball").id + 1] = 1
-    env.data.qpos[2], env.data.qpos[9] = 0.0995, 0.21
-    mujoco.mj_forward(env.model, env.data)
-    box, ball = (Contacts(env.model, [name]).read(env.data) for name in ("box", "ball"))
-    assert env.data.nefc == 1 and ball[0].force > 0.0
-    assert len(box) > 0 and all(contact.force == 0.0 for contact in box)
-
-
 def test_only_what_is_named_is_read():
     env = DroppedBall(height=0.0995)
     env.reset()

@@ -100,17 +100,6 @@ def test_after_the_held_action_a_forecast_brakes_as_steps_of_zero_do(env_id):
         assert np.array_equal(forecast.qpos[end], data.qpos) and np.array_equal(forecast.qvel[end], data.qvel)
 
 
-def test_actions_in_double_precision_are_taken_as_the_env_is_promised_them():
-    env = gym.make("FetchReach-v4")
-    plant = bound(env)
-    env.reset(seed=0)
-    plant.observe()
-    action = np.array([1.0, 1.0, -1.0, 0.0]) / 3.0
-    forecast = plant.forecast(action)
-    env.step(action)  # float64: the env keeps it
-    assert np.abs(forecast.qpos[-1] - env.unwrapped.data.qpos).max() < 1e-8
-
-
 # Other masses, delays -----------------------------------------------------------------------------------------
 
 

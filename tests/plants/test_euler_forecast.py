@@ -49,16 +49,6 @@ def test_the_look_ahead_and_a_sketch_are_euler_steps(env_id):
     assert plant.model.opt.integrator == raw.model.opt.integrator
 
 
-def test_the_first_control_interval_is_simulated_once_for_both():
-    _, plant = started("Hopper-v5")
-    control, (_, other) = 0.8 * plant.upper, started("Hopper-v5")
-    one = plant.forecast(control, 1), plant.forecast(control, 3, euler=True), plant.forecast(control, 3)
-    two = other.forecast(control, 3), other.forecast(control, 3, euler=True), other.forecast(control, 1)
-    for first, second in zip(one, (two[2], two[1], two[0]), strict=True):
-        assert first.path.tobytes() == second.path.tobytes()
-        assert first.published.tobytes() == second.published.tobytes()
-
-
 def test_poses_published_by_euler_steps_do_not_lag():
     _, plant = started("Ant-v5")
     forecast = plant.forecast(0.5 * plant.upper, 3, euler=True)

@@ -10,7 +10,6 @@ from oracles import in_cone
 from safe_wrappers.control.legged.support import centroidal_momentum
 from safe_wrappers.control.legged.whole_body import solve_cone, solve_pyramid
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
-from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.queries.floating_base import MomentumReader, contact_points, equations_of_motion
 
 ZOO = """
@@ -166,16 +165,3 @@ def test_every_answer_on_a_struggling_robot_is_inside_its_cones_whatever_its_sta
             assert ((found.control >= plant.lower) & (found.control <= plant.upper)).all()
             assert found.residuals.dynamics < 1e-9 * (1.0 + np.abs(found.acceleration).max() * size)
     assert {"solved", "infeasible"} <= seen
-
-
-def test_something_flexible_in_contact_is_refused():
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
-        <flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".1 .1 .1" pos="0 0 0.004" radius="0.01"
-        mass="0.1"><contact selfcollide="none"/></flexcomp></worldbody></mujoco>"""
-    )
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert data.ncon > 0
-    with pytest.raises(UnsupportedEnvError, match="flexible"):
-        contact_points(model, data)

@@ -172,18 +172,6 @@ def test_one_control_is_simulated_once_until_something_changes(monkeypatch):
     assert not np.array_equal(asked(u, 3)[0].qpos, heavy.qpos)
 
 
-def test_the_present_state_is_as_before_a_forecast():
-    env = make("Ant")
-    env.reset(seed=0)
-    plant = bound(env)
-    state, drift, time = plant.state.copy(), plant.acceleration[0].copy(), plant.time
-    plant.forecast(np.ones(8), 3)
-    np.testing.assert_array_equal(plant.state, state)
-    np.testing.assert_array_equal(plant.acceleration[0], drift)
-    assert plant.time == time == env.unwrapped.data.time
-    np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
-
-
 def fresh(raw):
     """Data at the env's state with everything up to date."""
     data = mujoco.MjData(raw.model)
@@ -226,37 +214,6 @@ def test_the_pose_is_that_of_the_state_where_mujocos_lags():
     assert np.abs(plant.published().xpos - truth.xpos).max() > 1e-4
 
 
-@pytest.mark.parametrize("delay_s", [0.05, 0.03, 0.12])
-def test_under_a_delay_it_starts_where_the_commands_in_flight_lead(delay_s):
-    env = make("HalfCheetah")  # a physics step of 0.01 s, a control step of 0.05 s
-    env.reset(seed=0)
-    plant = bound(env, delay_s=delay_s)
-    plant.executed(None)
-    rng = np.random.default_rng(0)
-    sent = []
-    for _ in range(8):
-        u = rng.uniform(-1.0, 1.0, 6)
-        plant.observe()
-        data = mujoco.MjData(env.unwrapped.model)
-        mujoco.mj_copyData(data, env.unwrapped.model, env.unwrapped.data)
-        for i in range(round(delay_s / 0.01)):  # each command acts from delay_s after it was sent
-            age = round(delay_s / 0.01) - i
-            command = -(-age // 5)
-            if command <= len(sent):
-                data.ctrl[:] = sent[-command]
-            mujoco.mj_step(env.unwrapped.model, data)
-        assert plant.time == pytest.approx(data.time, abs=1e-12)
-        np.testing.assert_allclose(plant.qpos, data.qpos, atol=1e-9)
-        data.ctrl[:] = u
-        for i in range(5):
-            mujoco.mj_step(env.unwrapped.model, data)
-            np.testing.assert_allclose(plant.forecast(u).qpos[i], data.qpos, atol=1e-9)
-        assert plant.published() is None  # what the env shows is older than the state
-        plant.executed(u)
-        sent.append(u)
-        env.step(u)
-
-
 # Braking ------------------------------------------------------------------------------------------------------
 
 SLIDER = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
@@ -288,27 +245,6 @@ def test_braking_halves_the_speed_of_a_driven_slide_in_every_control_step(kind, 
         # The speed that is read is one substep old, hence not exactly a half.
         assert (np.abs(speeds[1:]) < 0.62 * np.abs(speeds[:-1])).all(), speeds
         assert (speeds / speeds[0] > -0.01).all(), speeds  # nor does it turn back
-
-
-def test_braking_stays_in_the_control_range(monkeypatch):
-    given, simulate = [], Recorder.simulate
-
-    def watched(self, begin, end, *rest):
-        for hold in range(begin, end):
-            whole = simulate(self, hold, hold + 1, *rest)
-            given.append(float(self._data.ctrl[0]))
-        return whole
-
-    monkeypatch.setattr(Recorder, "simulate", watched)
-    for low, high in ((-1.0, 1.0), (0.5, 2.0), (-0.2, 0.0)):
-        env = Scene(SLIDER.format(mass=1.0, actuator=f'<motor joint="x" ctrlrange="{low} {high}"/>'))
-        plant = bound(env)
-        for speed in (30.0, -30.0):
-            env.data.qvel[0] = speed
-            plant.observe()
-            given.clear()
-            plant.forecast(np.array([high]), 3)
-            assert given == [high] + [low if speed > 0 else high] * 2
 
 
 # A simulation that breaks down --------------------------------------------------------------------------------

@@ -59,12 +59,6 @@ def test_the_point_is_found():
         assert (axis.low, axis.high, axis.clip, axis.substeps, axis.timestep) == (low, high, 4.0, 2, 0.01)
 
 
-def test_a_clamp_of_the_force_is_the_end_of_what_acts():
-    motors = MOTORS.replace('gear="10"', 'gear="10" forcerange="-0.5 0.5"')
-    axis = planar_point(bound(xml(motors=motors)), 5.0).axes[0]
-    assert (axis.low, axis.high) == (-0.5, 0.5)
-
-
 @pytest.mark.parametrize(
     ("changed", "says"),
     [

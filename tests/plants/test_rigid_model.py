@@ -4,7 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from flexible_joint import resonances
+from flexible_joint import inertia_of, resonances
 from oracles import damping_ratios
 from scenes import Scene
 
@@ -45,7 +45,7 @@ def test_the_flexible_arms_resonances_are_those_of_finite_differences_and_of_two
     frequencies, ratios = ringing_of_finite_differences(env)
     np.testing.assert_allclose(check.resonances, frequencies, rtol=1e-3)
     np.testing.assert_allclose(check.damping_ratios, ratios, rtol=0.02)
-    constants = arm.stiffness, arm.rotor_inertia, arm.link_inertia(np.array([0.4, elbow]))
+    constants = arm.stiffness, arm.rotor_inertia, inertia_of(arm, np.array([0.4, elbow]))
     np.testing.assert_allclose(check.resonances, resonances(*constants), rtol=1e-9)
     whole = damping_ratios(arm, constants[2])
     np.testing.assert_allclose(check.damping_ratios, whole, rtol=1e-3)  # to first order

@@ -40,8 +40,7 @@ def steps(count=200, **values):
         "episode_seed": 100 + 2 * np.arange(count) // count,
         "step": (np.arange(count) % (count // 2)).astype(np.int32),
         **dict.fromkeys(("intervened", "infeasible", "fallback", "violated"), none),
-        **dict.fromkeys(("correction", "cost"), np.zeros(count, np.float32)),
-        "margin": np.ones(count, np.float32),
+        "correction": np.zeros(count, np.float32),
         "proposed": np.zeros((count, 2), np.float32),
         "executed": np.zeros((count, 2), np.float32),
         "refused": np.zeros((count, 1), dtype=bool),
@@ -49,7 +48,6 @@ def steps(count=200, **values):
         "constraint_names": np.array(["Clearance"]),
         "coordinate_names": np.array(["x (m)", "y (m)", "speed (m/s)"]),
         "left_out": 0,
-        "filter_time_us": 70.0,
     }
     return StepLog(**(columns | values))
 

@@ -37,18 +37,15 @@ def test_the_filters_word_is_taken_down_step_by_step(tmp_path):
         ("proposed", keys.PROPOSED_ACTION),
         ("executed", keys.EXECUTED_ACTION),
         ("correction", keys.CBF_CORRECTION),
-        ("margin", keys.CBF_MARGIN),
     ):
         assert getattr(log, name) == pytest.approx(np.array([info[key] for info in infos])), name
     # The tighter limit refuses whatever the wider one refuses, and more.
     assert log.refused[:, 1].sum() > log.refused[:, 0].sum()
     assert (log.refused.any(axis=1) == log.intervened).all()
     assert log.step.tolist() == list(range(40))
-    assert np.isnan(log.cost).all()  # Reacher judges nothing
     assert log.coordinates.dtype == np.float32
     # The state in which the step began, not the one after it.
     assert log.coordinates[0, 4:6] == pytest.approx(env.unwrapped.init_qvel[:2], abs=0.01)
-    assert 0 < 1e-6 * log.filter_time_us < 1
     assert (tmp_path / "steps.npz").stat().st_size < 20_000
 
 
@@ -58,11 +55,8 @@ def test_without_a_filter_nothing_was_done():
     assert not (log.intervened.any() or log.infeasible.any() or log.fallback.any())
     assert (log.executed == log.proposed).all()
     assert (log.proposed == 0.5).all()
-    assert np.isnan(log.margin).all()
-    assert np.isfinite(log.cost).all()
     assert log.refused.shape == (5, 0)
     assert len(log.constraint_names) == 0
-    assert np.isnan(log.filter_time_us)
 
 
 def test_what_is_beyond_the_cap_is_counted(monkeypatch):

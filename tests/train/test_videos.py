@@ -85,15 +85,13 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             frames = Image.open(io.BytesIO(video.animation))
             log = evaluated_steps(experiment.run_folder(arm, 0), condition)
             seeds = (shown.episode_seed, shown.worst_seed)
-            for side, ((said_title, length, count), seed) in enumerate(
-                zip(video.episodes, seeds, strict=True)
-            ):
+            for side, seed in enumerate(seeds):
                 (row,) = [row for row in rows if row["episode_seed"] == seed]
                 # The film is of the very episode that was evaluated.
                 title = f"{('typical', 'worst')[side]}: episode {seed}, return {row['return']:.1f}"
                 title += f", {row['violations']:.0f} in violation"
-                assert (said_title, length) == (title, row["length"])
-                assert count == pytest.approx(row.get("intervention_rate", 0) * row["length"])
+                count = round(row.get("intervention_rate", 0) * row["length"])
+                assert f"{title}; of {row['length']:.0f} steps {count} changed." in video.said
                 changed += count
                 frames.seek(0)
                 pixels = np.asarray(frames.convert("RGB"), dtype=int)[TITLE : TITLE + HEIGHT]
@@ -113,7 +111,9 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             frames.seek(19)
             background = np.asarray(frames.convert("RGB"))[TITLE + 10, 10]
             assert background == pytest.approx([5 * 19] * 3, abs=6)
-            assert video.speed == 0.5  # 20 steps at 10 a second take 2 s; shown in 4
+            assert (
+                "Shown 0.5 times as fast as real." in video.said
+            )  # 20 steps at 10 a second take 2 s; shown in 4
     assert changed > 0
 
 

@@ -35,8 +35,6 @@ class StepLog:
         fallback: Its last resort acted.
         violated: The task's own truth saw a cost, at the step's end or at any substep.
         correction: L2, action units.
-        margin: The smallest h before the step; NaN without a filter.
-        cost: The task's; NaN where it reports none.
         proposed: The policy's action, shape (T, action size).
         executed: The action that the env was given, shape (T, action size).
         refused: Which constraints refused the boxed proposal, shape (T, constraints).
@@ -44,7 +42,6 @@ class StepLog:
         constraint_names: Shape (constraints,).
         coordinate_names: With units, shape (coordinates,).
         left_out: Steps beyond `MOST_STEPS` that were not kept.
-        filter_time_us: Mean wall time of one filter call; NaN without a filter.
     """
 
     episode_seed: NDArray[np.int64]
@@ -54,8 +51,6 @@ class StepLog:
     fallback: NDArray[np.bool_]
     violated: NDArray[np.bool_]
     correction: NDArray[np.float32]
-    margin: NDArray[np.float32]
-    cost: NDArray[np.float32]
     proposed: NDArray[np.float32]
     executed: NDArray[np.float32]
     refused: NDArray[np.bool_]
@@ -63,13 +58,12 @@ class StepLog:
     constraint_names: NDArray[np.str_]
     coordinate_names: NDArray[np.str_]
     left_out: int
-    filter_time_us: float
 
     def __len__(self) -> int:
         return len(self.step)
 
 
-_NOT_PER_STEP: Final = ("constraint_names", "coordinate_names", "left_out", "filter_time_us")
+_NOT_PER_STEP: Final = ("constraint_names", "coordinate_names", "left_out")
 _PER_STEP: Final = tuple(field.name for field in fields(StepLog) if field.name not in _NOT_PER_STEP)
 
 
@@ -202,8 +196,6 @@ class StepRecorder:
             "fallback": bool(info.get(keys.CBF_FALLBACK, False)),
             "violated": is_violation(info),
             "correction": info.get(keys.CBF_CORRECTION, 0.0),
-            "margin": info.get(keys.CBF_MARGIN, np.nan),
-            "cost": info.get(keys.COST, np.nan),
             "proposed": np.ravel(info.get(keys.PROPOSED_ACTION, action)),
             "executed": np.ravel(info.get(keys.EXECUTED_ACTION, action)),
             "refused": np.asarray(info.get(keys.CBF_REFUSED, np.zeros(0)), dtype=bool),
@@ -219,10 +211,8 @@ class StepRecorder:
         columns: dict[str, Any] = {
             name: np.array(values, dtype=kinds.get(name, np.float32)) for name, values in self._rows.items()
         }
-        names, time_us = (
-            self._env.get_wrapper_attr(name) if self._env.has_wrapper_attr(name) else None
-            for name in ("constraint_names", "filter_time_us")
-        )
+        named = self._env.has_wrapper_attr("constraint_names")
+        names = self._env.get_wrapper_attr("constraint_names") if named else None
         if names is None:
             names = [f"constraint {number + 1}" for number in range(columns["refused"].shape[-1])]
         return StepLog(
@@ -230,7 +220,6 @@ class StepRecorder:
             constraint_names=np.array(names, dtype=np.str_),
             coordinate_names=np.array(self._names, dtype=np.str_),
             left_out=self._left_out,
-            filter_time_us=np.nan if time_us is None else float(time_us),
         )
 
 
@@ -247,8 +236,7 @@ def load_steps(path: Path) -> StepLog | None:
         return None
     with np.load(path) as arrays:
         values: dict[str, Any] = {name: arrays[name] for name in arrays.files}
-    scalars = {"left_out": int(values["left_out"]), "filter_time_us": float(values["filter_time_us"])}
-    return StepLog(**(values | scalars))
+    return StepLog(**(values | {"left_out": int(values["left_out"])}))
 
 
 def pool(logs: Sequence[StepLog]) -> StepLog | None:
@@ -261,5 +249,4 @@ def pool(logs: Sequence[StepLog]) -> StepLog | None:
         constraint_names=logs[0].constraint_names,
         coordinate_names=logs[0].coordinate_names,
         left_out=sum(log.left_out for log in logs),
-        filter_time_us=float(np.mean([log.filter_time_us for log in logs])),
     )

@@ -1,19 +1,22 @@
-"""run_jobs: jobs side by side, what they tell, and their end at a signal."""
+"""run_jobs: jobs side by side in spawned processes, what they tell, and their end at a signal."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import Progress, TaskID, TextColumn
+from rich.progress import Progress, TaskID
 
-from . import STOPPED, Interrupted, Job, RunsFailedError, environment
-from .local import LocalWorkers
+from . import STOPPED, Interrupted, Job, Message, RunsFailedError, environment, work
 
 _POLL_S: Final = 0.2
 _LINES_S: Final = 30.0
@@ -78,7 +81,7 @@ def run_jobs(
                 elif kind == "say":
                     shown.say(f"{name}: {told}")
                 else:
-                    shown.update(name, kind, told)
+                    shown.steps(name, told)
             shown.tick()
             if signals and wait_until == float("inf"):
                 wait_until = time.monotonic() + _SAVE_S
@@ -132,20 +135,17 @@ class _Shown:
     """A bar for each running job on a terminal; now and then a line for each in a file or a pipe."""
 
     def __init__(self, console: Console) -> None:
-        columns = (*Progress.get_default_columns(), TextColumn("{task.fields[figures]}"))
-        self.bars = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self.bars = Progress(console=console, transient=True, disable=not console.is_terminal)
         self._tasks: dict[str, TaskID] = {}
         self._said_at = time.monotonic()
 
     def start(self, job: Job) -> None:
-        self._tasks[job.name] = self.bars.add_task(job.name, total=job.total, figures="")
+        self._tasks[job.name] = self.bars.add_task(job.name, total=job.total)
         if not self.bars.console.is_terminal:
             self.say(f"{job.name}: started ({job.total:,} {job.unit})")
 
-    def update(self, name: str, kind: str, told: Any) -> None:
-        """A job's `steps` or `figures`."""
-        figures = {} if kind == "steps" else {"figures": ", ".join(f"{key} {told[key]}" for key in told)}
-        self.bars.update(self._tasks[name], completed=told if kind == "steps" else None, **figures)
+    def steps(self, name: str, done: int) -> None:
+        self.bars.update(self._tasks[name], completed=done)
 
     def end(self, name: str, how: str) -> None:
         self.bars.remove_task(self._tasks.pop(name))
@@ -159,4 +159,81 @@ class _Shown:
         if not self.bars.console.is_terminal and time.monotonic() - self._said_at > _LINES_S:
             self._said_at = time.monotonic()
             for task in self.bars.tasks:
-                self.say(f"  {task.description}: {task.percentage:.0f} % {task.fields['figures']}".rstrip())
+                self.say(f"  {task.description}: {task.percentage:.0f} %")
+
+
+_here: dict[str, Any] = {}
+"""In a job's process: the queue of its messages, and the event that stops it."""
+
+
+class LocalWorkers:
+    """An executor of one process for each job: one that is killed, or runs out of memory, takes no other with it.
+
+    Args:
+        at_once: How many; None for one per core that this process may use.
+    """
+
+    def __init__(self, at_once: int | None) -> None:
+        # A container may have fewer than the machine; macOS does not tell.
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.at_once = at_once or cores
+        self._running: dict[Future[str], tuple[Job, ProcessPoolExecutor, Any, Any]] = {}
+
+    def start(self, job: Job) -> None:
+        """Begins a job."""
+        context = multiprocessing.get_context("spawn")
+        queue, stop = context.SimpleQueue(), context.Event()
+        pool = ProcessPoolExecutor(1, context, _begin, (queue, stop))
+        self._running[pool.submit(_work, job)] = job, pool, queue, stop
+
+    def messages(self, timeout_s: float) -> Iterator[tuple[str, Message]]:
+        """What jobs have to say, by their names; waits for an end, for at most so long."""
+        ended = wait(self._running, timeout_s, "FIRST_COMPLETED").done if self._running else set()
+        for future, (job, pool, queue, _) in list(self._running.items()):
+            while not queue.empty():
+                yield job.name, queue.get()
+            if future in ended:
+                del self._running[future]
+                pool.shutdown(wait=False)  # taking torch down can take seconds
+                yield job.name, ("end", _told(future))
+
+    def stop(self, name: str) -> None:
+        """Asks a job to save and end."""
+        for job, _, _, stop in self._running.values():
+            if job.name == name:
+                stop.set()
+
+    def kill(self) -> None:
+        """Ends all jobs at once."""
+        if self._running:
+            for child in multiprocessing.active_children():
+                child.kill()
+        for _, pool, _, _ in self._running.values():
+            pool.shutdown()
+
+
+def _told(future: Future[str]) -> str:
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        return "its process was killed (out of memory?). The same command goes on from its last checkpoint."
+
+
+def _begin(queue: Any, stop: Any) -> None:
+    """In a job's process, before all else."""
+    _here.update(queue=queue, stop=stop)
+    # A terminal, or a machine that goes down, sends these to every process; the first one's answer is enough.
+    for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(which, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _work(job: Job) -> str:
+    return work(job, _here["queue"].put, _here["stop"].is_set)

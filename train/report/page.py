@@ -31,7 +31,7 @@ from ..evaluation.summary import (
 )
 from ..files import Row, read_json, write_rows, write_text
 from ..run.folder import START_FILE, finished_facts
-from ..videos.record import Video, load_video, video_path
+from ..videos.record import load_video, video_path
 from .drawing import Picture, color_of, data_uri
 from .figures import CONDITIONS, curve_picture, over_the_episode, plane_picture, refusals
 from .tables import RUN_COLUMNS, SHORT, every_metric, run_rows, short_rows
@@ -98,7 +98,7 @@ def write_report(
         judge=judged_by(experiment, summary.judged),
         shown=shown,
         films=[
-            (f"{arm.name}, filter {words}", data_uri("image/webp", video.animation), _film(video))
+            (f"{arm.name}, filter {words}", data_uri("image/webp", video.animation), video.said)
             for arm in experiment.arms
             for condition, words in CONDITIONS.items()
             if (video := load_video(video_path(experiment, arm, condition))) is not None
@@ -194,14 +194,6 @@ def _scenes(experiment: ExperimentConfig) -> list[Picture]:
             title = f"{arm.name}, filter {CONDITIONS[condition]}, from above"
             scenes.append(Scene(title, color, log, log.episode_seed == shown.episode_seed, places))
     return scene_pictures(scenes)
-
-
-def _film(video: Video) -> str:
-    episodes = (
-        f"{title}; of {steps:,} steps {changed:,} changed." for title, steps, changed in video.episodes
-    )
-    said = " ".join(episodes)
-    return f"{said} Shown {video.speed:.1f} times as fast as real."
 
 
 def about(experiment: ExperimentConfig) -> str:

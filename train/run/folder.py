@@ -50,11 +50,6 @@ def check_finished(arm: ArmConfig, folder: Path) -> None:
         )
 
 
-def is_outgrown(arm: ArmConfig, folder: Path) -> bool:
-    """Whether the run was finished with fewer steps than it should have now: what shows its policy is out of date."""
-    return int(finished_facts(folder).get("timesteps", arm.total_steps)) < arm.total_steps
-
-
 def stored_run(folder: Path) -> ArmConfig:
     """The arm of a run, as its folder has it.
 

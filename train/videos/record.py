@@ -26,12 +26,10 @@ from .rendering import find_rendering
 
 
 class Video(NamedTuple):
-    """Episodes on film, side by side, and times real time at which they are shown."""
+    """Episodes on film, side by side, and a sentence that says what is seen."""
 
     animation: bytes
-    speed: float
-    episodes: list[tuple[str, int, int]]
-    """The title of each, its steps, and how many of them were changed."""
+    said: str
 
 
 def video_path(experiment: ExperimentConfig, arm: ArmConfig, condition: str) -> Path:
@@ -44,7 +42,7 @@ def load_video(path: Path) -> Video | None:
     facts = read_json(path.with_suffix(".json"))
     if not facts or not path.exists():
         return None
-    return Video(path.read_bytes(), facts["speed"], [tuple(episode) for episode in facts["episodes"]])
+    return Video(path.read_bytes(), facts["said"])
 
 
 def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
@@ -119,10 +117,10 @@ def record_video(
     with closing(for_film(make_stack(filmed, used, arm.learner.in_evaluation))) as env:
         animation, speed, films = film_episodes(policy, env, shown.filmed)
     write_bytes(path, animation)
+    said = [f"{film.title}; of {len(film.changed):,} steps {sum(film.changed):,} changed." for film in films]
     facts = {
         "state": _state(arm, used, shown, checkpoint.timesteps),
-        "speed": speed,
-        "episodes": [(film.title, len(film.changed), sum(film.changed)) for film in films],
+        "said": " ".join([*said, f"Shown {speed:.1f} times as fast as real."]),
     }
     write_json(path.with_suffix(".json"), facts)
     progress.steps(1)

@@ -61,7 +61,7 @@ class BoundSupportMargin(BoundSlacks):
             if other is found:
                 return distances
         of = found.step, found.point, found.normal, found.force
-        distances: list[float] = support_distances(*of).tolist()
+        distances = [float(distance) for distance in support_distances(*of)]
         self._known.append((found, distances))
         return distances
 

@@ -422,8 +422,9 @@ def _identity(n: int) -> Array:
 @functools.cache
 def load_solvers() -> None:
     """Load what a projection needs, or compile it (seconds, once per machine), so that no control step waits."""
-    rows = np.array([[1.0], [-1.0]]), np.array([-0.5, -0.5])
-    project_unchecked(np.ones(1), *rows, -np.ones(1), np.ones(1))
+    one, rows = np.ones(1), (np.array([[1.0], [-1.0]]), np.array([0.5, 0.5]))
+    project_unchecked(one, *rows, -one, one)
+    _by_least_distance(_Problem.of(one, *rows, -one, one))
 
 
 def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upper: Array) -> bool:

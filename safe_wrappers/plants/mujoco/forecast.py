@@ -1,7 +1,7 @@
 """A forecast: what a MuJoCo model does under a held control, and under braking after it."""
 
 from collections import deque
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -15,6 +15,7 @@ _HELD: Final = 4  # forecasts whose data are held: the admitted one is among the
 RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 """The warnings after which MuJoCo resets the state."""
 _EULER: Final = int(mujoco.mjtIntegrator.mjINT_EULER)
+_MOTION: Final = int(mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL)
 
 
 class Poses(NamedTuple):
@@ -169,17 +170,18 @@ class Recorder(Remade):
             published: Likewise what the intervals' ends publish, shape (intervals, 2, nbody, 3).
             euler: The steps are Euler's in the place of Runge-Kutta's; what they publish does not lag.
         """
-        m, data, n, nq = self._model, self._data, self.substeps, self.nq
-        qpos, qvel, frames, centres = data.qpos, data.qvel, data.xpos, data.xipos
-        resets = data.warning.number[RESETS]
+        m, data, n = self._model, self._data, self.substeps
+        frames, centres, resets = data.xpos, data.xipos, data.warning.number[RESETS]
         for hold in range(begin, end):
             if hold:
                 self.brake(data)
-            for i in range(hold * n, hold * n + n):
+            states = path[hold * n : hold * n + n]
+            for state in states:
                 mujoco.mj_step(m, data)
-                if i == hold * n + n - 1:
-                    self.settle(data)
-                path[i, :nq], path[i, nq:] = qpos, qvel
+                mujoco.mj_getState(m, data, state, _MOTION)
+            if self.settles:
+                self.settle(data)
+                mujoco.mj_getState(m, data, states[-1], _MOTION)
             if euler:
                 mujoco.mj_kinematics(m, data)
             published[hold, 0], published[hold, 1] = frames, centres
@@ -203,8 +205,11 @@ class Recorder(Remade):
         """Give the machine the control that brakes."""
         data.ctrl[:] = self._against_motion(data)
 
+    settles: ClassVar[bool] = False
+    """Whether the env does something to its data at the end of a control interval."""
+
     def settle(self, data: mujoco.MjData) -> None:
-        """What the env does to its data at the end of a control interval: nothing, in most."""
+        """Do what the env does to its data at the end of a control interval."""
 
     def _against_motion(self, data: mujoco.MjData) -> Array:
         rest, per_length, damping = self._servos

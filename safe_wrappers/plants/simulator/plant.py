@@ -162,8 +162,7 @@ class SimulatorPlant(RolloutPlant):
         stepping = getattr(type(env.unwrapped), "_step_mujoco_simulation", None)
         self.judges_substeps = stepping is MujocoEnv._step_mujoco_simulation
         if self.check_steps:
-            steps = self.check_steps, self.check_s
-            self.checked_steps = check_replay(self._simulation, *steps, self.same_noise)
+            self.checked_steps = check_replay(self._simulation, self.check_steps, self.check_s)
             if self.checked_steps < self.check_steps:
                 needed_s = math.ceil(1.2 * self.check_s * self.check_steps / self.checked_steps)
                 warnings.warn(

@@ -10,7 +10,6 @@ import os
 import pickle
 import random
 import time
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from types import FunctionType, ModuleType
@@ -276,13 +275,10 @@ def _reseed(generator: Any, seed: np.random.SeedSequence) -> None:
 _LONGEST = 10  # steps that are simulated ahead before the env makes them
 
 
-def check_replay(
-    simulation: Simulation, steps: int, limit_s: float, same_noise: bool = True, seed: int = 0
-) -> int:
+def check_replay(simulation: Simulation, steps: int, limit_s: float, seed: int = 0) -> int:
     """Make random steps, each stretch of 1 to 10 in the simulation first and then in the env.
 
-    The env is left reset; its random generator as it was. Where a simulation copies the env, a copy is stepped. With
-    `same_noise=False` it is said if other random numbers change nothing.
+    The env is left reset; its random generator as it was. Where a simulation copies the env, a copy is stepped.
 
     Returns:
         How many steps were compared: all, or those of the stretches that began in the time.
@@ -298,13 +294,10 @@ def check_replay(
     lengths = np.random.default_rng(seed)
     env.reset(seed=seed)
     checked.start()
-    made, end, changed = 0, time.monotonic() + limit_s, same_noise
+    made, end = 0, time.monotonic() + limit_s
     while made < steps and (not made or time.monotonic() < end):
         actions = [space.sample() for _ in range(int(lengths.integers(1, _LONGEST + 1)))]
         ahead = checked.run(lambda other, actions=actions: stretch(other, actions))  # type: ignore[misc]
-        if not changed:
-            noisy = checked.run(lambda other, actions=actions: _with_other_noise(other, actions))  # type: ignore[misc]
-            changed = any(difference(*pair) for pair in zip(ahead, noisy, strict=False))
         behind = stretch(env, actions)
         for number, (simulated, real) in enumerate(zip(ahead, behind, strict=False), 1):
             found = difference(simulated, real)
@@ -319,20 +312,7 @@ def check_replay(
             checked.start()
     env.reset(seed=seed)
     raw._np_random = generator
-    if not changed:
-        warnings.warn(
-            f"same_noise=False changes nothing in {name_of(env)}: {made} random steps with other random numbers were "
-            "those of the env. Either its steps draw none, or they draw from a generator that is not found, and its "
-            "noise is foreseen; NumPy's generators and those of Python's random are found, wherever env and wrappers "
-            "keep them",
-            stacklevel=2,
-        )
     return made
-
-
-def _with_other_noise(env: Env, actions: list[Any]) -> "list[Answer]":
-    with other_noise(env, 0):
-        return stretch(env, actions)
 
 
 Answer = tuple[Any, Any, bool, bool]

@@ -171,14 +171,6 @@ def test_the_envs_own_functions_are_used():
     assert CloneCart.seen is True
 
 
-def test_wrappers_are_put_back_where_the_env_is_simulated_itself():
-    env = TimeLimit(StateCart(), 5)
-    plant = bound(env)
-    env.reset(seed=0)
-    assert plant.rollout(np.ones(1), 9).ended
-    assert [env.step(np.ones(1))[3] for _ in range(5)] == [False] * 4 + [True]
-
-
 def test_the_noise_of_the_env_is_foreseen_unless_told():
     for same_noise in (True, False):
         env = NoisyCart()
