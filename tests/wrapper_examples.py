@@ -82,7 +82,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             lambda: {
                 "constraints": [sw.constraints.JointSpeedLimit(4.0)],
                 "fallback": "hold",
-                "solver": "clarabel",
                 "margin": 0.1,
             },
         ),
@@ -225,7 +224,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                 "friction": 0.05,
                 "regularization": 0.3,
                 "fallback": "hold",
-                "solver": "clarabel",
                 "margin": 0.01,
             },
         ),
