@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import safe_wrappers as sw
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.plants import MujocoPlant
