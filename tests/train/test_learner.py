@@ -58,7 +58,7 @@ def shield(env):
     return sw.CBFActionFilter(env, [BehindTheWall()], plant=plant)
 
 
-MAP = "{kind: safe_set_map, anchor: closest}"
+MAP = "safe_set_map"
 
 
 def one_arm(fake_experiment, learner, *overrides, algorithm="SAC"):
@@ -242,8 +242,6 @@ def test_another_learner_is_another_run(fake_experiment):
         ("{penalty: 1}", [], "naive takes no penalty"),
         ("{kind: safe_action, penalty: 1}", [], "safe_action takes no penalty; adaption_penalty and both do"),
         ("safe_action", ["algorithm=DQN", "hyperparameters={}"], "is for continuous actions, and DQN has"),
-        ("{kind: both, penalty: 1, anchor: closest}", [], "both takes no anchor; safe_set_map does"),
-        ("{kind: safe_set_map, anchor: brake}", [], "unknown name 'brake'"),
         ("safe_actions", [], "Did you mean 'safe_action'"),
         ("safe_set_map", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
