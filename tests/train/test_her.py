@@ -30,7 +30,7 @@ LEARNERS = {
     "adaption_penalty": "{kind: adaption_penalty, penalty: 7.0}",
     "safe_action": "safe_action",
     "both": "{kind: both, penalty: 7.0}",
-    "safe_set_map": "{kind: safe_set_map, anchor: closest}",
+    "safe_set_map": "safe_set_map",
 }
 SB3S_BUFFER = ("naive", "safe_set_map")
 
