@@ -80,8 +80,6 @@ _MATTER = {
     " BoundEscapeClearance.backup min/max",
     "control/backup/point_decision.py": "backup not; _stopped_at not",
     "constraints/predictive_shield.py": "BoundPredictiveShield.plan not; BoundPredictiveShield._after not",
-    "plants/simulator/copies.py": "EnvCopier.copy not",
-    "plants/simulator/plant.py": "SimulatorPlant.rollout.rolled_out not",
     "wrappers/action_shield.py": "ActionShield.step not; ActionShield.action_masks not",
     "wrappers/admission.py": "Admission.admits not",
     "wrappers/stopping_budget.py": "BoundBudget.longest_time not; BoundBudget.can_stop_after not",
