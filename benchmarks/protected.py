@@ -15,7 +15,7 @@ import itertools
 import multiprocessing
 import time
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -125,12 +125,12 @@ def table_of_envs(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
             [row for row in rows if row["case"] == name and row["filtered"] is kind] for kind in (True, False)
         )
         env = cases[name].protect(cases[name].make())
-        kinds = dict.fromkeys(type(c).__name__ for c in env.constraints)
+        kinds = map(spelled, env.constraints)
         proved = all(getattr(c, "promise", "best effort") == "proved" for c in env.constraints)
         times = f"{_overhead(on, 'inactive')} / {_overhead(on, 'active')}"
         cells = [
             ", ".join((name, *cases[name].also)),
-            ", ".join(kinds),
+            "; ".join(kinds),
             "proved" if proved else "best effort",
         ]
         cells += [times, _violations(on), f"{total(off, 'violations'):,}", f"{total(on, 'steps'):,}"]
@@ -138,6 +138,22 @@ def table_of_envs(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
         lines.append([*cells, *(f"{total(on, flag):,}" for flag in ("infeasible", "fallback"))])
     head = "env | constraints | class | step time, inactive / active | violations on | off"
     return markdown(f"{head} | steps each | changed | infeasible | fallback", lines)
+
+
+def spelled(constraint: Any) -> str:
+    """A constraint with the numbers and names that it was given, where they are not its defaults."""
+
+    def short(value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:g}"
+        return f"({', '.join(map(short, value))})" if isinstance(value, list | tuple) else str(value)
+
+    told = []
+    for one in fields(constraint):
+        value = getattr(constraint, one.name)
+        if one.init and value and value != one.default and type(value) in (int, float, str, list, tuple):
+            told += [f"{one.name} {short(value)}"] if len(short(value)) < 60 else []
+    return f"{type(constraint).__name__}: {', '.join(told)}" if told else type(constraint).__name__
 
 
 def table_of_drivers(rows: list[dict[str, Any]]) -> str:

@@ -10,8 +10,7 @@ that overtake each other; **outages** is rough and goes silent for 0.3 s every 2
 away** and sweeps on.
 
 Judged from outside the channel: energy is that of the operator's hand at the force that he is shown, and of what
-acted on the tool by the env's own account, less what a controller's storage began with; clearance is the env's, at
-every physics substep.
+acted on the tool by the env's own account; clearance is the env's, at every physics substep.
 """
 
 import itertools
@@ -36,7 +35,6 @@ JITTER, LOSS = 0.3, 0.05
 OUTAGE_BETWEEN_S, OUTAGE_LENGTH_S = 2.0, 0.3
 CODINGS: Final[dict[str, dict[str, Any]]] = {
     "plain": {"coding": "plain"},
-    "controller": {"coding": "plain", "passivity": "controller", "storage_j": 0.02},
     "wave": {"coding": "wave", "impedance": 40.0},
 }
 NETWORKS = ("steady", "rough", "outages")
@@ -102,8 +100,7 @@ def run(job: Job) -> dict[str, Any]:
         least = min(least, info["clearance"])
         breached += int(info["cost"] > 0.0)
         revoked += int(info["teleop/revoked"])
-    storage = 2.0 * float(CODINGS[job.coding].get("storage_j", 0.0))  # at each end
-    found = {"made_j": max(-lowest - storage, 0.0), "peak_n": peak, "swept_m": float(info["swept"])}
+    found = {"made_j": max(-lowest, 0.0), "peak_n": peak, "swept_m": float(info["swept"])}
     return asdict(job) | found | {"breached": breached > 0, "least_m": least, "revoked_steps": revoked}
 
 

@@ -5,6 +5,7 @@ compares two runs exactly.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -18,10 +19,8 @@ class InfoKey:
     Attributes:
         shape: Of an array, such as "(3,)" or "(wheels,)"; "" is a number.
         unit: SI, "action" or "reward"; "" without a unit.
-        chunk: How `ChunkHandover` merges the values of the control steps in its step.
-        where: A key; `chunk` leaves out control steps at which it is 0 or missing. "" counts all.
+        chunk: How `merged` merges the values of several control steps, NaN aside.
         log: `InterventionCallback` logs ``interventions/step_<log>``, the mean over steps and envs; "" is not logged.
-        entries: What `number` takes of an array: the largest size or the mean.
     """
 
     name: str
@@ -29,15 +28,13 @@ class InfoKey:
     shape: str = ""
     unit: str = ""
     chunk: Literal["last", "sum", "any", "max", "min", "mean"] = "last"
-    where: str = ""
     log: str = ""
-    entries: Literal["max", "mean"] = "max"
 
     def number(self, value: Any) -> float:
-        """The value of a step as one number."""
+        """The value of a step as one number: of an array the share that is True, or the largest size."""
         if not self.shape:
             return float(value)
-        return float(np.abs(value).max() if self.entries == "max" else np.mean(value))
+        return float(np.mean(value) if self.dtype == "bool" else np.abs(value).max())
 
 
 @dataclass(frozen=True)
@@ -48,13 +45,11 @@ class EpisodeFigure:
         how: "count" is the number of steps at which a key is above zero, or the sum of a key of whole numbers;
             "onsets" counts the entries of an array that become True; "any" is whether it ever was.
         of: The info keys that it is made from: for "count" all that exist, else the first that exists.
-        running: The key with the figure of the episode so far; "" for none.
     """
 
     name: str
     how: Literal["mean", "p95", "count", "sum", "min", "last", "any", "onsets"]
     of: tuple[str, ...]
-    running: str = ""
 
 
 class _NotJudged(np.float64):
@@ -96,8 +91,6 @@ CBF_NONFINITE: Final = _key("cbf/nonfinite", "bool", chunk="any")
 """The proposed action held a NaN or an infinity; it never reaches the env."""
 CBF_CORRECTION: Final = _key("cbf/correction", "float64", unit="action", chunk="max", log="correction")
 """L2 norm of executed minus proposed, boxing included; entries of the proposal that are not finite are taken as 0."""
-CBF_CLIPPED: Final = _key("cbf/clipped", "float64", unit="action", chunk="max")
-"""L2 norm of boxed minus proposed: what the action space alone took away."""
 CBF_MARGIN: Final = _key("cbf/margin", "float64", chunk="min")
 """The smallest barrier value h before the step, in each constraint's unit, margins not taken off; 0 without one."""
 CBF_UNSAFE: Final = _key("cbf/unsafe", "bool", chunk="any")
@@ -180,9 +173,7 @@ ADAPTION_TASK_REWARD: Final = _key("adaption/task_reward", "float64", unit="rewa
 # SafeActionMap, every step -----------------------------------------------------------------------------------
 MAP_SCALE: Final = _key("map/scale", "float64", chunk="min", log="map_scale")
 """By what the distance of the policy's action from the anchor was multiplied, from 0 to 1; 1: the action is
-unchanged."""
-MAP_ANCHOR: Final = _key("map/anchor", "bool", chunk="min")
-"""There was an admitted anchor; else the filter was given the policy's action."""
+unchanged; NaN: there was no admitted anchor, and the filter was given the policy's action."""
 
 # ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
 HANDOVER_SEAM_JUMP: Final = _key("handover/seam_jump", "float64", shape="(3,)", unit="action")
@@ -196,17 +187,11 @@ HANDOVER_STARVED: Final = _key("handover/starved", "int64", log="starved")
 """Control steps of this step at which the queue was empty and the fallback gave the command."""
 HANDOVER_LIMITED: Final = _key("handover/limited", "int64", log="limited")
 """Control steps of this step at which `rate_limit` changed a command, beyond the blend."""
-HANDOVER_STRETCHED: Final = _key("handover/stretched", "int64")
-"""Blends that began in this step and are longer than without `limits`."""
 HANDOVER_REFUSED: Final = _key("handover/refused", "bool")
 """A chunk was refused: not finite, not newer than the one in force, too late, out of reach, or without a blend that
 keeps `limits`."""
-HANDOVER_CLIPPED: Final = _key("handover/clipped", "float64", unit="action")
-"""The largest L2 norm of clipped minus proposed, of the chunk's entries; numbers that are not finite count as 0."""
 HANDOVER_LATENCY: Final = _key("handover/latency", "int64")
 """Control steps from the observation to the takeover of the last chunk that took over in this step; -1 without."""
-HANDOVER_STEPS: Final = _key("handover/steps", "int64")
-"""Control steps executed in this step (fewer than the execution horizon where the episode ended)."""
 
 # LeaseExpiry, every control step ---------------------------------------------------------------------------------
 LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")
@@ -216,9 +201,6 @@ LEASE_EXPIRED: Final = _key("lease/expired", "bool", chunk="any", log="lease_exp
 LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
 """A command was refused: no lease was granted, or it was not finite, older than the one in force or from the future,
 or a chunk's end was out of reach."""
-LEASE_CLIPPED: Final = _key("lease/clipped", "float64", unit="action", chunk="max")
-"""L2 norm by which the action left the action space; numbers that are not finite count as 0. Missing where a
-CBFActionFilter inside boxes it (`cbf/clipped`)."""
 LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_braking")
 """The fallback acted at this control step."""
 
@@ -227,8 +209,6 @@ TELEOP_ROUND_TRIP_S: Final = _key("teleop/round_trip_s", "float64", unit="s")
 """Age of the image that the command in force was made from; before the first one, since the reset."""
 TELEOP_CEILING_S: Final = _key("teleop/ceiling_s", "float64", unit="s")
 """The longest admissible round trip when this step was decided, from 0 to `longest_s`; inf without a ceiling."""
-TELEOP_CLEARANCE_M: Final = _key("teleop/clearance_m", "float64", unit="m", chunk="min")
-"""The smaller clearance, before or after the step; inf without a ceiling, or with nothing near."""
 TELEOP_REVOKED: Final = _key("teleop/revoked", "bool", chunk="any")
 """The operator had no authority, the local brake acted."""
 TELEOP_ENERGY_IN_J: Final = _key("teleop/energy_in_j", "float64", unit="J")
@@ -239,12 +219,6 @@ TELEOP_IN_FLIGHT_J: Final = _key("teleop/in_flight_j", "float64", unit="J")
 """Energy of the waves on their way; 0 with plain coding."""
 TELEOP_CREATED_J: Final = _key("teleop/created_j", "float64", unit="J")
 """The largest excess of energy out and in flight over energy in, so far; 0 is passive."""
-TELEOP_LOST: Final = _key("teleop/lost", "int64", chunk="sum")
-"""Packets of this step that got lost, both ways; actions that are not finite, or from the future, count as lost."""
-TELEOP_CLIPPED: Final = _key("teleop/clipped", "float64", unit="action", chunk="max")
-"""As `lease/clipped`, of the action that the operator sends in this step."""
-TELEOP_LATE: Final = _key("teleop/late", "int64", chunk="sum")
-"""Commands that arrived in this step behind or together with a newer one."""
 
 # ContactMonitor, every step: of the watched contacts over the physics substeps of the control step -----------------
 CONTACT_PEAK_FORCE: Final = _key("contact/peak_force", "float64", unit="N", chunk="max", log="contact_force")
@@ -255,21 +229,6 @@ CONTACT_PENETRATION: Final = _key("contact/penetration", "float64", unit="m", ch
 """The largest penetration depth."""
 CONTACT_RESIDUAL: Final = _key("contact/residual", "float64", unit="N m", chunk="max")
 """The largest ``|gap * force|`` of a contact: the violation of complementarity."""
-CONTACT_JUDGED: Final = _key("contact/judged", "int64", chunk="sum")
-"""How many contacts the figures are of; one counts at every evaluation of the physics that has it."""
-CONTACT_PULL: Final = _key("contact/pull", "float64", unit="N", chunk="max", where="contact/judged")
-"""The largest normal force that pulls, 0 where all push; NaN where no contact was judged."""
-CONTACT_OPEN_FORCE: Final = _key(
-    "contact/open_force", "float64", unit="N", chunk="max", where="contact/judged"
-)
-"""The largest normal force, of either sign, across an open gap, 0 without one; NaN where no contact was judged."""
-CONTACT_NEXT_TIME: Final = _key("contact/next_time", "float64", unit="s")
-"""With `restitution`: until the next watched pair of geoms touches, at the speeds after the step; inf where none
-approaches, NaN of a state that is not finite."""
-CONTACT_NEXT_IMPULSE: Final = _key("contact/next_impulse", "float64", unit="N s")
-"""With `restitution`: the impulse of that impact, `m (1 + e) v` along its normal; NaN without one."""
-CONTACT_NEXT_FORCE: Final = _key("contact/next_force", "float64", unit="N")
-"""With `restitution`: the peak force of that impact, `v sqrt(k m)`; NaN without one or without `stiffness`."""
 CONTACT_PARTIAL: Final = _key("contact/partial", "bool", chunk="any")
 """Not every substep was seen; the other keys describe only the last substep."""
 
@@ -280,45 +239,36 @@ BALANCE_ANGULAR_MOMENTUM: Final = _key("balance/angular_momentum", "float64", sh
 """About the centre of mass, after the step."""
 BALANCE_FRICTION_USED: Final = _key("balance/friction_used", "float64", chunk="max")
 """The largest ``|f_t| / (share mu f_n)`` of a contact with at least 1 % of the weight, over all evaluations."""
-BALANCE_ZMP_MARGIN: Final = _key(
-    "balance/zmp_margin", "float64", unit="m", chunk="min", where="balance/supported"
-)
-"""Least distance of the zero moment point from the edge of the support polygon, less the inset; 0 without one."""
-BALANCE_SUPPORTED: Final = _key("balance/supported", "float64", chunk="mean")
-"""Share of the evaluations with a support polygon: three contact points of one plane, not on a line."""
+BALANCE_ZMP_MARGIN: Final = _key("balance/zmp_margin", "float64", unit="m", chunk="min")
+"""Least distance of the zero moment point from the edge of the support polygon, less the inset; NaN without one."""
 BALANCE_AIRBORNE: Final = _key("balance/airborne", "float64", chunk="mean")
 """Share of the evaluations without a contact point."""
 BALANCE_PARTIAL: Final = _key("balance/partial", "bool", chunk="any")
 """Not every evaluation was seen (then only the last one counts), or numbers were not finite (reported as 0)."""
 
 # OcclusionPenalty, every step: one entry per track, after the step ------------------------------------------------
-OCCLUSION_VISIBLE: Final = _key("occlusion/visible", "bool", shape="(tracks,)", log="seen", entries="mean")
+OCCLUSION_VISIBLE: Final = _key("occlusion/visible", "bool", shape="(tracks,)", log="seen")
 """The track was measured at the end of this step (in sight, in range, and not dropped out)."""
 OCCLUSION_SIGMA: Final = _key("occlusion/sigma", "float64", shape="(tracks,)", unit="m", log="sigma")
 """Standard deviation of the track's estimated position where it is largest."""
-OCCLUSION_EXPIRED: Final = _key(
-    "occlusion/expired", "bool", shape="(tracks,)", chunk="any", log="expired", entries="mean"
-)
+OCCLUSION_EXPIRED: Final = _key("occlusion/expired", "bool", shape="(tracks,)", chunk="any", log="expired")
 """Without a measurement `sigmas` standard deviations would cross the tolerance in the next step: no permission."""
 OCCLUSION_PENALTY: Final = _key(
     "occlusion/penalty", "float64", unit="reward", chunk="sum", log="occlusion_penalty"
 )
 """What was taken off this step's reward."""
-OCCLUSION_TASK_REWARD: Final = _key("occlusion/task_reward", "float64", unit="reward", chunk="sum")
-"""The task's own reward of this step, before the penalty."""
 
 # The faults of safe_wrappers.wrappers.faults, every step --------------------------------------------------------
 FAULT_ACTIVE: Final = _key("fault/active", "bool", chunk="any", log="fault")
 """The policy's action of this step was lost, late or replaced."""
 
 # RecordInterventions ---------------------------------------------------------------------------------------
-RUNNING_PREFIX: Final = "interventions/"
 EPISODE: Final = (
-    EpisodeFigure("intervention_rate", "mean", (CBF_INTERVENED,), "interventions/rate"),
-    EpisodeFigure("correction_mean", "mean", (CBF_CORRECTION,), "interventions/correction_mean"),
+    EpisodeFigure("intervention_rate", "mean", (CBF_INTERVENED,)),
+    EpisodeFigure("correction_mean", "mean", (CBF_CORRECTION,)),
     EpisodeFigure("correction_p95", "p95", (CBF_CORRECTION,)),
-    EpisodeFigure("infeasible", "count", (CBF_INFEASIBLE,), "interventions/infeasible"),
-    EpisodeFigure("fallback", "count", (CBF_FALLBACK,), "interventions/fallback"),
+    EpisodeFigure("infeasible", "count", (CBF_INFEASIBLE,)),
+    EpisodeFigure("fallback", "count", (CBF_FALLBACK,)),
     EpisodeFigure("nonfinite", "count", (CBF_NONFINITE,)),
     EpisodeFigure("unsafe", "count", (CBF_UNSAFE,)),
     EpisodeFigure("mismatch", "count", (CBF_MISMATCH,)),
@@ -326,10 +276,10 @@ EPISODE: Final = (
     EpisodeFigure("lease_expired", "count", (LEASE_EXPIRED,)),
     EpisodeFigure("lease_refused", "count", (LEASE_REFUSED,)),
     EpisodeFigure("lease_braking", "count", (LEASE_BRAKING,)),
-    EpisodeFigure("margin_min", "min", (CBF_MARGIN,), "interventions/margin_min"),
+    EpisodeFigure("margin_min", "min", (CBF_MARGIN,)),
     EpisodeFigure("violations", "count", (COST, COST_SUBSTEP)),
-    EpisodeFigure("cost", "sum", (COST,), "interventions/cost"),
-    EpisodeFigure("cost_substep", "sum", (COST_SUBSTEP,), "interventions/cost_substep"),
+    EpisodeFigure("cost", "sum", (COST,)),
+    EpisodeFigure("cost_substep", "sum", (COST_SUBSTEP,)),
     EpisodeFigure("goals_reached", "last", (GOALS_REACHED,)),
     EpisodeFigure("spin_outs", "count", (SPIN_OUT,)),
     EpisodeFigure("success", "any", (SUCCESS, IS_SUCCESS)),
@@ -340,5 +290,21 @@ EPISODE: Final = (
 """An episode's figures beside its length and return, in the order of the CSV file."""
 EPISODE_SUMMARY: Final = _key("interventions", "dict")
 """At an episode's last step only: length, return, and the figures of `EPISODE` that the stack and the task report."""
-RUNNING: Final = tuple(_key(figure.running, "float64") for figure in EPISODE if figure.running)
-"""Every step: the episode so far; NaN where nothing reports the keys. Monitor's `info_keywords`."""
+
+
+def merged(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The last control step's info, with each registered key merged over the steps as `InfoKey.chunk` says."""
+    last = infos[-1]
+    if len(infos) == 1:
+        return last
+    found: dict[str, Any] = {}
+    for name, key in KEYS.items():
+        values = [info[name] for info in infos if name in info]
+        if key.dtype == "float64" and not key.shape:
+            values = [value for value in values if not math.isnan(value)]
+        if values and key.chunk != "last":
+            value = getattr(np, key.chunk)(values, axis=0)  # the others are NumPy's own names
+            array = isinstance(values[-1], np.ndarray)
+            found[name] = np.asarray(value, values[-1].dtype) if array else type(values[-1])(value)
+    last.update(found)
+    return last

@@ -157,6 +157,16 @@ def test_the_cars_outline_encloses_every_geom():
     assert closest < 1e-9
 
 
+def test_hulls_are_as_large_as_the_geoms():
+    from safe_wrappers.envs.goal_layout import HAZARD_RADIUS, VASE_HALF_SIZE
+    from safe_wrappers.envs.goal_robots import POINT
+    from safe_wrappers.recipes import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
+
+    assert POINT.radius <= POINT_HULL_RADIUS_M < POINT.radius + 1e-3
+    assert np.hypot(VASE_HALF_SIZE, VASE_HALF_SIZE) <= VASE_HULL_RADIUS_M < np.sqrt(2) * VASE_HALF_SIZE + 1e-3
+    assert sw.protect(gym.make("SafePointGoal1-v0")).constraints[0].obstacles[0].radius == HAZARD_RADIUS
+
+
 def test_options_reach_the_filter():
     narrow, wide = (sw.protect(gym.make("Reacher-v5"), margin=m) for m in (0.0, 0.5))
     assert wide.constraints[0].margin == pytest.approx(narrow.constraints[0].margin + 0.5)

@@ -63,10 +63,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
     },
     "AdaptionPenalty": {
         "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25}),
-        "the square, and one that levels off": (
-            TASK,
-            lambda: {"per_squared": 0.5, "bounded": 0.25, "scale": 0.5},
-        ),
     },
     "BalanceMonitor": {
         "everything": ("HalfCheetah-v5", dict),
@@ -82,7 +78,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             lambda: {
                 "constraints": [sw.constraints.JointSpeedLimit(4.0)],
                 "fallback": "hold",
-                "solver": "clarabel",
                 "margin": 0.1,
             },
         ),
@@ -114,10 +109,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             TASK,
             lambda: {"chunk_size": 1, "execution_horizon": 1, "blend_time": 0.5, "fallback": "hold"},
         ),
-        "temporal ensembling": (
-            TASK,
-            lambda: {"chunk_size": 6, "execution_horizon": 2, "blend": "ensemble", "decay": 0.1},
-        ),
     },
     "ContactMonitor": {
         "everything": (TASK, dict),
@@ -125,7 +116,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             "HalfCheetah-v5",
             lambda: {"bodies": ["bfoot", "ffoot"], "against": ["world"]},
         ),
-        "impacts to come": ("Ant-v5", lambda: {"restitution": 0.2, "stiffness": 1e4}),
     },
     "CostFunction": {
         "a function": ("Reacher-v5", lambda: {"fn": _joint_speed}),
@@ -152,7 +142,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                     top_speed=5.0,
                     act_s=0.01,
                 ),
-                "brake_blend_time": 0.04,
             },
         ),
         "a value with a closing speed": (
@@ -207,10 +196,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         ),
     },
     "RecordInterventions": {"no arguments": (TASK, dict)},
-    "SafeActionMap": {
-        "from the backup": (TASK, dict),
-        "from the filter's answer": (TASK, lambda: {"anchor": "closest"}),
-    },
+    "SafeActionMap": {"from the backup": (TASK, dict)},
     "SafetyOverlay": {
         "everything, of a filter": (TASK, dict),
         "the strip alone": (TASK, lambda: {"scene": False}),
@@ -225,7 +211,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                 "friction": 0.05,
                 "regularization": 0.3,
                 "fallback": "hold",
-                "solver": "clarabel",
                 "margin": 0.01,
             },
         ),
@@ -237,8 +222,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             lambda: {
                 "uplink": sw.teleop.Link(0.04, 0.03, loss=0.1, in_order=False),
                 "downlink": {"delay_s": 0.02, "outage_between_s": 0.5, "outage_length_s": 0.1},
-                "missing": "zero",
-                "seed": 3,
             },
         ),
         "waves under a ceiling": (
@@ -248,7 +231,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                 "downlink": 0.002,
                 "coding": "wave",
                 "impedance": 40.0,
-                "wave_rule": "hold",
                 "ceiling": sw.teleop.RoundTripCeiling(
                     sw.StoppingBudget(
                         sw.constraints.Clearance(
@@ -258,18 +240,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                         top_speed=1.4,
                     )
                 ),
-            },
-        ),
-        "a passivity controller": (
-            "TeleopContact-v0",
-            lambda: {
-                "uplink": 0.01,
-                "downlink": 0.01,
-                "passivity": "controller",
-                "damping_limit": 20.0,
-                "storage_j": 0.01,
-                "missing": "fallback",
-                "port": sw.teleop.TeleopPort([0, 1], [4, 5], feedthrough=40.0),
             },
         ),
     },

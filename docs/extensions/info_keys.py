@@ -65,15 +65,14 @@ class InfoKeys(_Table):
 class EpisodeFigures(_Table):
     """One row per figure of an episode."""
 
-    widths = "25 10 35 30"
+    widths = "30 15 55"
 
     def rows(self) -> list[list[str]]:
-        """Figure, how it is made from which keys, and the running key."""
-        rows = [["figure", "how", "of", "so far, at every step"]]
+        """Figure, and how it is made from which keys."""
+        rows = [["figure", "how", "of"]]
         for figure in info.EPISODE:
             of = ", ".join(f"``{name}``" for name in figure.of)
-            running = f"``{figure.running}``" if figure.running else ""
-            rows.append([f"``{figure.name}``", figure.how, of, running])
+            rows.append([f"``{figure.name}``", figure.how, of])
         return rows
 
 

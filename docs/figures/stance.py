@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 import safe_wrappers as sw
 from _ant import gait
-from _style import OFF, ON, OTHER, SAFE
+from _style import ON, OTHER
 
 BEFORE = 16
 """Control steps of the gait, after which a foot stands and the next torques would make it slide."""
@@ -27,9 +27,7 @@ def draw() -> Figure:
     figure = Figure(figsize=(7.2, 3.0))
     ax = figure.subplots()
     for options, color, label in (
-        ({"edges": 4}, OFF, "pyramid, 4 edges"),
-        ({"edges": 8}, OTHER, "8 edges"),
-        ({"edges": 16}, SAFE, "16 edges"),
+        ({}, OTHER, "pyramids"),
         ({"cone": "exact"}, ON, "exact cone"),
     ):
         distances = []

@@ -14,7 +14,6 @@ from safe_wrappers.sb3.callbacks import (
 )
 from safe_wrappers.sb3.critic_value import critic_value
 from safe_wrappers.sb3.gymnasium_vec_env import GymnasiumVecEnv
-from safe_wrappers.sb3.log_probability import log_probability
 from safe_wrappers.sb3.replay_buffers import (
     ExecutedActionDictReplayBuffer,
     ExecutedActionHerReplayBuffer,
@@ -31,5 +30,4 @@ __all__ = [
     "LagrangianMultiplier",
     "MarginCurriculum",
     "critic_value",
-    "log_probability",
 ]

@@ -38,7 +38,7 @@ class InterventionCallback(BaseCallback):
     def _on_step(self) -> bool:
         log_steps(self.logger, self.locals["infos"])
         for info in self.locals["infos"]:
-            log_episode(self.logger, info, keys.RUNNING_PREFIX)
+            log_episode(self.logger, info, "interventions/")
         return True
 
 
@@ -60,7 +60,7 @@ def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:
     for info in infos:
         for key in keys.KEYS.values():
             if key.log and key.name in info:
-                logger.record_mean(f"{keys.RUNNING_PREFIX}step_{key.log}", key.number(info[key.name]))
+                logger.record_mean(f"interventions/step_{key.log}", key.number(info[key.name]))
 
 
 def log_episode(logger: Logger, info: Mapping[str, Any], prefix: str) -> None:

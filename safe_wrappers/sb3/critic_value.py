@@ -30,7 +30,7 @@ def critic_value(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], NDArray[
     if critic is None and q_net is None:
         raise ConfigurationError(
             f"critic_value needs a critic that judges actions: SAC, TD3, DDPG, TQC or DQN; {type(model).__name__} has"
-            " none; log_probability says what its policy prefers"
+            " none"
         )
     scaling, policy = model.get_vec_normalize_env(), model.policy
     start = int(getattr(model.action_space, "start", 0))

@@ -1,18 +1,16 @@
-"""Admission of chunks of position setpoints: is the end within reach in time, and from which points can it stop?"""
+"""Admission of chunks of position setpoints: is the end within reach in time?"""
 
 from collections.abc import Callable
 from typing import Any
 
 import mujoco
 import numpy as np
-import ruckig
 from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.watchdog.reachability import (
     MotionLimits,
     admits,
-    jerk_limited_profile,
     jerk_limited_time,
 )
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
@@ -29,8 +27,7 @@ class Admission:
     """Refuses chunks that no motion within the limits could follow to their end; a necessary condition only.
 
     With arrival "moving" the end may be passed at any speed; with "rest" the machine must be able to stand there in
-    time. With "stopping" `stops` is True: chunks are admitted as far as they can be stopped from each of their points
-    (`stoppable`). `measured` None reads the lengths and velocities of the MuJoCo actuators; `controls` is m.
+    time. `measured` None reads the lengths and velocities of the MuJoCo actuators; `controls` is m.
     """
 
     def __init__(self, env: Env, motion_limits: Any, measured: Measured | None, controls: int) -> None:
@@ -45,7 +42,7 @@ class Admission:
             raise ConfigurationError(f"{wanted}: pass measured, {_MEASURED}")
         try:
             given = dict(motion_limits)
-            arrival, stops = given.pop("arrival", "moving"), given.pop("stopping", False)
+            arrival = given.pop("arrival", "moving")
             self._limits = MotionLimits(**given)
             np.broadcast_to(np.broadcast_arrays(*self._limits.arrays)[0], (controls,))
         except (TypeError, ValueError) as error:
@@ -53,15 +50,12 @@ class Admission:
                 raise
             wanted = f"each a number or one for each of the {controls} action components"
             raise ConfigurationError(
-                'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": ..., '
-                f'"stopping": ...}}, {wanted}; got {motion_limits!r}'
+                'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": ...}, '
+                f"{wanted}; got {motion_limits!r}"
             ) from None
         if arrival not in ("moving", "rest"):
             raise UnknownNameError(f"arrival is 'moving' or 'rest', got {arrival!r}")
-        if not isinstance(stops, bool):
-            raise ConfigurationError(f"stopping is True or False, got {stops!r}")
-        self._rest, self.stops = arrival == "rest", stops
-        self._axis_limits = tuple(np.broadcast_to(limit, (controls,)) for limit in self._limits.arrays)
+        self._rest = arrival == "rest"
         self._needs_acceleration = self._rest and bool(np.isfinite(self._limits.arrays[2]).any())
         if self._needs_acceleration and measured is None:
             raise ConfigurationError(f"arrival at rest: pass measured, {_MEASURED}, accelerations")
@@ -76,32 +70,6 @@ class Admission:
         here = 0.0 if acceleration is None else acceleration
         least_s = jerk_limited_time((position, velocity, here), (end, 0.0, 0.0), self._limits)
         return bool(least_s <= duration_s)
-
-    def stoppable(self, commands: Array, control_dt: float, room: float, late_s: float) -> int:
-        """How many of a chunk's first commands, shape (h, m), can be executed with a stop from each inside of a room.
-
-        The machine follows the setpoints, one in each control step, goes on for the delays at the fastest that it has
-        been, and stops with all axes together by ruckig's shortest profile. The sum of these ways, in whatever
-        direction, must be no longer than the room, which has the setpoints' unit of length.
-        """
-        position, velocity, _ = self._state()
-        start = np.broadcast_to(np.asarray(position, dtype=np.float64), commands.shape[1:])
-        moving = np.broadcast_to(np.asarray(velocity, dtype=np.float64), start.shape)
-        velocities = np.diff(np.concatenate([start[None], commands]), axis=0) / control_dt
-        accelerations = np.diff(np.concatenate([moving[None], velocities]), axis=0) / control_dt
-        if not np.isfinite(accelerations).all():
-            return 0
-        rest, fastest = np.zeros(start.shape), float(np.linalg.norm(moving))
-        for k, (command, v, a) in enumerate(zip(commands, velocities, accelerations, strict=True)):
-            stop = jerk_limited_profile(
-                (rest, v, a), (rest, rest, rest), self._axis_limits, ruckig.ControlInterface.Velocity
-            )
-            farthest = [max(-axis.min, axis.max) for axis in stop.position_extrema]
-            fastest = max(fastest, float(np.linalg.norm(v)))
-            way = np.linalg.norm(command - start) + late_s * fastest + np.linalg.norm(farthest)
-            if not way <= room:
-                return k
-        return len(commands)
 
     def _state(self) -> tuple[ArrayLike, ArrayLike, ArrayLike | None]:
         if self._measured is None:

@@ -2,10 +2,12 @@
 
 import copy
 import math
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
@@ -50,7 +52,7 @@ class CBFActionFilter(LayerWrapper):
         margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
 
     Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
-    ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe``, ``cbf/mismatch`` (bool); ``cbf/correction``, ``cbf/clipped``,
+    ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe``, ``cbf/mismatch`` (bool); ``cbf/correction``,
     ``cbf/margin`` (float); ``cbf/stage`` (int); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
 
     Attributes:
@@ -58,6 +60,7 @@ class CBFActionFilter(LayerWrapper):
         added_margin: Added to every constraint's own; `set_margin` changes it.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         warned: What has been warned of: "nonfinite", "clipped", "mismatch", and "unsafe" until the next reset.
+        started: Whether there was a reset.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
     Raises:
@@ -99,8 +102,18 @@ class CBFActionFilter(LayerWrapper):
         self.plant.bind(env)
         self._fallback = fallback
         self.filter = self._filter()
-        self._observed = False
+        self.started = self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
+        self._deciding = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the lock, which no copy shares."""
+        return {name: value for name, value in vars(self).items() if name != "_deciding"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a state of `__getstate__`."""
+        vars(self).update(state)
+        self._deciding = threading.Lock()
 
     def _take_action_space(self, env: Env) -> None:
         space = check_actions(env)
@@ -148,7 +161,7 @@ class CBFActionFilter(LayerWrapper):
     def start_report(self) -> dict[str, Any]:
         """Take the state that a reset has left: the info keys of a new episode."""
         self.warned.discard("unsafe")
-        self._observed = False
+        self.started, self._observed = True, False
         self.filter.start()
         margin, unsafe = self._margin()
         report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
@@ -162,13 +175,14 @@ class CBFActionFilter(LayerWrapper):
         return report | self.filter.info(None, None)
 
     def step(self, action: Any) -> Step:
-        """Filter the action and step the env with what may be executed."""
-        started = time.perf_counter()
-        sent, report = self.judge(action)
-        self.filter_seconds += time.perf_counter() - started
-        self.filter_calls += 1
-        observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
-        self.plant.received(observation, info)
+        """Filter the action and step the env with what may be executed; another thread waits meanwhile."""
+        with self._deciding:  # the env makes the step that was judged, from the state in which it was
+            started = time.perf_counter()
+            sent, report = self.judge(action)
+            self.filter_seconds += time.perf_counter() - started
+            self.filter_calls += 1
+            observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
+            self.plant.received(observation, info)
         info |= report
         info[keys.CBF_MISMATCH] = self.deviates()
         if self.filter.reporting:
@@ -198,6 +212,8 @@ class CBFActionFilter(LayerWrapper):
 
         The env must be stepped with it next. The constraints' own keys are not among these.
         """
+        if not self.started:
+            raise gym.error.ResetNeeded("call reset before step")
         proposed: Array = action_array(action, self._shape, np.float64)
         if not self._observed:
             self.filter.observe()
@@ -207,7 +223,6 @@ class CBFActionFilter(LayerWrapper):
         # False for NaN too, so that one comparison clears the common case.
         inside = bool(((proposed >= self._low) & (proposed <= self._high)).all())
         finite = inside or bool(np.isfinite(proposed).all())
-        clipped = 0.0
         usable: Array | None = proposed
         if not (readable and finite):
             if readable:
@@ -218,7 +233,7 @@ class CBFActionFilter(LayerWrapper):
         elif not inside:
             usable = np.clip(proposed, self._low, self._high)
             clipped = float(np.linalg.norm(usable - proposed))
-            message = f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)"
+            message = f"the policy's action left the action space by {clipped:.3g}; it is boxed"
             self._warn_once("clipped", message)
         decision = self.filter.filter(usable)
         intervened = decision.changed
@@ -243,7 +258,6 @@ class CBFActionFilter(LayerWrapper):
             keys.CBF_MISMATCH: False,
             keys.CBF_REFUSED: none if decision.refused is None else decision.refused,
             keys.CBF_CORRECTION: correction,
-            keys.CBF_CLIPPED: clipped,
             keys.CBF_MARGIN: margin,
             keys.PROPOSED_ACTION: proposed,
             keys.EXECUTED_ACTION: executed.copy(),

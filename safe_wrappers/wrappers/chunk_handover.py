@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import OF_NUMBERS, Array, non_negative, numbers_of, settings_from, shown
+from safe_wrappers.checks import OF_NUMBERS, Array, numbers_of, settings_from, shown
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
 from safe_wrappers.errors import ActionError, UnknownNameError
@@ -22,7 +22,7 @@ from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_mode
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.chunk_queue import (
-    BASELINES,
+    REPLACE,
     ChunkQueue,
     ChunkSizes,
     Command,
@@ -39,7 +39,6 @@ from safe_wrappers.wrappers.layer import (
     Reset,
     Step,
     WrapperRng,
-    outside,
     receiver_inside,
 )
 
@@ -55,7 +54,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     **What it guarantees.** With `rate_limit`, the commands that it sends in neighbouring control steps of an episode
     differ by at most `rate_limit` times the control interval in every component, whatever the chunks; commands that
     are held back for it are counted (`handover/limited`). A chunk with an entry that is not finite is refused as a
-    whole. Entries outside the action box are clipped to it (`handover/clipped`). **What it does not.** A filter
+    whole. Entries outside the action box are clipped to it. **What it does not.** A filter
     inside may have to break the limit. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter`
     belong inside.
 
@@ -64,28 +63,23 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         chunk_size: H, entries of a chunk.
         execution_horizon: s, control steps from one chunk's observation to the next; `d <= s <= H - d`.
         inference_delay: d, control steps; or [least, most], drawn anew for every chunk.
-        blend: "smoothstep", "quintic", "hermite"; or a baseline without any bound: "replace" takes the new chunk at
-            once, "ensemble" averages all chunks at hand (temporal ensembling, Zhao et al., RSS 2023).
+        blend: "smoothstep" or "quintic"; or "replace", a baseline without any bound: the new chunk at once.
         blend_time: s, the least duration of a blend; without it and `rate_limit` blends are as long as the left-over.
         rate_limit: Bound on |u[k+1] - u[k]| / control interval, for all components or one each, action units per s.
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
-        decay: The ensemble's weights are exp(-decay i), i = 0 the oldest.
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
-        clock_error_s: Observation times that are ahead of `now_s` by no more count as now, s; others are refused.
         limits: Of the machine, which every blend keeps between its ends, too: it is stretched until it does, or its
             chunk is refused.
         flexible: A `plants.rigid_model_check`, or "auto", which makes one now: where it finds that springs ring on,
-            `blend_time` and `rate_limit` are at least as strict as `vibration_share` asks, and smoothsteps that the
-            next seam comes before the end of fade out beside the next one.
-        vibration_share: Of the energy that a step of torque leaves in the springs, what a blend over the whole action
-            range may leave.
+            `blend_time` and `rate_limit` are so strict that a blend over the whole action range leaves at most 1 % of
+            the energy that a step of torque leaves in the springs, and smoothsteps that the next seam comes before
+            the end of fade out beside the next one.
 
     Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
-    ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/stretched``, ``handover/refused``,
-    ``handover/clipped``, ``handover/latency``, ``handover/steps``. The inner layers' info is merged over the control
-    steps.
+    ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``.
+    The inner layers' info is merged over the control steps.
 
     Raises:
         ConfigurationError: Sizes that do not fit together, a time or limit that is not positive, nothing to blend
@@ -117,21 +111,17 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
         control_dt: float | None = None,
-        decay: float = 0.01,
         steps_per_entry: int = 1,
-        clock_error_s: float = 0.0,
         limits: SeamLimits | Mapping[str, Any] | None = None,
         flexible: RigidModelCheck | Mapping[str, Any] | str | None = None,
-        vibration_share: float = 0.01,
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)  # first: with a handover inside the actions are no vector either
         space = check_actions(env)
         plant = own_plant(plant)
         sizes = ChunkSizes.checked(chunk_size, execution_horizon, inference_delay, steps_per_entry)
-        if blend not in (*BLENDS, *BASELINES):
-            raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
-        decay = non_negative("decay", decay, "a number")
+        if blend not in (*BLENDS, REPLACE):
+            raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, REPLACE))}")
         limits = None if limits is None else settings_from(SeamLimits, limits, "limits")
         blend_time, rate_limit, control_dt = map(plain_numbers, (blend_time, rate_limit, control_dt))
         self._record(
@@ -143,7 +133,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             rate_limit=rate_limit,
             plant=plant,
             control_dt=control_dt,
-            decay=decay,
             steps_per_entry=sizes.steps_per_entry,
             limits=plain_data(limits),
             flexible=plain_data(flexible),
@@ -151,7 +140,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
         self.control_dt = check_timing(env, control_dt)
         self._delay = sizes.delay
-        self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         self._upsampling = Upsampling(sizes.entries, sizes.steps_per_entry)
         self._controls = space.shape[0]
         low, high = (np.repeat(end[None], sizes.entries, axis=0) for end in (space.low, space.high))
@@ -159,13 +147,11 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback = FallbackController(env, fallback, plant)
         springs = self._springs(flexible)
         if springs is not None:
-            blend_time, rate_limit = bounds_for_springs(
-                springs, vibration_share, space, blend_time, rate_limit
-            )
+            blend_time, rate_limit = bounds_for_springs(springs, space, blend_time, rate_limit)
         bounds = blend_time, rate_limit, limits
         fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, *bounds)
         self._check = None if limits is None else self._bound_check(limits)
-        queue = space, self.control_dt, blend, fewest, rate_limits, decay, self._check
+        queue = space, self.control_dt, blend, fewest, rate_limits, self._check
         self._queue = ChunkQueue(*queue, overlap=springs is not None)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
@@ -178,13 +164,13 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback.reset()
         self._queue.reset()
         self._start()
-        info.update(self._measured([], False, -1, 0.0))
+        info.update(self._measured([], False, -1))
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Execute the next `execution_horizon` control steps, with this chunk from when it is there."""
         chunk = self._checked(action)
-        clipped = self._clipped(chunk)
+        self._warn_clipped(chunk)
         refused = not self._submit(chunk)
         total: Any = 0.0
         infos, commands, latency = [], [], -1
@@ -209,8 +195,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             if terminated or truncated:
                 break
         self._observed_s = self.now_s
-        info = macro_info(infos)
-        info.update(self._measured(commands, refused, latency, clipped))
+        info = keys.merged(infos)
+        info.update(self._measured(commands, refused, latency))
         return observation, total, terminated, truncated, info
 
     @property
@@ -255,7 +241,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         return chunk
 
     def _admits(self, commands: Array) -> bool:
-        return self._inside is None or self._inside.admits_chunk(commands)
+        return self._inside is None or self._inside.admits(commands[-1], len(commands))
 
     def _submit(self, chunk: Array) -> bool:
         """Send the chunk on its way; False if one came and was refused."""
@@ -264,10 +250,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             return True
         if not np.isfinite(chunk).all():
             return False
-        observed_s = self._observed_s
-        if self.now_s < observed_s <= self.now_s + self._clock_error_s + SAME_STEP * self.control_dt:
-            observed_s = self.now_s
-        observed = math.floor(observed_s / self.control_dt + SAME_STEP)
+        observed = math.floor(self._observed_s / self.control_dt + SAME_STEP)
         if self._check is not None and not self._upsampling.bears_knots(chunk, self._check, self.control_dt):
             return False
         return self._queue.submit(self._upsampling.commands(chunk), observed, self._queue.now + delay)
@@ -284,18 +267,15 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             self._seam_until = now + command.blend_steps + DIFFERENCES - 1  # it ends a blend under way
         return now <= self._seam_until
 
-    def _clipped(self, chunk: Array) -> float:
-        """By how much a chunk left the action space; the first one that does is warned of."""
+    def _warn_clipped(self, chunk: Array) -> None:
+        """The first chunk that leaves the action space is warned of."""
         space: Any = self.action_space
-        clipped = outside(chunk, space.low, space.high)
-        if clipped > 0.0:
-            message = f"the policy's action left the action space by {clipped:.3g} (handover/clipped)"
-            self._warn_once("clipped", f"{message}; entries of the chunk are clipped to it")
-        return clipped
+        if (((chunk < space.low) | (chunk > space.high)) & np.isfinite(chunk)).any():
+            self._warn_once(
+                "clipped", "the policy's action left the action space; its entries are clipped to it"
+            )
 
-    def _measured(
-        self, commands: list[Command], refused: bool, latency: int, clipped: float
-    ) -> dict[str, Any]:
+    def _measured(self, commands: list[Command], refused: bool, latency: int) -> dict[str, Any]:
         counted = np.array(self._in_seam, dtype=bool)
         jump, peak = np.zeros(DIFFERENCES), 0.0
         for order in range(1, DIFFERENCES + 1):
@@ -316,25 +296,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             keys.HANDOVER_BLEND_TIME: (max(blends) + 1) * self.control_dt if blends else 0.0,
             keys.HANDOVER_STARVED: sum(c.starved for c in commands),
             keys.HANDOVER_LIMITED: limited,
-            keys.HANDOVER_STRETCHED: sum(c.stretched for c in commands),
-            keys.HANDOVER_STEPS: len(commands),
             keys.HANDOVER_REFUSED: refused,
-            keys.HANDOVER_CLIPPED: clipped,
             keys.HANDOVER_LATENCY: latency,
         }
-
-
-def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
-    """The last control step's info, with each registered key merged over the steps as `InfoKey.chunk` says."""
-    last = infos[-1]
-    if len(infos) == 1:
-        return last
-    merged: dict[str, Any] = {}
-    for name, key in keys.KEYS.items():
-        values = [i[name] for i in infos if name in i and (not key.where or i.get(key.where))]
-        if values and key.chunk != "last":
-            value = getattr(np, key.chunk)(values, axis=0)  # the others are NumPy's own names
-            array = isinstance(values[-1], np.ndarray)
-            merged[name] = np.asarray(value, values[-1].dtype) if array else type(values[-1])(value)
-    last.update(merged)
-    return last

@@ -9,19 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, positive, whole_number
+from safe_wrappers.control.handover.curves import hermite_spline
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, Seam, drawn_out, join
 from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE, shortest_latched_blend, smoothstep
-from safe_wrappers.control.handover.splines import hermite_series
 from safe_wrappers.control.handover.vibration import shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck
 from safe_wrappers.wrappers.layer import whole_steps
 
 REPLACE: Final = "replace"
-ENSEMBLE: Final = "ensemble"
-BASELINES: Final = (REPLACE, ENSEMBLE)
-"""What is done without a bound on the seam: the new chunk at once, or the mean of all chunks at hand."""
+"""The baseline without a bound on the seam: the new chunk at once."""
+
+
+_VIBRATION_SHARE: Final = 0.01
+"""Of the energy that a step of torque leaves in springs, what a blend over the whole action range may leave."""
 
 
 class Command(NamedTuple):
@@ -35,7 +37,6 @@ class Command(NamedTuple):
     refused: bool  # a chunk that has arrived was refused
     seam: bool  # there is a seam before it: another chunk, another source, or the fallback began
     blend_steps: int  # control steps of the blend that begins with this command; 0 if none does
-    stretched: bool  # that blend is longer than without the machine's limits
 
 
 class Chunk(NamedTuple):
@@ -55,10 +56,9 @@ class ChunkQueue:
     Args:
         space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
         control_dt: Control interval, s.
-        blend: A blend of `control/handover/seams.py`, "replace" or "ensemble".
+        blend: A blend of `control/handover/seams.py`, or "replace".
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
-        decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
         check: Of the machine's limits; None accepts all blends.
         overlap: A smoothstep that the next seam comes before the end of is not cut short: what is left of it fades
             out beside the next one. A left-over that is shorter than a blend is drawn out. What keeps the rate limit
@@ -72,11 +72,10 @@ class ChunkQueue:
         blend: str,
         fewest: int,
         rate_limit: Array,
-        decay: float,
         check: SeamCheck | None = None,
         overlap: bool = False,
     ) -> None:
-        self._control_dt, self._blend, self._fewest, self._decay = control_dt, blend, fewest, decay
+        self._control_dt, self._blend, self._fewest = control_dt, blend, fewest
         self._rate_limit, self._check = rate_limit, check
         self._overlap = overlap and blend == "smoothstep"
         step = np.asarray(rate_limit * control_dt)
@@ -99,7 +98,6 @@ class ChunkQueue:
         self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
         self._asked = self._none  # the chunk in force as it came; it ends with the plan
         self._coming: list[Chunk] = []
-        self._averaged: list[Chunk] = []
         self._in_force = self._source
         self._acting: str | None = None
         self._fade: tuple[Array, int, int] | None = (
@@ -131,14 +129,14 @@ class ChunkQueue:
                 (h, m).
             fallback: Called when nothing is planned; returns a finite control of shape (m,).
         """
-        admitted, refused = self._admitted(admits)
+        chunk, refused = self._admitted(admits)
         newest = self._observed
         self._coming = [c for c in self._coming if c.due > self.now]
-        seam, blend_steps, stretched = False, 0, False
-        if admitted:
-            joined = self._take_over(admitted)
+        seam, blend_steps = False, 0
+        if chunk is not None:
+            joined = self._take_over(chunk)
             refused |= joined is None
-            seam, blend_steps, stretched = joined or (False, 0, False)
+            seam, blend_steps = joined or (False, 0)
         control, limited = self._planned()
         starved = control is None
         if control is None:
@@ -156,45 +154,34 @@ class ChunkQueue:
         self.now += 1
         took_over = self._observed > newest
         held |= limited
-        return Command(sent, self._observed, starved, held, took_over, refused, seam, blend_steps, stretched)
+        return Command(sent, self._observed, starved, held, took_over, refused, seam, blend_steps)
 
-    def _admitted(self, admits: Callable[[Array], bool]) -> tuple[list[Chunk], bool]:
-        """The chunks that may take over now, the newest observation first; and whether one was refused."""
-        admitted: list[Chunk] = []
+    def _admitted(self, admits: Callable[[Array], bool]) -> tuple[Chunk | None, bool]:
+        """The chunk of the newest observation that may take over now, if any; and whether one was refused."""
         refused = False
         for chunk in reversed([c for c in self._coming if c.due <= self.now]):
             left = chunk.commands[self.now - chunk.observed :]
-            if not (len(left) and admits(left)):  # it came too late, or must not
-                refused = True
-                continue
-            admitted.append(chunk)
-            if self._blend != ENSEMBLE:
-                break
-        return admitted, refused
+            if len(left) and admits(left):
+                return chunk, refused
+            refused = True  # it came too late, or must not
+        return None, refused
 
-    def _take_over(self, admitted: list[Chunk]) -> tuple[bool, int, bool] | None:
-        """Let the newest of these take over, or all in an ensemble; None if no blend keeps the machine's limits.
-
-        Returns whether it is a seam, its blend's steps, and whether these limits stretched it.
-        """
-        newest = admitted[0]
-        fresh = newest.commands[self.now - newest.observed :]
+    def _take_over(self, chunk: Chunk) -> tuple[bool, int] | None:
+        """Let a chunk take over: whether it is a seam, and its blend's steps; None if no blend keeps the limits."""
+        fresh = chunk.commands[self.now - chunk.observed :]
         joined: Seam | None = None
-        if self._blend in BLENDS and len(newest.commands) > 1:
+        if self._blend in BLENDS and len(chunk.commands) > 1:
             joined = self._joined(fresh)
             if joined is None:
                 return None
-        self._coming = [c for c in self._coming if c.observed > newest.observed]
-        self._observed, self._in_force = newest.observed, self._source
-        if self._blend == ENSEMBLE:
-            self._averaged += reversed(admitted)
-            return len(self._sent) > 0, 0, False
+        self._coming = [c for c in self._coming if c.observed > chunk.observed]
+        self._observed, self._in_force = chunk.observed, self._source
         if joined is None:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
-            return self._blend == REPLACE and len(self._sent) > 0, 0, False
+            return self._blend == REPLACE and len(self._sent) > 0, 0
         self._plan, self._limited, self._asked = joined.plan, joined.limited, fresh
         self._fade = None
-        return len(self._sent) > 0, joined.steps, joined.stretched
+        return len(self._sent) > 0, joined.steps
 
     def _joined(self, fresh: Array) -> Seam | None:
         """The blend into a chunk's rest, shape (n, m); None if none keeps the machine's limits."""
@@ -220,13 +207,6 @@ class ChunkQueue:
         )
 
     def _planned(self) -> tuple[Array | None, bool]:
-        if self._blend == ENSEMBLE:
-            self._averaged = [c for c in self._averaged if c.observed + len(c.commands) > self.now]
-            if not self._averaged:
-                return None, False
-            votes = np.array([c.commands[self.now - c.observed] for c in self._averaged])
-            weights = np.exp(-self._decay * np.arange(len(votes)))
-            return np.asarray(weights @ votes / weights.sum()), False
         if not len(self._plan):
             return None, False
         control, limited = self._plan[0], bool(self._limited[0])
@@ -321,7 +301,7 @@ def blend_bounds(
     fewest, rate_limits = 0, np.full(space.shape, np.inf)
     given = {"blend_time": blend_time, "rate_limit": rate_limit, "limits": limits}
     named = [name for name, one in given.items() if one is not None]
-    if blend in BASELINES:
+    if blend == REPLACE:
         if named:
             bounded = ", ".join(BLENDS)
             baseline = f"blend={blend!r} is a baseline that bounds nothing"
@@ -352,17 +332,16 @@ def blend_bounds(
 
 def bounds_for_springs(
     check: RigidModelCheck,
-    share: float,
     space: gym.spaces.Box,
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
 ) -> tuple[float, Sequence[float] | float | None]:
     """Blend time, s, and rate limit, each the stricter of the user's and of what springs ask.
 
-    These ask for the time from which on a smoothstep leaves at most a share of a step's energy in them, and for the
+    These ask for the time from which on a smoothstep leaves at most 1 % of a step's energy in them, and for the
     steepest rate of such a blend over the whole action range, if every component has one.
     """
-    shortest = shortest_smoothstep(share, check.resonances[0])
+    shortest = shortest_smoothstep(_VIBRATION_SHARE, check.resonances[0])
     own = np.full(space.shape, np.inf) if rate_limit is None else _rate_limits(rate_limit, space.shape[0])
     rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / shortest, own)
     return max(shortest, blend_time or 0.0), rates.tolist() if np.isfinite(rates).all() else rate_limit
@@ -410,11 +389,9 @@ class Upsampling:
     def __init__(self, entries: int, steps: int) -> None:
         self._steps = steps
         if steps > 1:
-            times = np.arange(entries) * float(steps)
-            unit = np.eye(entries)
-            rates = np.asarray(np.gradient(unit, axis=1)) / steps
             # The spline is linear in the entries: one matrix for all chunks.
-            self._weights = hermite_series(times, unit, rates, np.arange((entries - 1) * steps + 1)).T
+            spline = hermite_spline(np.eye(entries), float(steps))
+            self._weights = np.asarray(spline(np.arange((entries - 1) * steps + 1.0)))
 
     def bears_knots(self, chunk: Array, check: SeamCheck, control_dt: float) -> bool:
         """Whether the torque steps where the spline's pieces meet keep the machine's limits."""

@@ -1,6 +1,6 @@
 """What decides between a command and the fallback: `CommandGate` and `FallbackController`."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.layer import SAME_STEP, CommandReceiver, Env, LayerWrapper, Step, outside
+from safe_wrappers.wrappers.layer import SAME_STEP, CommandReceiver, Env, LayerWrapper, Step
 
 
 class FallbackController:
@@ -73,8 +73,6 @@ class FallbackController:
 class CommandGate(LayerWrapper, CommandReceiver):
     """Base of `LeaseExpiry` and `TeleopChannel`; the env has a one-dimensional Box action space."""
 
-    clipped_key: ClassVar[str]
-    """Of the info: by how much an action left the space."""
     _fallback: FallbackController | None
 
     def __init__(self, env: Env, control_dt: float | None) -> None:
@@ -92,7 +90,6 @@ class CommandGate(LayerWrapper, CommandReceiver):
         self._observed_s = 0.0
         if not self._filtered:
             info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
-            info[self.clipped_key] = 0.0
 
     def _boxed(self, control: Any) -> Array:
         """Clipped to the action box, shape (m,)."""
@@ -109,14 +106,12 @@ class CommandGate(LayerWrapper, CommandReceiver):
             self._warn_once("nonfinite", f"the {whose} action is not finite ({action}); {consequence}")
         return finite
 
-    def _measure(self, action: NDArray[Any], whose: str) -> None:
-        """By how much the action of this step is outside the space; the first one that is is warned of."""
-        if self._filtered:
-            return
-        self._clipped = outside(action.astype(np.float64), self._low, self._high)
-        if self._clipped > 0.0:
-            message = f"the {whose} action left the action space by {self._clipped:.3g} ({self.clipped_key})"
-            self._warn_once("outside", f"{message}; no CBFActionFilter inside boxes it")
+    def _warn_outside(self, action: NDArray[Any], whose: str) -> None:
+        """The first action outside the space is warned of, where no filter inside boxes it."""
+        beyond = (action < self._low) | (action > self._high)
+        if not self._filtered and (beyond & np.isfinite(action)).any():
+            message = f"the {whose} action left the action space, and no CBFActionFilter inside boxes it"
+            self._warn_once("outside", f"{message}: {action}")
 
     def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:
         """Step the env; returns what was executed, which a filter inside may have changed, and the env's answer."""
@@ -128,7 +123,6 @@ class CommandGate(LayerWrapper, CommandReceiver):
             executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)
         else:
             info[keys.EXECUTED_ACTION] = executed.copy()
-            info[self.clipped_key] = self._clipped
         if self._fallback is not None:
             self._fallback.executed(executed)
         self._steps_done += 1

@@ -1,7 +1,6 @@
 """What goes wrong between a policy and a robot, as seeded wrappers: to test with, and to train against."""
 
 import copy
-import math
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -27,7 +26,6 @@ from safe_wrappers.wrappers.layer import (
 
 __all__ = [
     "FAULTS",
-    "ClockSkew",
     "DroppedRefreshes",
     "Fault",
     "FrozenPolicy",
@@ -122,9 +120,6 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
     def admits(self, end: NDArray[np.float64], steps: int) -> bool:
         return self._inside is None or self._inside.admits(end, steps)
 
-    def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
-        return self._inside is None or self._inside.admits_chunk(commands)
-
     def _refuse_what_is_no_action(self, action: Any) -> None:
         """Now, and not when it arrives, at a step whose action is a right one."""
         self._refuse_what_is_not_finite(action)
@@ -211,29 +206,6 @@ class Jitter(Fault):
         return newest
 
 
-class ClockSkew(Fault):
-    """Gives the observation times of a clock that is off, and runs at another rate: `(1 + drift) t + offset_s`.
-
-    A clock that is ahead (`offset_s` > 0, in s; `drift` is in s/s) makes commands look younger, or from the future.
-    """
-
-    def __init__(
-        self, env: Env, offset_s: float = 0.0, drift: float = 0.0, control_dt: float | None = None
-    ) -> None:
-        for name, value in (("offset_s", offset_s), ("drift", drift)):
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise ConfigurationError(f"{name} is a finite number, got {value!r}")
-        if offset_s == 0.0 and drift == 0.0:
-            raise ConfigurationError("a clock with neither offset_s nor drift is right; give one of them")
-        super().__init__(env, control_dt, offset_s=offset_s, drift=drift)
-        self._offset_s, self._drift = offset_s, drift
-
-    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        if given is None:
-            return None
-        return Carried(given.action, (1.0 + self._drift) * given.observed_s + self._offset_s)
-
-
 class OnOffProcess:
     """A process that is off and on by turns, both for exponentially distributed times (means in s); it begins off."""
 
@@ -292,7 +264,6 @@ class FrozenPolicy(OnOffFault):
 
 
 FAULTS: dict[str, type[Fault]] = {
-    kind.__name__: kind
-    for kind in (ClockSkew, DroppedRefreshes, FrozenPolicy, Jitter, Outages, RepeatedCommands)
+    kind.__name__: kind for kind in (DroppedRefreshes, FrozenPolicy, Jitter, Outages, RepeatedCommands)
 }
 """By name, for configs."""

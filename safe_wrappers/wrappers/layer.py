@@ -17,7 +17,6 @@ from safe_wrappers.plants.default import PlantTemplate
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.serialize import recorded
 from safe_wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.episode_guard import EpisodeGuard
 
 Env = gym.Env[Any, Any]
 Reset = tuple[Any, dict[str, Any]]
@@ -29,7 +28,7 @@ Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 _WRAPPERS = __name__.rpartition(".")[0]
 
 
-class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
     """A wrapper with a place in the stack, whose arguments are recorded in the env's spec."""
 
     layer: ClassVar[Layer]
@@ -38,7 +37,6 @@ class LayerWrapper(EpisodeGuard, gym.Wrapper[Any, Any, Any, Any], gym.utils.Reco
         refuse_vector_env(env, type(self).__name__)
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
-        self.await_reset()
         self.warned: set[str] = set()
         innermost = not any(isinstance(inner, LayerWrapper) for inner in wrappers_of(env))
         self._passes_numbers = innermost and isinstance(env.action_space, gym.spaces.Box)
@@ -154,22 +152,10 @@ class CommandReceiver:
         """Whether a chunk may be executed that ends with this command, shape (m,), so many control steps from now."""
         return True
 
-    def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
-        """Whether a chunk may be executed, shape (h, m): the commands of the next h control steps."""
-        return self.admits(commands[-1], len(commands))
-
 
 def receiver_inside(env: Env) -> CommandReceiver | None:
     """The outermost receiver among an env's wrappers."""
     return next((inner for inner in wrappers_of(env) if isinstance(inner, CommandReceiver)), None)
-
-
-def outside(action: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> float:
-    """The L2 norm by which an action (m,) left its box, of a chunk (h, m) the largest; NaN and inf count as 0."""
-    if ((action >= low) & (action <= high)).all():
-        return 0.0
-    beyond = np.where(np.isfinite(action), action - np.clip(action, low, high), 0.0)
-    return max(math.hypot(*one) for one in np.atleast_2d(beyond).tolist())  # squares may overflow
 
 
 def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None) -> NDArray[Any]:

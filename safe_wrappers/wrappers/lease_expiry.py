@@ -46,13 +46,8 @@ class LeaseExpiry(CommandGate):
         min_lease_s: Every fresh command gets a lease of at least so long, s; above 0 only with a CBFActionFilter
             inside. Behind a `ChunkHandover` give the time of one `execution_horizon`.
         blend_time: s, of the way back from the fallback to a fresh command.
-        brake_blend_time: s, of the way to the fallback; it counts in the budget. 0: at once.
-        clock_error_s: Bound on how wrong the times of observations may be, s; it counts in the budget.
         motion_limits: For actions that are position setpoints: {"max_acceleration": ..., "max_speed": ...,
-            "max_jerk": ..., "arrival": "moving" or "rest", "stopping": True or False}; chunks whose end is out of
-            reach are refused. With "stopping" a chunk's lease ends with the last of its points up to which a
-            jerk-limited stop from each would stay within the clearance, in whatever direction; a chunk without such a
-            point is refused.
+            "max_jerk": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
         measured: For `motion_limits`: a function of the env that returns positions, velocities and, for an arrival at
             rest with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
         fallback: "brake", "hold", "zero", or a function of the plant.
@@ -60,7 +55,7 @@ class LeaseExpiry(CommandGate):
         control_dt: Control interval, s; None reads the env's `dt`.
 
     Info, at every step: ``lease/remaining_s`` (float), ``lease/expired``, ``lease/refused``, ``lease/braking``
-    (bool); without a filter inside ``lease/clipped`` (float) and ``executed_action``.
+    (bool), and ``executed_action``.
 
     Raises:
         ConfigurationError: A missing or negative bound or time, a clearance that is neither, or a wrong order.
@@ -78,11 +73,10 @@ class LeaseExpiry(CommandGate):
     """
 
     layer: ClassVar = Layer.LEASE
-    clipped_key: ClassVar = keys.LEASE_CLIPPED
 
     _fallback: FallbackController
     _executed: Array | None
-    _blend: tuple[Array, int, int] | None
+    _blend: tuple[Array, int] | None
 
     def __init__(
         self,
@@ -95,8 +89,6 @@ class LeaseExpiry(CommandGate):
         max_lease_s: float = 1.0,
         min_lease_s: float = 0.0,
         blend_time: float = 0.1,
-        brake_blend_time: float = 0.0,
-        clock_error_s: float = 0.0,
         motion_limits: Mapping[str, Any] | None = None,
         measured: Measured | None = None,
         fallback: str | FallbackFunction = "brake",
@@ -120,13 +112,9 @@ class LeaseExpiry(CommandGate):
             example = "LeaseExpiry(sw.protect(env), ...)"
             raise ConfigurationError(f"min_lease_s above 0 needs a CBFActionFilter inside: {example}")
         self._blend_steps = whole_steps(non_negative("blend_time", blend_time, "s"), self.control_dt)
-        brake_blend_time = non_negative("brake_blend_time", brake_blend_time, "s")
-        self._brake_steps = whole_steps(brake_blend_time, self.control_dt)
-        self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         delays = {"detect_s": detect_s, "confirm_s": confirm_s, "age_s": age_s}
         detect, confirm, age = (non_negative(name, value, "s") for name, value in delays.items())
-        self._delays_s = detect + confirm + age + self._brake_steps * self.control_dt + self._clock_error_s
-        self._delays_s += self._same_s  # by which a step may outlast its lease
+        self._delays_s = detect + confirm + age + self._same_s  # by which a step may outlast its lease
         self._budget = BoundBudget(budget, env)
         plant = self._budget.plant_of(plant)
         self._fallback = FallbackController(env, fallback, plant, self._budget.constraint)
@@ -136,9 +124,6 @@ class LeaseExpiry(CommandGate):
         self._admission: Admission | None = None
         if motion_limits is not None:
             self._admission = Admission(env, motion_limits, measured, self._low.size)
-            if self._admission.stops and not budget.measures_approach:
-                raise ConfigurationError("stopping needs a clearance in the setpoints' unit of length")
-        self._late_s = self._delays_s + budget.act_s
         self._start({})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -158,31 +143,28 @@ class LeaseExpiry(CommandGate):
         self._executed = None
         self._braking = self._chunk_refused = False
         self._blend = None
-        self._chunk_s = math.inf
 
     def step(self, action: Any) -> Step:
         """Execute the action under its lease, the command in force under its own, or the fallback."""
         given = action_array(action, self._shape)
-        self._measure(given, "policy's")
+        self._warn_outside(given, "policy's")
         now = self.now_s
         arrived, fresh, refused = self._accept(given, now)
         if fresh:
             refused |= not self._grant(now)
-        self._chunk_s = math.inf
         covered = now + self.control_dt <= self._until_s + self._same_s
         expired = not covered and self._until_s > -math.inf
         if covered:
             if arrived:
                 self._command = given
             if self._braking:
-                self._braking, self._blend = False, self._start_blend(self._blend_steps)
+                self._braking, self._blend = False, self._start_blend()
             # The env gets a copy as well: it may scale in place what is still in force.
             sent = self._command.copy() if self._blend is None else self._blended(self._command)
         else:
             self._until_s = -math.inf
-            if not self._braking:
-                self._braking, self._blend = True, self._start_blend(self._brake_steps)
-            sent = self._blended(self._fallback.command())
+            self._braking, self._blend = True, None
+            sent = self._fallback.command().astype(self._dtype)
         self._executed, answer = self._execute(sent)
         self._observed_s = self.now_s
         info = answer[4]
@@ -202,25 +184,13 @@ class LeaseExpiry(CommandGate):
         self._chunk_refused |= not admitted
         return admitted
 
-    def admits_chunk(self, commands: Array) -> bool:
-        """Whether the end is within `motion_limits`; with "stopping" the lease is cut to the points that can stop."""
-        if not self.admits(commands[-1], len(commands)):
-            return False
-        if self._admission is None or not self._admission.stops:
-            return True
-        self._budget.measure()
-        points = self._admission.stoppable(commands, self.control_dt, self._budget.room, self._late_s)
-        self._chunk_s = min(self._chunk_s, points * self.control_dt)
-        self._chunk_refused |= points == 0
-        return points > 0
-
     def _accept(self, command: NDArray[Any], now: float) -> tuple[bool, bool, bool]:
         """Whether there is a command that may be executed, whether it is a fresh one, whether one was refused."""
         observed_s, refused, newest_s = self._observed_s, self._chunk_refused, self._newest_s
         self._chunk_refused = False
         if observed_s is None:
             return False, False, refused
-        from_future = observed_s > now + self._clock_error_s + self._same_s
+        from_future = observed_s > now + self._same_s
         finite = self._is_finite(command, "policy's", "the command in force goes on under its lease")
         if from_future or observed_s < newest_s - self._same_s or not finite:
             return False, False, True
@@ -233,24 +203,22 @@ class LeaseExpiry(CommandGate):
         """A new lease for the fresh command; False, and none at all, where it would not last."""
         self._budget.measure()
         longest_s = self._budget.longest_time(self._delays_s + max(now - self._newest_s, 0.0))
-        lease = max(min(longest_s, self._max_lease_s, self._chunk_s), self._min_lease_s)
+        lease = max(min(longest_s, self._max_lease_s), self._min_lease_s)
         # NaN gives no lease at all: a filter inside reads the same state.
         granted = not math.isnan(longest_s) and lease + self._same_s >= self.control_dt
         self._until_s = now + lease if granted else -math.inf
         return granted
 
-    def _start_blend(self, steps: int) -> tuple[Array, int, int] | None:
-        """From what was executed last, over so many steps; None where nothing was executed yet."""
-        if self._executed is None or steps == 0:
+    def _start_blend(self) -> tuple[Array, int] | None:
+        """From what was executed last, and how many steps of the blend are done; None where there is nothing to."""
+        if self._executed is None or self._blend_steps == 0:
             return None
-        return self._boxed(self._executed), steps, 0
+        return self._boxed(self._executed), 0
 
     def _blended(self, target: Any) -> Any:
         """In the box, so that rounding to its dtype makes no infinity of anything."""
-        control = self._boxed(target)
-        if self._blend is not None:
-            start, steps, done = self._blend
-            weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
-            control = start * (1.0 - weight) + weight * control
-            self._blend = (start, steps, done + 1) if done + 1 < steps else None
-        return control.astype(self._dtype)
+        assert self._blend is not None
+        start, done = self._blend
+        weight = float(smoothstep((done + 1.0) / (self._blend_steps + 1.0)))
+        self._blend = (start, done + 1) if done + 1 < self._blend_steps else None
+        return (start * (1.0 - weight) + weight * self._boxed(target)).astype(self._dtype)

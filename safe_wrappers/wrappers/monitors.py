@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
-from safe_wrappers.control.contact.impact import complementarity_residuals, normal_impulse, peak_force
+from safe_wrappers.control.contact.impact import complementarity_residuals
 from safe_wrappers.control.legged.support import support_distances
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.contacts import (
@@ -25,7 +25,6 @@ from safe_wrappers.plants.mujoco.contacts import (
 )
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.queries.floating_base import MomentumReader
-from safe_wrappers.plants.queries.next_impact import NextImpact
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
 
@@ -82,7 +81,7 @@ class StepMonitor(LayerWrapper, ABC):
 
 
 class ContactMonitor(StepMonitor):
-    """Reports forces, impulses and violations of a MuJoCo env's contacts, and the next impact; changes nothing.
+    """Reports forces, impulses and violations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
     of its own, from the state before it and with the inputs that the env has left. An env that changes its inputs or
@@ -93,24 +92,17 @@ class ContactMonitor(StepMonitor):
         bodies: Names of the bodies to watch; None watches all.
         against: Names of what they touch, "world" among them; None is everything. A contact counts if one of its
             bodies is in each list.
-        restitution: e of every impact, from 0 (plastic) to 1 (elastic); with it the next impact is predicted.
-        stiffness: k of every contact, both sides in series, N/m; with it the peak force of that impact, too.
 
     Info, at every step (0 and False after a reset; not finite where the simulation's contacts are not):
     ``contact/peak_force`` (N), the largest normal force between two bodies, summed over their contacts;
     ``contact/impulse`` (N s) of all watched contacts; ``contact/penetration`` (m), the deepest; ``contact/residual``
-    (N m), the largest ``|gap * force|``, 0 for rigid contacts; ``contact/judged`` (int), how many contacts that was;
-    ``contact/pull`` (N), the largest force that pulls, and ``contact/open_force`` (N), the largest across an open
-    gap, both NaN where none was judged; ``contact/partial`` (bool): not replayed, the figures are those of the
-    contacts left behind, for one substep. With `restitution`, of the state after the step or reset:
-    ``contact/next_time`` (s) until two geoms touch that do not touch yet, at their present speeds, inf if none
-    approach; ``contact/next_impulse`` (N s) and ``contact/next_force`` (N) of that impact alone, NaN without one.
+    (N m), the largest ``|gap * force|``, 0 for rigid contacts; ``contact/partial`` (bool): not replayed, the figures
+    are those of the contacts left behind, for one substep.
 
     Raises:
-        UnsupportedEnvError: No MuJoCo model, or impacts to predict of a height field or of flexible parts.
+        UnsupportedEnvError: No MuJoCo model.
         UnknownNameError: No body of that name; the message lists those there are.
-        ConfigurationError: Not a list of names, a restitution or stiffness outside its range, a stiffness alone, or a
-            `ChunkHandover` inside, whose step is many control steps.
+        ConfigurationError: Not a list of names, or a `ChunkHandover` inside, whose step is many control steps.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -128,42 +120,22 @@ class ContactMonitor(StepMonitor):
         env: Env,
         bodies: Sequence[str] | None = None,
         against: Sequence[str] | None = None,
-        restitution: float | None = None,
-        stiffness: float | None = None,
     ) -> None:
         StepMonitor.__init__(self, env)
         raw: Any = env.unwrapped
         self._contacts = Contacts(raw.model, bodies, against)
         self.bodies = None if bodies is None else list(bodies)
         self.against = None if against is None else list(against)
-        self._restitution = restitution if restitution is None else _restitution(restitution)
-        self._stiffness = stiffness if stiffness is None else positive("stiffness", stiffness, "N/m")
-        if restitution is None and stiffness is not None:
-            raise ConfigurationError(
-                "stiffness is for the impacts that are predicted: give their restitution, too"
-            )
-        self._next: NextImpact | None = None
-        if restitution is not None:
-            self._next = NextImpact(raw.model, self._contacts.watched)
-        own = {"restitution": self._restitution, "stiffness": self._stiffness}
-        self._record({"bodies": self.bodies, "against": self.against, **own})
+        self._record({"bodies": self.bodies, "against": self.against})
         self._begin(raw.model)
 
     @property
     def peak_bodies(self) -> tuple[str, str] | None:
         """Names of the two bodies that had the `contact/peak_force` of the last step; None where there was none."""
-        return self._names(self._peak_bodies)
-
-    @property
-    def next_bodies(self) -> tuple[str, str] | None:
-        """Names of the two bodies of the next impact, after the last step or reset; None where none is predicted."""
-        return self._names(self._next_bodies)
-
-    def _names(self, bodies: tuple[int, int] | None) -> tuple[str, str] | None:
-        if bodies is None:
+        if self._peak_bodies is None:
             return None
         model = self.unwrapped.model  # type: ignore[attr-defined]
-        first, second = (model.body(i).name if i < model.nbody else "" for i in bodies)
+        first, second = (model.body(i).name if i < model.nbody else "" for i in self._peak_bodies)
         return first, second
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -177,13 +149,10 @@ class ContactMonitor(StepMonitor):
     def _begin(self, model: mujoco.MjModel) -> None:
         if self._contacts.model is not model:
             self._contacts = Contacts(model, self.bodies, self.against)
-            if self._next is not None:
-                self._next = NextImpact(model, self._contacts.watched)
         self._gaps: list[float] = []
         self._forces: list[float] = []
         self._impulse = self._peak = 0.0
         self._peak_bodies: tuple[int, int] | None = None
-        self._next_bodies: tuple[int, int] | None = None
 
     def _visit(self, data: mujoco.MjData, time_s: float) -> None:
         pairs: dict[tuple[int, int], float] = {}
@@ -198,15 +167,11 @@ class ContactMonitor(StepMonitor):
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
         peak, impulse, depth, residual = self._peak, self._impulse, 0.0, 0.0
-        pull: float = keys.NOT_JUDGED
-        across: float = keys.NOT_JUDGED
         if self._gaps:
             gaps, forces = np.array(self._gaps), np.array(self._forces)
             if np.isfinite(gaps).all() and np.isfinite(forces).all():
                 residuals = complementarity_residuals(gaps, forces)
                 depth, residual = float(residuals.penetration.max()), float(residuals.product.max())
-                pull = float(residuals.tension.max())
-                across = float(np.abs(forces).max(initial=0.0, where=gaps > 0.0))
             else:
                 peak = impulse = depth = residual = math.nan
         return {
@@ -214,37 +179,7 @@ class ContactMonitor(StepMonitor):
             keys.CONTACT_IMPULSE: impulse,
             keys.CONTACT_PENETRATION: depth,
             keys.CONTACT_RESIDUAL: residual,
-            keys.CONTACT_JUDGED: len(self._gaps),
-            keys.CONTACT_PULL: pull,
-            keys.CONTACT_OPEN_FORCE: across,
-            **self._predicted(data),
         }
-
-    def _predicted(self, data: mujoco.MjData) -> dict[str, float]:
-        """The next impact from a state; nothing where none was asked for."""
-        if self._next is None:
-            return {}
-        impact = self._next.of(data)
-        self._next_bodies = impact.bodies
-        impulse: float = keys.NOT_JUDGED
-        force: float = keys.NOT_JUDGED
-        if impact.bodies is not None:
-            assert self._restitution is not None
-            impulse = float(normal_impulse(impact.mass, -impact.speed, self._restitution))
-            if self._stiffness is not None:
-                force = float(peak_force(impact.speed, impact.mass, self._stiffness))
-        return {
-            keys.CONTACT_NEXT_TIME: keys.NOT_JUDGED if math.isnan(impact.time_s) else impact.time_s,
-            keys.CONTACT_NEXT_IMPULSE: impulse,
-            keys.CONTACT_NEXT_FORCE: force,
-        }
-
-
-def _restitution(given: float) -> float:
-    value = non_negative("restitution", given, "a share of the speed")
-    if value > 1.0:
-        raise ConfigurationError(f"restitution is from 0 (plastic) to 1 (elastic), got {given!r}")
-    return value
 
 
 PRESSING: Final = 0.01
@@ -268,8 +203,8 @@ class BalanceMonitor(StepMonitor):
     Info, at every step (0 and False after a reset): of the robot after the step ``balance/linear_momentum`` (kg m/s)
     and ``balance/angular_momentum`` about its centre of mass (kg m^2/s), arrays (3,); ``balance/friction_used``, the
     largest ``|f_t| / (friction_share mu f_n)`` of a contact that carries at least 1 % of the weight;
-    ``balance/zmp_margin`` (m), from the edge of the support polygon minus the inset, 0 without a polygon;
-    ``balance/supported`` and ``balance/airborne``, shares of the evaluations with a polygon and without a contact;
+    ``balance/zmp_margin`` (m), from the edge of the support polygon minus the inset, NaN without a polygon;
+    ``balance/airborne``, the share of the evaluations without a contact;
     ``balance/partial`` (bool): not replayed, the figures are those of the contacts left behind (0 if not finite).
 
     Raises:
@@ -284,8 +219,8 @@ class BalanceMonitor(StepMonitor):
         >>> env = sw.BalanceMonitor(gym.make("Ant-v5"))
         >>> _ = env.reset(seed=0)
         >>> infos = [env.step(0 * env.action_space.low)[4] for _ in range(20)]
-        >>> infos[0]["balance/airborne"], infos[-1]["balance/supported"] > 0.0
-        (1.0, True)
+        >>> infos[0]["balance/airborne"], infos[-1]["balance/airborne"]
+        (1.0, 0.0)
     """
 
     partial: ClassVar = keys.BALANCE_PARTIAL
@@ -336,16 +271,19 @@ class BalanceMonitor(StepMonitor):
         distances = support_distances(found.step, found.point, found.normal, found.force)
         return {
             keys.BALANCE_FRICTION_USED: float(used.max(initial=0.0)),
-            keys.BALANCE_ZMP_MARGIN: float(distances.min()) - self.inset if distances.size else 0.0,
-            keys.BALANCE_SUPPORTED: distances.size / found.steps,
+            keys.BALANCE_ZMP_MARGIN: float(distances.min()) - self.inset
+            if distances.size
+            else keys.NOT_JUDGED,
             keys.BALANCE_AIRBORNE: (found.steps - np.unique(found.step).size) / found.steps,
         }
 
 
 _MOMENTA: Final = (keys.BALANCE_LINEAR_MOMENTUM, keys.BALANCE_ANGULAR_MOMENTUM)
-_NOTHING: Final = dict.fromkeys(
-    (keys.BALANCE_FRICTION_USED, keys.BALANCE_ZMP_MARGIN, keys.BALANCE_SUPPORTED, keys.BALANCE_AIRBORNE), 0.0
-)
+_NOTHING: Final = {
+    keys.BALANCE_FRICTION_USED: 0.0,
+    keys.BALANCE_ZMP_MARGIN: keys.NOT_JUDGED,
+    keys.BALANCE_AIRBORNE: 0.0,
+}
 
 
 class _Robot:

@@ -296,10 +296,6 @@ class Track:
         mean_velocity: m/s, one per coordinate; None: zeros.
         start_position_std: m, a number or one per coordinate.
         start_velocity_std: m/s, a number or one per coordinate.
-        turn_noise: Of a velocity that turns at a rate of its own (a coordinated turn), intensity of the white noise
-            in that rate's derivative, rad^2/s^3: after t seconds unseen it adds `turn_noise` t to the rate's
-            variance. None: a velocity that does not turn. In the plane alone.
-        start_turn_std: Of such a turn rate at a reset, where its mean is 0, rad/s.
 
     Raises:
         ConfigurationError: Bodies and published points at once, or neither; a number or matrix out of its range.
@@ -312,8 +308,6 @@ class Track:
     mean_velocity: Sequence[float] | None = None
     start_position_std: Any = 0.1
     start_velocity_std: Any = 0.5
-    turn_noise: float | None = None
-    start_turn_std: float = 0.5
 
     def __post_init__(self) -> None:
         if (self.bodies is None) == (self.published is None):
@@ -328,8 +322,6 @@ class Track:
             noise = "the intensity of its white acceleration noise in m^2/s^3"
             raise ConfigurationError(f"acceleration_noise is missing: {noise} (0: velocity stays)")
         check_fields(self, positive, ["reversion_s"], "s")
-        check_fields(self, non_negative, ["turn_noise"], "rad^2/s^3")
-        check_fields(self, non_negative, ["start_turn_std"], "rad/s")
         for name in ("acceleration_noise", "mean_velocity", "start_position_std", "start_velocity_std"):
             setattr(self, name, plain_numbers(getattr(self, name)))
 
@@ -338,19 +330,14 @@ class Track:
         mean = 0.0 if self.mean_velocity is None else self.mean_velocity
         velocity = _each("mean_velocity", mean, coordinates, "m/s", signed=True)
         reversion_s = np.inf if self.reversion_s is None else self.reversion_s
-        return Motion(
-            _intensity(self.acceleration_noise, coordinates), reversion_s, velocity, self.turn_noise
-        )
+        return Motion(_intensity(self.acceleration_noise, coordinates), reversion_s, velocity)
 
-    def start(self, coordinates: int, size: int) -> Array:
-        """Standard deviations of a state at a reset: position, velocity and, as a fifth, turn rate; shape (size,)."""
-        stds = np.zeros(size)
-        stds[:coordinates] = _each("start_position_std", self.start_position_std, coordinates, "m")
-        velocity = _each("start_velocity_std", self.start_velocity_std, coordinates, "m/s")
-        stds[coordinates : 2 * coordinates] = velocity
-        if self.turn_noise is not None:
-            stds[2 * coordinates :] = self.start_turn_std
-        return stds
+    def start(self, coordinates: int) -> Array:
+        """Standard deviations of position and velocity at a reset, shape (2d,)."""
+        position = _each("start_position_std", self.start_position_std, coordinates, "m")
+        return np.concatenate(
+            [position, _each("start_velocity_std", self.start_velocity_std, coordinates, "m/s")]
+        )
 
     def data(self) -> dict[str, Any]:
         """Plain data, from which it can be made again."""

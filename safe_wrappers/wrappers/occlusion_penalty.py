@@ -10,10 +10,8 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
-from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.control.estimation.observability import unobservable_directions
-from safe_wrappers.control.estimation.tracks import largest_deviation
-from safe_wrappers.control.estimation.turning_tracks import TurningTracks, tracks_of
+from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import one_reward, read_attribute, refuse_vector_rewards
 from safe_wrappers.plants.mujoco.binding import control_interval
@@ -55,7 +53,7 @@ class OcclusionPenalty(LayerWrapper):
             position from the sensor's body (m, world axes), velocity (m/s) and deviation along each axis (m).
 
     Info, at every step and at reset: ``occlusion/visible``, ``occlusion/expired`` (bool arrays, one per track),
-    ``occlusion/sigma`` (m, array), ``occlusion/penalty``, ``occlusion/task_reward`` (float).
+    ``occlusion/sigma`` (m, array), ``occlusion/penalty`` (float).
 
     Attributes:
         tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead.
@@ -125,8 +123,8 @@ class OcclusionPenalty(LayerWrapper):
         self._look_at(raw.model)
         owners = [thing.track for thing in self._things]
         self.track_names = [thing.name for thing in self._things]
-        self.tracking = tracks_of([track.motion(self._d) for track in owners])
-        self._start_std = np.stack([track.start(self._d, self.tracking.size) for track in owners])
+        self.tracking = Tracks([track.motion(self._d) for track in owners])
+        self._start_std = np.stack([track.start(self._d) for track in owners])
         self._state_names = [*axes, *(f"v{axis}" for axis in axes)]
         self.last_seen_positions = np.zeros((len(self.track_names), self._d))
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
@@ -190,7 +188,7 @@ class OcclusionPenalty(LayerWrapper):
             self.ego_motion.fix()
         self._start()
         info.update(self._look())
-        info[keys.OCCLUSION_PENALTY] = info[keys.OCCLUSION_TASK_REWARD] = 0.0
+        info[keys.OCCLUSION_PENALTY] = 0.0
         return self._observed(observation), info
 
     def step(self, action: Any) -> Step:
@@ -203,41 +201,18 @@ class OcclusionPenalty(LayerWrapper):
             self.ego_motion.advance(elapsed, self._random.draw.standard_normal(9))
         info.update(self._look())
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
-        info[keys.OCCLUSION_TASK_REWARD] = one_reward(reward, "OcclusionPenalty")
         info[keys.OCCLUSION_PENALTY] = penalty
         if penalty:
-            reward = float(reward) - penalty
+            reward = one_reward(reward, "OcclusionPenalty") - penalty
         return self._observed(observation), reward, terminated, truncated, info
 
     @property
     def unobservable(self) -> dict[str, list[str]]:
-        """Track name -> directions of its state ("x", "vy", "turn rate") that the sensor cannot resolve in sight.
-
-        Of a track that turns they depend on its state, and are those at the present estimate: the rank of the
-        differentials of its outputs' Lie derivatives.
-        """
-        return {name: self._unobservable(i) for i, name in enumerate(self.track_names)}
-
-    def _unobservable(self, track: int) -> list[str]:
-        motion = self.tracking.motions[track]
-        if motion.turn_noise is not None and isinstance(self.tracking, TurningTracks):
-            return list(self.tracking.unobservable(track, self._matrix, self._state_names))
-        return list(unobservable_directions(motion.matrices()[0], self._matrix, self._state_names))
-
-    def permissions(self, horizon_s: float = 60.0) -> Array:
-        """How long each track may be relied on if nothing is seen from now on, s, (n,); inf beyond the horizon.
-
-        Where a track turns, in whole control steps, the last one before the bound crosses the tolerance.
-        """
-        if isinstance(self.tracking, TurningTracks):
-            return self.tracking.blind_times(self.tolerance / self.sigmas, horizon_s, self._control_dt)
-        direction = np.eye(self._d, 2 * self._d)
-        times = []
-        for i, motion in enumerate(self.tracking.motions):
-            a, _, q = motion.matrices()
-            covariance = self.tracking.covariance[i]
-            times.append(blind_time(covariance, a, q, direction, self.tolerance, self.sigmas, horizon_s))
-        return np.array(times)
+        """Track name -> directions of its state ("x", "vy") that the sensor cannot resolve in sight."""
+        return {
+            name: list(unobservable_directions(motion.matrices()[0], self._matrix, self._state_names))
+            for name, motion in zip(self.track_names, self.tracking.motions, strict=True)
+        }
 
     def _elapsed(self) -> float:
         now = float(self._raw.data.time)
@@ -255,7 +230,7 @@ class OcclusionPenalty(LayerWrapper):
         truth, _ = self._truth()
         mean = np.zeros((n, self.tracking.size))
         mean[:, :d] = truth[:, :d] + self._start_std[:, :d] * self._random.draw.standard_normal((n, d))
-        mean[:, d : 2 * d] = np.stack([motion.mean_velocity for motion in self.tracking.motions])
+        mean[:, d:] = np.stack([motion.mean_velocity for motion in self.tracking.motions])
         self.tracking.start(mean, self._start_std[:, :, None] ** 2 * np.eye(self.tracking.size))
         self.last_seen_positions = mean[:, :d].copy()
 

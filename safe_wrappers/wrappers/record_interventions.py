@@ -81,13 +81,13 @@ class RecordInterventions(LayerWrapper):
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
     Put it outside the filter, `LeaseExpiry`, `TeleopChannel` and `OcclusionPenalty`, and inside `ChunkHandover` and
-    SB3's `Monitor`. At every step `info` gains the keys of `safe_wrappers.info.RUNNING` (float64, the episode so
-    far), and at an episode's last step `info["interventions"]`, a dict: `length`, `return` (of the task: penalties
-    that a wrapper inside has taken off are added back), and the figures of `safe_wrappers.info.EPISODE`. A mean is
-    over all steps of the episode, `margin_min` the smallest finite `cbf/margin`.
+    SB3's `Monitor`. At an episode's last step `info` gains `info["interventions"]`, a dict: `length`, `return` (of
+    the task: penalties that a wrapper inside has taken off are added back), and the figures of
+    `safe_wrappers.info.EPISODE`. A mean is over all steps of the episode, `margin_min` the smallest finite
+    `cbf/margin`.
 
-    What nobody reported is not zero: it is NaN in the running keys, missing in the summary, and an empty cell in the
-    file. The same holds for a 0 that was not reported at every step; a count above 0 is a lower bound.
+    What nobody reported is not zero: it is missing in the summary, and an empty cell in the file. The same holds for
+    a 0 that was not reported at every step; a count above 0 is a lower bound.
 
     Rewards may be vectors, as mo-gymnasium's: `return` is then an array, the sum of each component. A file needs
     rewards that are one number.
@@ -107,8 +107,8 @@ class RecordInterventions(LayerWrapper):
         >>> _ = env.reset(seed=0)
         >>> for _ in range(3):
         ...     _, _, _, _, info = env.step(env.action_space.low)
-        >>> print(list(info["interventions"]), info["interventions/cost"])  # no filter, and a task without a cost
-        ['length', 'return'] nan
+        >>> print(list(info["interventions"]))  # no filter, and a task without a cost
+        ['length', 'return']
     """
 
     layer: ClassVar = Layer.RECORDER
@@ -133,17 +133,15 @@ class RecordInterventions(LayerWrapper):
         return 1e6 * float(self.env.get_wrapper_attr("filter_seconds")) / calls if calls else None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Start a new episode's counts: 0 in info of what this reset's info has, NaN of what it lacks."""
+        """Start a new episode's counts."""
         self._clear()
         observation, info = self.env.reset(seed=seed, options=options)
         for tally in self._tallies:
             tally.reset(info)
-            if tally.figure.running:
-                info[tally.figure.running] = 0.0 if tally.figure.of[0] in info else keys.NOT_JUDGED
         return observation, info
 
     def step(self, action: Any) -> Step:
-        """Step the env; its info gains the running counts, and the summary at the episode's end."""
+        """Step the env; its info gains the summary at the episode's end."""
         observation, reward, terminated, truncated, info = self._pass_on(action)
         self._steps += 1
         penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
@@ -151,9 +149,6 @@ class RecordInterventions(LayerWrapper):
         self._return = self._return + earned + float(penalties)
         for tally in self._tallies:
             tally.add(info)
-            if tally.figure.running:
-                value = tally.value(self._steps)
-                info[tally.figure.running] = keys.NOT_JUDGED if value is None else float(value)
         if terminated or truncated:
             figures = {tally.figure.name: tally.value(self._steps) for tally in self._tallies}
             summary = {"length": self._steps, "return": self._return}

@@ -1,28 +1,21 @@
 """SafeActionMap and StuckEscape: they give the filter another action than the policy's."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
-from numpy.typing import ArrayLike
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, finite_array, non_negative, positive
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.checks import Array, non_negative, positive
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import brake
 from safe_wrappers.filter.ray_map import Ray, centre, mapped_on_ray, rounded
 from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards, wrappers_of
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng, action_array
-
-AnchorFunction = Callable[[Any], ArrayLike | None]
-"""Takes the env inside of the map, which it must not change; returns an action, shape (m,), or None for no anchor."""
-
-ANCHORS: Final = ("centre", "backup", "closest")
 
 
 class SafeActionMap(LayerWrapper):
@@ -41,24 +34,22 @@ class SafeActionMap(LayerWrapper):
     itself is always asked about. The edge is found to a thousandth of the ray. The box ends where the actuators
     saturate: beyond, actions differ in nothing.
 
-    **What it asks** is what the filter asks, mostly up to 14 times in a step, for "centre" up to 13 times more for
-    each component, which is dear where constraints forecast.
+    **What it asks** is what the filter asks, mostly up to 14 times in a step, and up to 13 times more for each
+    component, which is dear where constraints forecast.
+
+    The anchor is the first backup control of a constraint, or braking, that every constraint admits, moved halfway
+    between the ends of what is admitted, component by component.
 
     Args:
         env: With a `CBFActionFilter` inside, and a bounded action space.
-        anchor: "backup": the first backup control of a constraint, or braking, that every constraint admits.
-            "centre": from there halfway between the ends of what is admitted, component by component. "closest": what
-            the filter would execute; actions that are admitted stay as they are, and the others differ only where
-            that answer is not on the edge of what is admitted, as on a detour. Or a function of the env.
 
-    Info, at every step: ``map/scale`` (float), by what the distance was multiplied, 1 is an unchanged action;
-    ``map/anchor`` (bool), False where there was no admitted anchor, or no finite action: then the action goes to the
-    filter as it is. ``proposed_action`` is the mapped one, since the filter was given it.
+    Info, at every step: ``map/scale`` (float), by what the distance was multiplied, 1 is an unchanged action; NaN
+    where there was no admitted anchor, or no finite action: then the action goes to the filter as it is.
+    ``proposed_action`` is the mapped one, since the filter was given it.
 
     Raises:
         ConfigurationError: No filter inside; an action space without bounds, or a wrapper in between that changes
-            actions; no backup control to begin from; at a step, a function that returned no action.
-        UnknownNameError: No anchor of that name.
+            actions; no backup control to begin from.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -71,43 +62,37 @@ class SafeActionMap(LayerWrapper):
 
     layer: ClassVar = Layer.MAP
 
-    def __init__(self, env: Env, anchor: str | AnchorFunction = "centre") -> None:
+    def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
         self._filter = _filter_inside(env)
         space: Any = env.action_space
         if not space.is_bounded():
             raise ConfigurationError(f"SafeActionMap maps a box with finite bounds, got {space}")
-        if not callable(anchor) and anchor not in ANCHORS:
-            names = ", ".join(ANCHORS)
-            raise UnknownNameError(f"no anchor {anchor!r}; choose {names}, or pass a function of the env")
         engine = self._filter.filter
-        if anchor in ("centre", "backup") and not (
-            engine.plant.can_brake or any(c.has_backup for c in engine.bound)
-        ):
+        if not (engine.plant.can_brake or any(c.has_backup for c in engine.bound)):
             raise ConfigurationError(
-                f"anchor {anchor!r}: no constraint of this filter knows a backup control, and the plant does not"
-                " brake; use 'closest', or a function of the env"
+                "SafeActionMap needs an anchor: no constraint of this filter knows a backup control, and the plant"
+                " does not brake"
             )
-        self._record({"anchor": anchor})
-        self.anchor = anchor
+        self._record({})
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
         self._shape, self._dtype = space.shape, space.dtype
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Resets the env; info has the keys of a step that maps nothing."""
+        """Resets the env; info has the key of a step that maps nothing."""
         observation, info = self.env.reset(seed=seed, options=options)
-        info[keys.MAP_SCALE], info[keys.MAP_ANCHOR] = 1.0, False
+        info[keys.MAP_SCALE] = 1.0
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Steps the env with the mapped action."""
-        sent, scale, anchored = self.mapped(action)
+        sent, scale = self.mapped(action)
         observation, reward, terminated, truncated, info = self.env.step(sent)
-        info[keys.MAP_SCALE], info[keys.MAP_ANCHOR] = scale, anchored
+        info[keys.MAP_SCALE] = scale
         return observation, reward, terminated, truncated, info
 
-    def mapped(self, action: Any) -> tuple[Any, float, bool]:
-        """What is sent to the filter in the env's present state, and the two info keys.
+    def mapped(self, action: Any) -> tuple[Any, float]:
+        """What is sent to the filter in the env's present state, and `map/scale`.
 
         The env must be stepped next.
         """
@@ -115,17 +100,17 @@ class SafeActionMap(LayerWrapper):
         engine = self._filter.filter
         self._filter.observe()
         if engine.margin != engine.margin or not np.isfinite(given).all():
-            return action, 1.0, False
+            return action, keys.NOT_JUDGED
         boxed = rounded(given, self._low, self._high, self._dtype)
         low, high = self._acting()
         force = np.clip(boxed, low, high)
-        anchor = self._anchor(boxed, low, high)
+        anchor = self._anchor(low, high)
         if anchor is None:
-            return action, 1.0, False
+            return action, keys.NOT_JUDGED
         if (np.abs(anchor - force) <= 1e-9 * (high - low)).all():
-            return action, 1.0, True
+            return action, 1.0
         control, scale = mapped_on_ray(engine.admits, Ray(anchor, force, low, high, self._dtype), boxed)
-        return (action if control is boxed else control.astype(self._dtype)), scale, True
+        return (action if control is boxed else control.astype(self._dtype)), scale
 
     def _acting(self) -> tuple[Array, Array]:
         """The box of actions between which the force still changes: beyond it a ray would lead nowhere."""
@@ -133,37 +118,17 @@ class SafeActionMap(LayerWrapper):
         low, high = np.clip(plant.acting_range or (plant.lower, plant.upper), self._low, self._high)
         return low, high
 
-    def _anchor(self, boxed: Array, low: Array, high: Array) -> Array | None:
-        """The first known action that is admitted, as it can be executed, or the centre from there."""
-        admits = self._filter.filter.admits
-        for known in self._known(boxed):
-            control = rounded(known, low, high, self._dtype)
-            if admits(control):
-                if self.anchor == "centre":
-                    return centre(admits, control, low, high, self._dtype)
-                return control
-        return None
-
-    def _known(self, boxed: Array) -> Iterator[Array]:
+    def _anchor(self, low: Array, high: Array) -> Array | None:
+        """The centre of what is admitted around the first known action that is."""
         engine = self._filter.filter
-        if callable(self.anchor):
-            given = self.anchor(self.env)
-            if given is not None:
-                yield self._checked(given)
-        elif self.anchor == "closest":
-            yield engine.filter(boxed).control
-        else:
-            yield from (control for c in engine.bound if (control := c.backup()) is not None)
-            if engine.plant.can_brake:
-                yield brake(engine.plant)
-
-    def _checked(self, given: ArrayLike) -> Array:
-        control = finite_array("the anchor", given)
-        if control.shape != self._shape:
-            raise ConfigurationError(
-                f"the anchor's function must return an action of shape {self._shape}, or None; got {given!r}"
-            )
-        return control
+        known = [control for c in engine.bound if (control := c.backup()) is not None]
+        if engine.plant.can_brake:
+            known.append(brake(engine.plant))
+        for one in known:
+            control = rounded(one, low, high, self._dtype)
+            if engine.admits(control):
+                return centre(engine.admits, control, low, high, self._dtype)
+        return None
 
 
 def _filter_inside(env: Env) -> CBFActionFilter:
@@ -180,20 +145,14 @@ def _filter_inside(env: Env) -> CBFActionFilter:
     raise ConfigurationError("SafeActionMap needs a CBFActionFilter inside: SafeActionMap(sw.protect(env))")
 
 
-ValueFunction = Callable[[Any, Array], ArrayLike]
-"""Of an observation and actions, shape (k, m): how good they are, shape (k,)."""
-_CANDIDATES: Final = 64
-
-
 class StuckEscape(LayerWrapper):
     """Proposes another action for a while, in the policy's place, where policy and filter are stuck.
 
     Stuck means: in the last `after_s` more than half of the policy's actions were changed by the filter or replaced
     by this wrapper, and the rewards of these steps add up to `progress` at most. A deterministic policy that pushes
     against the filter, or circles an obstacle, may do so for ever. For `escape_s` an action that was drawn at random
-    is proposed; or, with a `value`, of 64 that were drawn the best that the filter admits, chosen anew at every step.
-    The filter inside checks it like any other, so that its guarantees stay. A deadlock is ended by chance, not by a
-    plan; it may take several draws.
+    is proposed. The filter inside checks it like any other, so that its guarantees stay. A deadlock is ended by
+    chance, not by a plan; it may take several draws.
 
     While it acts, the filter's keys are about what the filter was given, the drawn action: an escape is
     `cbf/escaping`, not `cbf/intervened`. `cbf/nonfinite` is also true for a policy's action that is not finite.
@@ -203,15 +162,11 @@ class StuckEscape(LayerWrapper):
         after_s: The time without progress, s.
         progress: The sum of rewards, in the task's units, up to which there is none.
         escape_s: For how long another action is proposed, s; 0 reports alone.
-        value: Chooses among admitted actions: a function of an observation, as this wrapper returns it, and actions,
-            shape (k, m), that returns k numbers, the more the better; `safe_wrappers.sb3.critic_value(model)` is one.
-            An action whose value is NaN is not chosen. The filter is asked 64 times per step of an escape.
 
     Info, at every step: ``cbf/stuck``, ``cbf/escaping`` (bool).
 
     Raises:
-        ConfigurationError: No filter inside, times that are not, or a `value` that is no function; in an escape: it
-            returns another shape.
+        ConfigurationError: No filter inside, or times that are not.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -231,7 +186,6 @@ class StuckEscape(LayerWrapper):
         after_s: float = 2.0,
         progress: float = 0.0,
         escape_s: float = 1.0,
-        value: ValueFunction | None = None,
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
@@ -243,16 +197,12 @@ class StuckEscape(LayerWrapper):
             )
         if not (isinstance(progress, int | float | np.number) and np.isfinite(progress)):
             raise ConfigurationError(f"progress is a finite sum of rewards, got {progress!r}")
-        if value is not None and not callable(value):
-            raise ConfigurationError(
-                f"value is a function of an observation and actions, such as critic_value(model), got {value!r}"
-            )
         control_dt = inside.plant.control_dt
         self._window = max(1, round(positive("after_s", after_s, "s") / control_dt))
         self._escape = round(non_negative("escape_s", escape_s, "s") / control_dt)
         self._inside = inside
         self._record(arguments)
-        self.progress, self.value = float(progress), value
+        self.progress = float(progress)
         self._rng = WrapperRng("StuckEscape")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -261,7 +211,7 @@ class StuckEscape(LayerWrapper):
         self._rng.reset(self.env, seed)
         self._rewards: deque[float] = deque(maxlen=self._window)
         self._changed: deque[bool] = deque(maxlen=self._window)
-        self._left, self._observation = 0, observation
+        self._left = 0
         return observation, info | {keys.CBF_STUCK: False, keys.CBF_ESCAPING: False}
 
     def step(self, action: Any) -> Step:
@@ -269,13 +219,12 @@ class StuckEscape(LayerWrapper):
         escaping = self._left > 0
         sent = action
         if escaping:
-            own = action_array(action, self._drawn.shape[1:], np.float64)
-            sent = self._other(action)
+            own = action_array(action, self._drawn.shape, np.float64)
+            sent = self._drawn
         observation, reward, terminated, truncated, info = self.env.step(sent)
         if escaping:
             self._left -= 1
             info[keys.CBF_NONFINITE] |= not np.isfinite(own).all()
-        self._observation = observation
         self._rewards.append(one_reward(reward, "StuckEscape"))
         self._changed.append(info[keys.CBF_INTERVENED] or escaping)
         full = len(self._rewards) == self._window
@@ -287,29 +236,9 @@ class StuckEscape(LayerWrapper):
         return observation, reward, terminated, truncated, info
 
     def _draw(self) -> Array:
-        """Actions between the plant's bounds, evenly distributed, as the action space has them."""
+        """An action between the plant's bounds, evenly distributed, as the action space has it."""
         plant, space = self._inside.plant, self._inside.action_space
         assert isinstance(space, Box)  # the filter takes no other
         low, high = np.maximum(plant.lower, space.low), np.minimum(plant.upper, space.high)
-        count = 1 if self.value is None else _CANDIDATES
-        drawn: Array = self._rng.draw.uniform(low, high, (count, *low.shape)).astype(space.dtype)
+        drawn: Array = self._rng.draw.uniform(low, high).astype(space.dtype)
         return drawn
-
-    def _other(self, action: Any) -> Any:
-        """The drawn action; with a value function, the best of those that are admitted, else the policy's."""
-        if self.value is None:
-            return self._drawn[0]
-        self._inside.observe()
-        engine = self._inside.filter
-        readable = engine.margin == engine.margin  # else nothing says what is admitted
-        admitted = np.array([u for u in self._drawn if readable and engine.admits(u.astype(np.float64))])
-        if not len(admitted):
-            return action
-        values = np.asarray(self.value(self._observation, admitted), dtype=np.float64)
-        if values.shape != (len(admitted),):
-            raise ConfigurationError(
-                f"StuckEscape: value must return a number for each of {len(admitted)} actions, shape"
-                f" ({len(admitted)},); got shape {values.shape}"
-            )
-        best = np.argmax(np.where(np.isnan(values), -np.inf, values))
-        return action if np.isnan(values[best]) else admitted[best]

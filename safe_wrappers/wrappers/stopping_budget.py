@@ -40,9 +40,7 @@ class StoppingBudget:
         top_speed: Bound on the approach speed, m/s; None: none.
         localisation: Bound on the error of the clearance, m; the constraint's own is added.
         margin: Clearance to be kept at rest, m; the constraint's own is added.
-        act_s: T_act, until the full deceleration is there, s; with `jerk` until it begins.
-        jerk: Verified lower bound on how fast the fallback changes its deceleration, m/s^3: the stop counts as a
-            profile of limited jerk, which fits from every moment of a lease. None: at once.
+        act_s: T_act, until the full deceleration is there, s.
 
     Raises:
         ConfigurationError: A bound that is missing, negative or does not belong to the clearance.
@@ -56,7 +54,6 @@ class StoppingBudget:
     localisation: float = 0.0
     margin: float = 0.0
     act_s: float = 0.0
-    jerk: float | None = None
 
     def __post_init__(self) -> None:
         given: Any = self.clearance
@@ -69,14 +66,13 @@ class StoppingBudget:
         check_fields(self, non_negative, ["act_s"], "s")
         check_fields(self, non_negative, ["acceleration"], "m/s^2")
         check_fields(self, positive, ["braking"], "m/s^2")
-        check_fields(self, positive, ["jerk"], "m/s^3")
         check_fields(self, positive, ["top_speed"], "m/s")
         check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
         name = type(self.clearance).__name__
         if not self.measures_approach:
             if self.closing_speed is None:
                 raise ConfigurationError(f"{name} does not say how fast it is approached: give closing_speed")
-            if (self.braking, self.acceleration, self.top_speed, self.jerk) != (None,) * 4:
+            if (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
                 raise ConfigurationError(f"{name} counts braking already: give closing_speed alone")
             return
         if self.braking is None and not isinstance(self.clearance, Clearance):
@@ -120,8 +116,6 @@ class BoundBudget:
         if self._measures_approach:
             braking = budget.braking if budget.braking is not None else float(given.braking)
             self._stop["braking"] = braking
-            if budget.jerk is not None:
-                self._stop["jerk"] = budget.jerk
             if isinstance(self.constraint, Clearance):
                 # Its rows are then those of this budget.
                 own_bounds: Any = {"braking": braking, "margin": margin, "state_error": localisation}
@@ -183,13 +177,6 @@ class BoundBudget:
         """Whether all that was measured is finite."""
         return bool(np.isfinite(self.clearance).all() and np.isfinite(self.speed).all())
 
-    @property
-    def room(self) -> float:
-        """The least measured clearance less its reserves, m; -inf where it is not finite, inf without obstacles."""
-        if not self.readable:
-            return -math.inf
-        return float(self.clearance.min(initial=math.inf)) - sum(self._reserves.values())
-
     def longest_time(self, delays_s: float = 0.0) -> float:
         """The longest time that the worst command may go on from the measured state, s; zero or less: stop now.
 
@@ -217,12 +204,11 @@ class BoundBudget:
     def can_stop_after(self, command: Array, duration_s: float) -> bool:
         """Whether the machine can stop by itself after a command of so many seconds.
 
-        By the declared bounds, whatever the command is, or by the rows of a `Clearance` (without `act_s` and `jerk`).
+        By the declared bounds, whatever the command is, or by the rows of a `Clearance` (without `act_s`).
         """
         if self.longest_time() >= duration_s:
             return True
-        at_once = self._budget.act_s == 0.0 and self._budget.jerk is None
-        if not (isinstance(self.constraint, Clearance) and at_once and self.readable):
+        if not (isinstance(self.constraint, Clearance) and self._budget.act_s == 0.0 and self.readable):
             return False
         assert self._bound is not None
         rows = self._bound.rows()

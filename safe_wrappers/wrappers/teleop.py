@@ -87,8 +87,6 @@ class Line:
         self._outages = None if between_s is None or length_s is None else OnOffProcess(between_s, length_s)
 
     newest: Packet  # of all that have arrived the one that was sent last
-    fresh: bool  # whether it arrived at the last `receive`
-    late: int  # how many packets of the last `receive` were overtaken
 
     def reset(self, env: Env, seed: int | None, first: Any = None) -> None:
         """Nothing is on its way, and `first` has arrived; call it after the env's own reset."""
@@ -98,7 +96,7 @@ class Line:
         self._coming: list[tuple[float, int, Any]] = []
         self._sent = 0
         self._latest_s = -math.inf
-        self.newest, self.fresh, self.late = Packet(-1, first), False, 0
+        self.newest = Packet(-1, first)
 
     def send(self, load: Any, now_s: float) -> tuple[int, bool]:
         """Send something; its number, and whether it gets lost."""
@@ -123,10 +121,7 @@ class Line:
         while self._coming and self._coming[0][0] <= now_s + self._slack_s:
             _, sequence, load = heapq.heappop(self._coming)
             found.append(Packet(sequence, load))
-        before = self.newest.sequence
         self.newest = max([self.newest, *found], key=lambda packet: packet.sequence)
-        self.fresh = self.newest.sequence > before
-        self.late = len(found) - self.fresh
         return found
 
 
@@ -266,7 +261,6 @@ class RoundTripWatch:
     budget: BoundBudget  # to be bound to a plant
     revoked: bool  # whether authority is revoked, as `judge` left it
     readable: bool  # whether clearance and speed were finite when `look` was called
-    clearance_m: float  # the smallest clearance then, m; inf where nothing is near, 0 where unreadable
     ceiling_s: float  # the longest round trip then, s, within `longest_s` of 0; the lowest where unreadable
 
     def __init__(self, env: Env, ceiling: RoundTripCeiling, control_dt: float, slack_s: float = 0.0) -> None:
@@ -285,9 +279,8 @@ class RoundTripWatch:
         budget.measure()
         self.readable = budget.readable
         if not self.readable:
-            self.clearance_m, self.ceiling_s = 0.0, -ceiling.longest_s
+            self.ceiling_s = -ceiling.longest_s
             return
-        self.clearance_m = float(budget.clearance.min(initial=math.inf))
         # The next look comes one control step from now.
         highest_s = budget.longest_round_trip(ceiling.video_s, ceiling.human_s) - self._control_dt
         self.ceiling_s = min(max(highest_s, -ceiling.longest_s), ceiling.longest_s)

@@ -2,14 +2,13 @@
 
 import copy
 import math
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, settings_from
-from safe_wrappers.control.teleop.wave_line import Rule
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
@@ -28,10 +27,7 @@ from safe_wrappers.wrappers.teleop import (
     link_from,
     port_from,
 )
-from safe_wrappers.wrappers.teleop_coding import Coding, Down, Passivity, Up, coding_from
-
-Missing = Literal["hold", "zero", "fallback"]
-"""What acts while no command arrives."""
+from safe_wrappers.wrappers.teleop_coding import Coding, Down, Up, coding_from
 
 
 class TeleopChannel(CommandGate):
@@ -54,22 +50,15 @@ class TeleopChannel(CommandGate):
         downlink: For observations, likewise.
         coding: "plain" or "wave".
         impedance: Characteristic impedance b of the waves, N s/m; for "wave".
-        passivity: "none", or "controller" (plain coding with a port), which bounds the energy each end gives out.
         ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
-        missing: What acts while no command arrives: "hold" the last one (at first zero), "zero", or "fallback".
-        wave_rule: "queue", "hold" or "zero": what a wave line puts out when packets are late.
         port: A `TeleopPort` or the dict of one; None: what the env publishes, if it does.
-        damping_limit: Of the passivity controller's damping force at the operator, N; None: none.
-        storage_j: J that each end of a passivity controller may give out unpaid; None: 0.02.
         fallback: The local brake: "brake", "hold", "zero", or a function of the plant.
         plant: For the ceiling's constraint and the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
-        seed: Keeps the random numbers of several channels apart; they start anew with a reset's seed.
 
-    Info, at every step: ``teleop/round_trip_s``, ``teleop/ceiling_s``, ``teleop/clearance_m``,
-    ``teleop/energy_in_j``, ``teleop/energy_out_j``, ``teleop/in_flight_j``, ``teleop/created_j`` (float),
-    ``teleop/revoked`` (bool), ``teleop/lost``, ``teleop/late`` (int), and ``executed_action``; without a filter
-    inside ``teleop/clipped`` (float).
+    Info, at every step: ``teleop/round_trip_s``, ``teleop/ceiling_s``, ``teleop/energy_in_j``,
+    ``teleop/energy_out_j``, ``teleop/in_flight_j``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
+    and ``executed_action``.
 
     Raises:
         ConfigurationError: A link, a port, an impedance or a ceiling that cannot be, or a wrong order.
@@ -85,7 +74,6 @@ class TeleopChannel(CommandGate):
     """
 
     layer: ClassVar = Layer.CHANNEL
-    clipped_key: ClassVar = keys.TELEOP_CLIPPED
 
     def __init__(
         self,
@@ -94,30 +82,19 @@ class TeleopChannel(CommandGate):
         downlink: Link | dict[str, Any] | float,
         coding: Coding = "plain",
         impedance: float | None = None,
-        passivity: Passivity = "none",
         ceiling: RoundTripCeiling | dict[str, Any] | None = None,
-        missing: Missing = "hold",
-        wave_rule: Rule = "queue",
         port: TeleopPort | dict[str, Any] | None = None,
-        damping_limit: float | None = None,
-        storage_j: float | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
         control_dt: float | None = None,
-        seed: int = 0,
     ) -> None:
         arguments = dict(locals())
         CommandGate.__init__(self, env, control_dt)
         plant = own_plant(plant)
         self.uplink, self.downlink = link_from("uplink", uplink), link_from("downlink", downlink)
         limit = None if ceiling is None else settings_from(RoundTripCeiling, ceiling, "ceiling", ", or None")
-        choices = {"coding": Coding, "passivity": Passivity, "missing": Missing, "wave_rule": Rule}
-        for name, known in choices.items():
-            if arguments[name] not in get_args(known):
-                there = ", ".join(get_args(known))
-                raise ConfigurationError(f"{name} is one of {there}; got {arguments[name]!r}")
-        if isinstance(seed, bool) or not isinstance(seed, int):
-            raise ConfigurationError(f"seed is a whole number, got {seed!r}")
+        if coding not in get_args(Coding):
+            raise ConfigurationError(f"coding is one of {', '.join(get_args(Coding))}; got {coding!r}")
         self._record(
             arguments,
             uplink=plain_data(self.uplink),
@@ -127,22 +104,16 @@ class TeleopChannel(CommandGate):
             plant=plant,
         )
         self.port = port_from(port, env)
-        self._coding = coding_from(
-            env, self.port, self.control_dt, coding, impedance, passivity, damping_limit, storage_j, wave_rule
-        )
-        # Two channels, one around the other, are refused; so a number is enough to keep their lines apart.
-        self._up = Line(self.uplink, f"TeleopChannel up {seed}", self._same_s)
-        self._down = Line(self.downlink, f"TeleopChannel down {seed}", self._same_s)
-        self._missing: Missing = missing
+        self._coding = coding_from(env, self.port, self.control_dt, coding, impedance)
+        self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
+        self._down = Line(self.downlink, "TeleopChannel down 0", self._same_s)
         self._watch: RoundTripWatch | None = None
         self._fallback: FallbackController | None = None
         if limit is not None:
             self._watch = RoundTripWatch(env, limit, self.control_dt, self._same_s)
             plant = self._watch.budget.plant_of(plant)
-        if limit is not None or missing == "fallback":
             refuse_changed_actions(env)
             self._fallback = FallbackController(env, fallback, plant)
-        if self._watch is not None:
             self._watch.budget.bind(plant)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -156,35 +127,33 @@ class TeleopChannel(CommandGate):
             self._watch.reset()
         self._coding.reset(observation)
         self._start(info)
-        self._lost = 0
         self._images: list[float] = [0.0]  # when the image was taken that was shown after each step
-        self._report(info, 0.0, *self._measured)
+        self._report(info, 0.0, self._ceiling_s)
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Send the action, step the env with what has arrived, and return what has come back."""
         now_s = self.now_s
-        self._lost = 0
         self._send_up(self._sendable(action), now_s)
         arrived = self._up.receive(now_s)
-        command, operators = self._in_force()
-        plain = self._flow_of(command) if operators else None
-        flow, seen_s = self._coding.far(arrived, self._up.newest.load, plain)
+        command = self._in_force()
+        flow, seen_s = self._coding.far(arrived, self._up.newest.load)
         if flow is not None:
-            command, operators = self._with_flow(command, flow), True
+            command = self._with_flow(command, flow)
         round_trip_s = now_s - seen_s
-        ceiling_s, clearance_m = self._measured
+        ceiling_s = self._ceiling_s
         if self._watch is not None:
             self._watch.judge(self._boxed(command), seen_s, round_trip_s, now_s)
         if self.revoked:
-            command, operators = self._braked(), False
+            assert self._fallback is not None
+            command = self._fallback.command().astype(self._dtype)
         executed, (observation, reward, terminated, truncated, info) = self._execute(command)
         # What the brake or a filter inside does is not the operator's: the channel's port stood still.
-        obeyed = operators and np.array_equal(executed, np.asarray(command, dtype=np.float64))
+        obeyed = not self.revoked and np.array_equal(executed, np.asarray(command, dtype=np.float64))
         shown = self._send_down(executed, observation, obeyed)
         if self._watch is not None:
             self._watch.look()
-        self._report(info, round_trip_s, ceiling_s, min(clearance_m, self._measured[1]))
+        self._report(info, round_trip_s, ceiling_s)
         return shown, reward, terminated, truncated, info
 
     @property
@@ -193,18 +162,14 @@ class TeleopChannel(CommandGate):
         return self._watch is not None and self._watch.revoked
 
     def _sendable(self, action: Any) -> NDArray[Any] | None:
-        """A copy of the action; None, which counts as lost, where it is not finite."""
+        """A copy of the action; None where it is not finite."""
         given = action_array(action, self._shape)
-        self._measure(given, "operator's")
-        if self._is_finite(given, "operator's", "it is not sent"):
-            return given
-        self._lost += 1
-        return None
+        self._warn_outside(given, "operator's")
+        return given if self._is_finite(given, "operator's", "it is not sent") else None
 
     def _send_up(self, action: NDArray[Any] | None, now_s: float) -> None:
         observed_s, self._observed_s = self._observed_s, self.now_s + self.control_dt
         if observed_s is None or observed_s > now_s + self._same_s:
-            self._lost += action is not None and observed_s is not None
             action = None
         self._moved = flow = None if action is None else self._flow_of(action)
         extra = self._coding.near(flow)
@@ -213,24 +178,17 @@ class TeleopChannel(CommandGate):
         step = min(max(math.floor(observed_s / self.control_dt + SAME_STEP), 0), len(self._images) - 1)
         sequence, lost = self._up.send(Up(action, self._images[step], extra), now_s)
         self._coding.sent(True, sequence, extra, lost)
-        self._lost += lost
 
-    def _in_force(self) -> tuple[Any, bool]:
-        """The command for this step as far as it is plain, and whether it is the operator's."""
-        newest, fresh = self._up.newest.load, self._up.fresh
-        if not fresh and self._missing == "fallback":
-            return self._braked(), False
-        if newest is None or (not fresh and self._missing == "zero"):
-            return self._rest(), True
+    def _in_force(self) -> Any:
+        """The command for this step as far as it is plain: the newest that has arrived, at first zero."""
+        newest = self._up.newest.load
+        if newest is None:
+            return self._rest()
         command = newest.action.copy()
         # What is judged is what is executed; without a ceiling nothing is judged, and nothing changed.
         if self._watch is not None and ((command < self._low) | (command > self._high)).any():
             command = self._boxed(command).astype(self._dtype)
-        return command, True
-
-    def _braked(self) -> Any:
-        assert self._fallback is not None
-        return self._fallback.command().astype(self._dtype)
+        return command
 
     def _flow_of(self, command: Any) -> Array | None:
         """In the box, as the machine will take it."""
@@ -249,7 +207,6 @@ class TeleopChannel(CommandGate):
         extra, given = coding.settle(flow, observation, obeyed)
         sequence, lost = self._down.send(Down(_copy(observation), now_s, extra), now_s)
         coding.sent(False, sequence, extra, lost)
-        self._lost += lost
         arrived = self._down.receive(now_s)
         newest = self._down.newest.load
         self._images.append(max(self._images[-1], newest.taken_s))
@@ -259,24 +216,18 @@ class TeleopChannel(CommandGate):
         return shown
 
     @property
-    def _measured(self) -> tuple[float, float]:
-        """The ceiling (s) and the clearance (m) of the present state; inf where they are not watched."""
-        watch = self._watch
-        return (math.inf, math.inf) if watch is None else (watch.ceiling_s, watch.clearance_m)
+    def _ceiling_s(self) -> float:
+        """The ceiling of the present state, s; inf where it is not watched."""
+        return math.inf if self._watch is None else self._watch.ceiling_s
 
-    def _report(
-        self, info: dict[str, Any], round_trip_s: float, ceiling_s: float, clearance_m: float
-    ) -> None:
+    def _report(self, info: dict[str, Any], round_trip_s: float, ceiling_s: float) -> None:
         info[keys.TELEOP_ROUND_TRIP_S] = round_trip_s
         info[keys.TELEOP_CEILING_S] = ceiling_s
-        info[keys.TELEOP_CLEARANCE_M] = clearance_m
         info[keys.TELEOP_REVOKED] = self.revoked
-        info[keys.TELEOP_ENERGY_IN_J] = self._coding.energy_in.value
-        info[keys.TELEOP_ENERGY_OUT_J] = self._coding.energy_out.value
+        info[keys.TELEOP_ENERGY_IN_J] = self._coding.energy_in_j
+        info[keys.TELEOP_ENERGY_OUT_J] = self._coding.energy_out_j
         info[keys.TELEOP_IN_FLIGHT_J] = self._coding.stored_j
         info[keys.TELEOP_CREATED_J] = self._coding.ledger.created_j
-        info[keys.TELEOP_LOST] = self._lost
-        info[keys.TELEOP_LATE] = self._up.late
 
 
 def _copy(observation: Any) -> Any:

@@ -2,25 +2,19 @@
 
 import heapq
 import math
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array, non_negative, positive
-from safe_wrappers.control.teleop.passivity import ChannelLedger, effort_and_outgoing, to_waves
-from safe_wrappers.control.teleop.passivity_control import EnergyReference
-from safe_wrappers.control.teleop.port_checks import RunningSum, port_energy
-from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
+from safe_wrappers.checks import Array, positive
+from safe_wrappers.control.teleop.passivity import ChannelLedger, effort_and_outgoing, port_energy, to_waves
+from safe_wrappers.control.teleop.wave_line import WaveLine
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.wrappers.layer import Env
 from safe_wrappers.wrappers.teleop import Packet, PortReading, TeleopPort
 
-_STORAGE_J: Final = 0.02
-"""What each end of a passivity controller may give out unpaid, unless it is said."""
-
 Coding = Literal["plain", "wave"]
-Passivity = Literal["none", "controller"]
 
 
 class Up(NamedTuple):
@@ -52,16 +46,14 @@ class PlainCoding:
     env's step, `settle` (what truly happened), `sent`, `shown`. Without a reading of a port no energies are known.
     """
 
-    storage_j = 0.0  # what each end may give out unpaid, J
-
     def __init__(self, reading: PortReading | None, tick_s: float) -> None:
         self._reading, self._tick_s = reading, tick_s
 
     def reset(self, observation: Any) -> None:
         """A new episode, whose first observation the operator knows."""
         self._seen_s = 0.0
-        self.ledger = ChannelLedger(2.0 * self.storage_j)
-        self.energy_in, self.energy_out = RunningSum(), RunningSum()
+        self.ledger = ChannelLedger()
+        self.energy_in_j = self.energy_out_j = 0.0
         if self._reading is not None:
             self._reading.reset(observation)
             self._still = np.zeros(self._reading.effort.size)
@@ -73,8 +65,8 @@ class PlainCoding:
     def sent(self, up: bool, sequence: int, extra: Any, lost: bool) -> None:
         """A packet left, up or down."""
 
-    def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
-        """Decode what has arrived in this tick; `flow` (m,) is of the plain command, None if not the operator's."""
+    def far(self, arrived: list[Packet], newest: Up | None) -> Order:
+        """Decode what has arrived in this tick."""
         if newest is not None:
             self._seen_s = newest.seen_s
         return None, self._seen_s
@@ -99,8 +91,8 @@ class PlainCoding:
         felt = self._reading.of(shown)
         moved = np.zeros_like(felt) if moved is None else moved
         self.ledger.add(felt, moved, *given, self._tick_s, self.stored_j)
-        self.energy_in.add(port_energy(felt, moved, self._tick_s))
-        self.energy_out.add(port_energy(*given, self._tick_s))
+        self.energy_in_j += port_energy(felt, moved, self._tick_s)
+        self.energy_out_j += port_energy(*given, self._tick_s)
 
     @property
     def stored_j(self) -> float:
@@ -108,70 +100,17 @@ class PlainCoding:
         return 0.0
 
 
-class PaidCoding(PlainCoding):
-    """Plain, but each end gives out at most `storage_j` more energy than it has heard the other took in.
-
-    `limit` is of the damping force at the operator's end, N; None: none.
-    """
-
-    def __init__(self, reading: PortReading, tick_s: float, limit: float | None, storage_j: float) -> None:
-        super().__init__(reading, tick_s)
-        self._port, self._limit, self.storage_j = reading, limit, storage_j
-
-    def reset(self, observation: Any) -> None:
-        super().reset(observation)
-        near = EnergyReference("impedance", self.storage_j, self._limit)
-        self._ends = near, EnergyReference("admittance", self.storage_j)
-        self._late = self._felt = self._port.effort
-
-    def near(self, flow: Array | None) -> Any:
-        moved = self._still if flow is None else flow
-        self._felt = self._ends[0].modify(self._late, moved, self._tick_s).effort
-        return self._ends[0].message_j
-
-    def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
-        end = self._ends[1]
-        end.receive(*(packet.load.extra for packet in arrived))
-        _, seen_s = super().far(arrived, newest, flow)
-        wanted = self._still if flow is None else flow
-        paid = self._affordable(wanted, max(end.budget_j, 0.0))
-        return None if paid is wanted else paid, seen_s
-
-    def _affordable(self, flow: Array, budget_j: float) -> Array:
-        """The flow, or as much of it as its energy is paid for; the effort may answer the flow at once."""
-        steady = port_energy(self._port.base, flow, self._tick_s)
-        damped = self._port.feedthrough * port_energy(flow, flow, self._tick_s)
-        if steady + damped <= budget_j:
-            return flow
-        # The positive root of damped s^2 + steady s = budget, without a difference of nearly equal numbers.
-        root = math.sqrt(steady * steady + 4.0 * damped * budget_j)
-        share = 2.0 * budget_j / (steady + root) if steady > 0.0 else (root - steady) / (2.0 * damped)
-        return flow * min(share, 1.0)
-
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        _, given = super().settle(flow, observation, obeyed)
-        assert given is not None
-        # Power is positive into the channel at both ends. The flow was scaled, not damped: no damping to credit.
-        self._ends[1].account(-given[0], given[1], self._tick_s)
-        return self._ends[1].message_j, given
-
-    def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        self._ends[0].receive(*(packet.load.extra for packet in arrived))
-        self._late = self._port.of(observation)
-        return self._port.replaced(observation, self._felt)
-
-
 class WaveCoding(PlainCoding):
     """Flow and effort as waves (`impedance` in N s/m), each of which pays for what it does at the other end."""
 
-    def __init__(self, reading: PortReading, tick_s: float, impedance: float, rule: Rule) -> None:
+    def __init__(self, reading: PortReading, tick_s: float, impedance: float) -> None:
         super().__init__(reading, tick_s)
-        self._port, self._impedance, self._rule = reading, impedance, rule
+        self._port, self._impedance = reading, impedance
 
     def reset(self, observation: Any) -> None:
         super().reset(observation)
         m = self._still.size
-        self._up, self._down = (WaveLine(self._tick_s, self._rule, m) for _ in range(2))
+        self._up, self._down = (WaveLine(self._tick_s, m) for _ in range(2))
         self._back: list[tuple[int, Array]] = []
         self._waiting: list[tuple[int, float]] = []
         self._incoming = self._felt = self._still
@@ -192,15 +131,13 @@ class WaveCoding(PlainCoding):
         if lost:
             line.lose(sequence)
 
-    def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
+    def far(self, arrived: list[Packet], newest: Up | None) -> Order:
         wave = self._up.deliver([(packet.sequence, packet.load.extra) for packet in arrived])
-        if self._rule != "queue":
-            super().far(arrived, newest, flow)  # seen as late as the newest
-        else:  # as late as the wave that is put out now, or the last one
-            for packet in arrived:
-                heapq.heappush(self._waiting, (packet.sequence, packet.load.seen_s))
-            if self._waiting:
-                self._seen_s = heapq.heappop(self._waiting)[1]
+        # Seen as late as the wave that is put out now, or the last one.
+        for packet in arrived:
+            heapq.heappush(self._waiting, (packet.sequence, packet.load.seen_s))
+        if self._waiting:
+            self._seen_s = heapq.heappop(self._waiting)[1]
         # What the machine took beyond what had arrived is paid first.
         energy = self._energy(wave)
         paid = min(self._owed_j, energy)
@@ -246,37 +183,18 @@ class WaveCoding(PlainCoding):
 
 
 def coding_from(
-    env: Env,
-    port: TeleopPort | None,
-    tick_s: float,
-    coding: Coding,
-    impedance: float | None,
-    passivity: Passivity,
-    damping_limit: float | None,
-    storage_j: float | None,
-    rule: Rule,
+    env: Env, port: TeleopPort | None, tick_s: float, coding: Coding, impedance: float | None
 ) -> PlainCoding:
     """The coding that a channel's arguments ask for; an error if they do not go together or a port is missing."""
-    if passivity == "none" and not (damping_limit is None and storage_j is None):
-        raise ConfigurationError('damping_limit and storage_j are for passivity="controller"')
-    storage_j = non_negative("storage_j", _STORAGE_J if storage_j is None else storage_j, "J")
-    if damping_limit is not None:
-        damping_limit = positive("damping_limit", damping_limit, "N")
-    if coding == "wave" and passivity == "controller":
-        raise ConfigurationError('waves pay for their energy: passivity="controller" is for plain coding')
-    if coding == "plain" and impedance is not None:
-        raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
     reading = None if port is None else PortReading(env, port)
-    if coding == "plain" and passivity == "none":
+    if coding == "plain":
+        if impedance is not None:
+            raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
         return PlainCoding(reading, tick_s)
     if reading is None:
-        what = 'coding="wave"' if coding == "wave" else 'passivity="controller"'
-        raise ConfigurationError(
-            f'{what} needs a port, such as port={{"flow": [0], "effort": [2]}}; {env.unwrapped!r} publishes none'
-        )
+        wanted = 'coding="wave" needs a port, such as port={"flow": [0], "effort": [2]}'
+        raise ConfigurationError(f"{wanted}; {env.unwrapped!r} publishes none")
     refuse_changed_actions(env)
-    if coding == "plain":
-        return PaidCoding(reading, tick_s, damping_limit, storage_j)
     if impedance is None:
         raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
-    return WaveCoding(reading, tick_s, positive("impedance", impedance, "N s/m"), rule)
+    return WaveCoding(reading, tick_s, positive("impedance", impedance, "N s/m"))

@@ -18,7 +18,6 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, CBFActionFilter
-from safe_wrappers.wrappers.episode_guard import EpisodeGuard
 from safe_wrappers.wrappers.layer import action_array
 
 Mask = NDArray[np.bool_]
@@ -32,7 +31,7 @@ else:
     _Wrapper = VectorWrapper  # no generic class in Gymnasium 1.1
 
 
-class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
+class VectorCBFActionFilter(_Wrapper):
     """Filters the actions of all envs of a `SyncVectorEnv`.
 
     Every env has a `CBFActionFilter` of its own beside it, with the same guarantees; its executed actions are the
@@ -77,7 +76,6 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         margin: float = 0.0,
     ) -> None:
         super().__init__(env)
-        self.await_reset()
         envs = single_envs(env)
         plants = [copy.deepcopy(plant) for _ in envs]
         self.filters = [
@@ -137,6 +135,8 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Filter the actions, shape (n, m), and step the envs with what may be executed."""
+        if not self.filters[0].started:
+            raise gym.error.ResetNeeded("call reset before step")
         started = time.perf_counter()
         given = action_array(actions, (self.num_envs, *self._low.shape))
         judged = ~self._ended if self._next_step else np.ones(self.num_envs, dtype=bool)
@@ -248,7 +248,6 @@ class VectorCBFActionFilter(EpisodeGuard, _Wrapper):
         }
         if written.any():
             found[keys.CBF_CORRECTION] = np.linalg.norm(executed - proposed, axis=1)
-            found[keys.CBF_CLIPPED] = np.linalg.norm(boxed - proposed, axis=1)
         for key, values in found.items():
             reports[key][usual] = values[usual]
         return usual

@@ -95,15 +95,7 @@ def test_a_row_that_is_no_number_is_kept_and_fails():
     assert traction._bounds().offsets.shape == (8,)
 
 
-# The report --------------------------------------------------------------------------------------------------------
-
-
-# Traction against strange vehicles, drivers and episodes: judged by MuJoCo's own velocities, never by the filte
-
-
-def start_hostile(env, **layout):
-    env.reset(seed=0, options={"layout": OPEN | layout})
-    return env
+# Traction against strange vehicles and drivers: judged by MuJoCo's own velocities, never by the filter's
 
 
 # Drivers -------------------------------------------------------------------------------------------------------
@@ -112,7 +104,8 @@ def start_hostile(env, **layout):
 @pytest.mark.parametrize(("ground", "period"), [("dry", 1), ("dry", 2), ("wet", 2), ("ice", 3)])
 def test_throttle_and_brake_by_turns(ground, period):
     """The slip changes its sign within a control step: its mean is near zero, and so is the force measured."""
-    env = start_hostile(rover(), ground=ground, speed=2.0)
+    env = rover()
+    env.reset(seed=0, options={"layout": OPEN | {"ground": ground, "speed": 2.0}})
     slips = [env.step(FULL * (1 if k // period % 2 else -1))[4]["slip_max"] for k in range(200)]
     assert max(slips) < 0.16
 
@@ -122,7 +115,7 @@ def overshoots(steps, draw, seed=0):
     env, rng, slips = rover(), np.random.default_rng(seed), []
     for step in range(steps):
         if step % 300 == 0:
-            start_hostile(env, speed=rng.uniform(0.0, 3.0))
+            env.reset(seed=0, options={"layout": OPEN | {"speed": rng.uniform(0.0, 3.0)}})
         info = env.step(draw(rng).astype(np.float32))[4]
         assert not info["cbf/infeasible"]
         slips.append((info["slip_max"], np.abs(info["slip"]).max()))
@@ -136,10 +129,6 @@ def longest_run(flags):
 
 def full_or_nothing(rng):
     return np.append(np.sign(rng.uniform(-1, 1, 4)), rng.uniform(-0.2, 0.2))
-
-
-def anything(rng):
-    return rng.uniform(-1.0, 1.0, 5)
 
 
 def test_wheels_driven_against_each_other_at_random():
@@ -317,9 +306,6 @@ def test_a_state_that_is_no_number_is_forgotten():
     traction.observe(traction.executed(full))
     assert np.isfinite(traction.rows().offsets).all()
     np.testing.assert_array_equal(traction.seen.present, 0.0)
-
-
-# Reports -------------------------------------------------------------------------------------------------------
 
 
 # Bad input -----------------------------------------------------------------------------------------------------

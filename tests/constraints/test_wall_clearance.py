@@ -138,9 +138,6 @@ def test_far_from_walls_actions_pass_bit_for_bit():
         assert (info["executed_action"] == action.astype(np.float64)).all()
 
 
-# Outside the safe set -----------------------------------------------------------------------------------------
-
-
 # Composition --------------------------------------------------------------------------------------------------
 
 

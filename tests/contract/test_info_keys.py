@@ -70,11 +70,34 @@ def test_what_is_written_is_registered_as_it_is_and_what_is_registered_is_writte
 
 
 def test_the_constants_are_the_names_and_figures_are_made_of_registered_keys():
-    constants = {v for k, v in vars(keys).items() if k.isupper() and type(v) is str} - {keys.RUNNING_PREFIX}
-    assert constants | set(keys.RUNNING) == set(keys.KEYS)
+    constants = {v for k, v in vars(keys).items() if k.isupper() and type(v) is str}
+    assert constants == set(keys.KEYS)
     assert all(key.name == name for name, key in keys.KEYS.items())
     assert {name for figure in keys.EPISODE for name in figure.of} <= set(keys.KEYS)
-    assert {key.where for key in keys.KEYS.values()} - {""} <= set(keys.KEYS)
     for of in (lambda key: key.log, lambda key: key.name):
         named = [of(key) for key in keys.KEYS.values() if of(key)]
         assert len(set(named)) == len(named)
+
+
+def test_infos_of_several_steps_are_merged_as_the_registry_says():
+    steps = [
+        {
+            keys.CBF_INTERVENED: flag,
+            keys.CBF_MARGIN: margin,
+            keys.COST: 1.0,
+            keys.CONTACT_PEAK_FORCE: force,
+            "own": flag,
+        }
+        for flag, margin, force in ((False, 0.3, 2.0), (True, 0.1, 9.0), (False, 0.2, np.nan))
+    ]
+    steps[1][keys.CBF_REFUSED], steps[2][keys.CBF_REFUSED] = np.array([True, False]), np.array([False, False])
+    found = keys.merged([dict(step) for step in steps])
+    assert found.pop(keys.CBF_REFUSED).tolist() == [True, False]
+    assert found == {
+        keys.CBF_INTERVENED: True,
+        keys.CBF_MARGIN: 0.1,
+        keys.COST: 3.0,
+        keys.CONTACT_PEAK_FORCE: 9.0,  # NaN is no report
+        "own": False,  # of the last step
+    }
+    assert type(found[keys.CBF_INTERVENED]) is bool and keys.merged(steps[:1]) is steps[0]

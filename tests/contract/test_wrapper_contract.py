@@ -227,7 +227,7 @@ def test_info_has_the_same_keys_and_types_at_every_step(name, case):
             seen.append(types(env.step(lowest(env))[4]))
     assert all(s == seen[0] for s in seen)
     added = seen[0].keys() - env.unwrapped.step(lowest(env.unwrapped))[4].keys()
-    assert added or name in SILENT, "a wrapper of ours reports something"
+    assert added or name in (*SILENT, "RecordInterventions"), "a wrapper of ours reports something"
     assert all("/" in key or key.endswith("_action") or key == "cost" for key in added)
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from safe_wrappers.control.handover.blend_curves import BlendCurve
+from safe_wrappers.control.handover.curves import BlendCurve, knot_torque_step
 from safe_wrappers.control.handover.seams import BLENDS, join
 
 HOLD = 0.1
@@ -60,23 +60,14 @@ def test_a_curve_is_scipys_and_its_peaks_are_those_of_dense_samples(blend, scena
     curve, oracle = BlendCurve.of(blend, sent, prior, new, n, HOLD), curve_by_scipy(blend, *scenario)
     fine, span = 4000, (n + 1) * HOLD
     dense = oracle(np.linspace(0.0, span, fine * (n + 1) + 1))
-    for i, piece in enumerate(curve.pieces):
-        t = np.linspace(0.0, curve.span, 7)
-        found = np.polynomial.polynomial.polyval(t, piece.T)
-        np.testing.assert_allclose(found.T, oracle(t + i * curve.span), atol=1e-10)
+    t = np.linspace(0.0, span, 7 * (n + 1))
+    np.testing.assert_allclose(curve.curve(t), oracle(t), atol=1e-10)
     np.testing.assert_allclose(curve.peak(0), np.abs(dense).max(axis=0), rtol=1e-5)
     rate = np.abs(np.diff(dense, axis=0)).max(axis=0) * fine / HOLD
     np.testing.assert_allclose(curve.peak(1), rate, rtol=2e-3, atol=2e-3)
     # The higher derivatives inside of the pieces; jumps between them have their own test.
     for order in (2, 3):
-        t = np.linspace(0.0, curve.span, 2001)
-        inner = np.max(
-            [
-                np.abs(np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyder(p.T, order)))
-                for p in curve.pieces
-            ],
-            axis=(0, -1),
-        )
+        inner = np.abs(curve.curve.derivative(order)(np.linspace(0.0, span, 2001 * (n + 1)))).max(axis=0)
         assert (curve.peak(order) >= inner * (1 - 1e-9)).all()
 
 
@@ -108,3 +99,14 @@ def test_between_held_commands_the_peaks_are_the_closed_forms(order, peak):
     for blend in ("smoothstep", "quintic"):
         found = BlendCurve.of(blend, *held, 4, HOLD).peak(order)
         assert found == pytest.approx(2.0 * peak / 0.5**order)
+
+
+def test_torque_steps_at_knots_are_those_of_scipys_spline():
+    rng = np.random.default_rng(0)
+    knots, roots = rng.normal(size=(6, 2)), rng.normal(size=(4, 2, 2))
+    bend = CubicHermiteSpline(HOLD * np.arange(6), knots, np.gradient(knots, HOLD, axis=0)).derivative(2)
+    at = HOLD * np.arange(1, 5)
+    jumps = bend(at + 1e-12) - bend(at - 1e-12)
+    inertia = roots @ roots.swapaxes(1, 2)
+    expected = np.einsum("kij,kj->ki", inertia, jumps)
+    np.testing.assert_allclose(knot_torque_step(inertia, HOLD, knots), expected, rtol=1e-6, atol=1e-6)

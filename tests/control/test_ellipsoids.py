@@ -90,36 +90,6 @@ def test_no_point_of_the_set_is_nearer_and_no_point_outside_is_reached_sooner(ca
         assert (units @ point - supports).max() <= distance + LOST_WIDTH * max(half) + 1e-9
 
 
-@given(cases(axes=st.floats(0.05, 5.0)))
-def test_inside_the_normal_leads_to_the_boundary_over_the_depth(case):
-    point, shape, _half, _ = case
-    point = 0.1 * point
-    distance, normal = one(point, shape)
-    assume(distance < 0.0)
-    exit_point = point - distance * normal
-    level = exit_point @ np.linalg.solve(shape, exit_point)
-    assert level == pytest.approx(1.0, abs=1e-9)
-
-
-@given(cases(), st.floats(-3.0, 3.0))
-def test_turning_space_turns_the_normal(case, angle):
-    point, shape, half, _ = case
-    rotation = turn(len(point), np.array([angle, 0.5 * angle, 1.0]))
-    before, normal = one(point, shape)
-    turned, turned_normal = one(rotation @ point, rotation @ shape @ rotation.T)
-    assert turned == pytest.approx(before, abs=LOST_WIDTH * max(half) + 1e-12)
-    if before > 0.01:  # inside and on flat sets several normals are equally good
-        np.testing.assert_allclose(turned_normal, rotation @ normal, atol=1e-5)
-
-
-@given(cases(), st.floats(1e-3, 1e3))
-def test_scaling_space_scales_the_distance(case, factor):
-    point, shape, half, _ = case
-    before, _ = one(point, shape)
-    after, _ = one(factor * point, factor**2 * shape)
-    assert after == pytest.approx(factor * before, abs=factor * (LOST_WIDTH * max(half) + 1e-12))
-
-
 @given(cases(), arrays(np.float64, 3, elements=st.floats(-1e-4, 1e-4)))
 def test_a_step_changes_the_distance_by_its_part_along_the_normal(case, step):
     point, shape, half, _ = case
@@ -131,15 +101,6 @@ def test_a_step_changes_the_distance_by_its_part_along_the_normal(case, step):
     change = after - distance - step @ normal
     rounding = LOST_WIDTH * max(half) + 1e-12
     assert -rounding <= change <= step @ step / distance + rounding
-
-
-@given(DIMENSIONS.flatmap(lambda d: arrays(np.float64, d, elements=COORDINATES)))
-def test_the_zero_shape_is_a_point(offset):
-    d = len(offset)
-    distance, normal = one(offset, np.zeros((d, d)))
-    assert distance == pytest.approx(np.linalg.norm(offset), abs=1e-14)
-    np.testing.assert_allclose(distance * normal, offset, atol=1e-14)
-    assert np.linalg.norm(normal) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -160,19 +121,6 @@ def test_an_axis_aligned_segment_from_minus_one_to_one_is_exact(point, distance,
         assert abs(direction[1]) == 1.0, "across the segment"
     else:
         np.testing.assert_allclose(direction, normal, atol=1e-9)
-
-
-def test_a_segment_at_any_angle():
-    angles = np.linspace(0.0, np.pi, 37)
-    along = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    shape = 4.0 * along[:, :, None] * along[:, None, :]
-    for offset, distance in [(0.7 * along + 0.3 * across, 0.3), (3.5 * along, 1.5), (0.7 * along, 0.0)]:
-        found, normal = ellipsoid_gap(offset, shape)
-        assert (found <= distance + 1e-9).all()
-        assert (found >= distance - 2.0 * LOST_WIDTH).all()
-        if distance == 0.0:
-            np.testing.assert_allclose(np.abs((normal * across).sum(axis=1)), 1.0, atol=1e-6)
 
 
 def smallest_eigenvalue(a, b, c):
@@ -198,34 +146,6 @@ def test_the_width_that_rounding_hides_is_not_left_out():
     assert hidden > 1e-9, "no width was lost: the test would not see its overestimation"
 
 
-def test_a_disc_in_space():
-    flat = np.diag([4.0, 4.0, 0.0])
-    points = [((0.0, 0.0, 1.5), 1.5), ((5.0, 0.0, 0.0), 3.0), ((5.0, 0.0, 4.0), 5.0), ((0.3, 0.2, 0.0), 0.0)]
-    for point, distance in points:
-        assert one(point, flat)[0] == pytest.approx(distance, abs=1e-12)
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_the_centre_of_a_ball_is_as_deep_as_its_radius(d):
-    distance, normal = one(np.zeros(d), 4.0 * np.eye(d))
-    assert distance == -2.0
-    assert np.linalg.norm(normal) == 1.0
-
-
-def test_at_the_centre_the_shortest_half_axis_leads_out():
-    distance, normal = one((0.0, 0.0, 0.0), np.diag([4.0, 0.25, 9.0]))
-    assert distance == pytest.approx(-0.5)
-    np.testing.assert_allclose(np.abs(normal), [0.0, 1.0, 0.0], atol=1e-15)
-
-
-def test_on_the_longest_axis_the_way_out_is_off_the_axis():
-    """Half-axes 2 and 1, point (0.5, 0): nearest is x = 2/3 (from 4 cos t - cos t = 2 * 0.5), not (0, ±1)."""
-    distance, normal = one((0.5, 0.0), np.diag([4.0, 1.0]))
-    nearest = np.array([2.0 / 3.0, np.sqrt(1.0 - 1.0 / 9.0)])
-    assert distance == pytest.approx(-np.hypot(nearest[0] - 0.5, nearest[1]), abs=1e-12)
-    np.testing.assert_allclose(np.abs(normal), np.abs(nearest - [0.5, 0.0]) / -distance, atol=1e-9)
-
-
 def test_extreme_ratios_stay_finite_and_bounded():
     """Half-axes over 12 decades, coordinates over 20: against the bound that every direction gives."""
     rng = np.random.default_rng(3)
@@ -238,12 +158,6 @@ def test_extreme_ratios_stay_finite_and_bounded():
         units /= np.linalg.norm(units, axis=2, keepdims=True)
         bounds = (units * points).sum(axis=2) - np.linalg.norm(units * half, axis=2)
         assert (bounds.max(axis=0) <= distance + 1e-11 * (1.0 + half.max(axis=1))).all()
-
-
-def test_no_points_give_no_distances():
-    distance, normal = ellipsoid_gap(np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    assert distance.shape == (0,)
-    assert normal.shape == (0, 2)
 
 
 @pytest.mark.parametrize(
@@ -266,8 +180,3 @@ def test_no_points_give_no_distances():
 def test_bad_input_is_refused(offset, shape, words):
     with pytest.raises(ConfigurationError, match=words):
         ellipsoid_gap(offset, shape)
-
-
-def test_a_users_rounding_is_not_refused():
-    shape = np.array([[[1.0, 1e-13], [0.0, -1e-13]]])
-    assert ellipsoid_gap(np.array([[0.0, 1.0]]), shape)[0] == pytest.approx(1.0, abs=1e-6)

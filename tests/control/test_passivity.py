@@ -12,7 +12,6 @@ from safe_wrappers.control.teleop.passivity import (
     effort_and_outgoing,
     to_waves,
 )
-from safe_wrappers.control.teleop.port_checks import RunningSum
 from safe_wrappers.errors import ConfigurationError
 
 NUMBERS = st.floats(-1e4, 1e4, allow_subnormal=False)
@@ -50,47 +49,6 @@ def test_every_way_through_the_transform_ends_at_the_same_port(port, b):
     operator = effort_and_outgoing(v, w, b)
     np.testing.assert_allclose(operator.effort, f, **efforts)
     np.testing.assert_allclose(operator.outgoing, u, **waves)
-
-
-def test_waves_by_hand():
-    u, w = to_waves(4.0, 1.0, 2.0)
-    assert (u, w) == (3.0, 1.0)  # (4 + 2) / 2 and (4 - 2) / 2
-    batch = to_waves(np.full((5, 2), 4.0), np.full((5, 2), 1.0), 2.0)
-    assert batch.u.shape == (5, 2)
-
-
-DT = 0.01
-
-
-def test_a_million_steps_do_not_drift():
-    values = np.random.default_rng(0).normal(size=1_000_000) * 10.0 ** np.arange(-8, 2).repeat(100_000)
-    values[::1000] += 1e9
-    values[1::1000] -= 1e9
-    total = RunningSum(1.0)
-    for value in values.tolist():
-        total.add(value)
-    exact, size = math.fsum([1.0, *values.tolist()]), float(np.abs(values).sum())
-    eps = np.finfo(float).eps
-    bound = 2.0 * eps * abs(exact) + values.size * eps**2 * size
-    assert abs(total.value - exact) <= bound
-    assert abs(sum(values.tolist(), 1.0) - exact) > 1e3 * bound  # which adding up one by one is far from
-
-
-def test_rounding_of_a_channel_is_not_activity():
-    rng, by_rounding = np.random.default_rng(0), 0
-    for _ in range(100):
-        ledger, pieces = ChannelLedger(), rng.uniform(0.1, 1.0, size=7)
-        for piece in pieces:
-            ledger.add(piece, 0.3, 0.0, 0.0, DT)
-        ledger.add(0.0, 0.0, math.fsum(pieces.tolist()), 0.3, DT)
-        by_rounding += ledger.created_j > 0.0
-        assert ledger.passive
-        ledger.add(0.0, 0.0, 1e-9, 0.3, DT)
-        assert not ledger.passive
-    assert by_rounding > 5
-    stored = ChannelLedger(0.7)
-    stored.add(0.1, 0.3, 0.0, 0.0, 1.0, stored_j=0.73)  # 0.7 + 0.03 is a rounding below 0.73
-    assert stored.passive
 
 
 class Behind:
@@ -180,14 +138,13 @@ def test_whether_a_plain_delay_is_active_depends_on_what_is_behind_it(kind, phas
     expected = -0.5 * 0.3**2 * ((impedance * np.exp(-2j * phase)).real - impedance.real)
     assert made == pytest.approx(expected, rel=0.05)
     assert (made > 0.0) is active
-    assert not (active and ledger.passive)
+    assert not active or ledger.created_j > 1e-6
 
 
 @pytest.mark.parametrize("phase", [0.2, QUARTER, 3 * QUARTER])
 def test_with_waves_the_same_sines_make_nothing(phase):
     made, ledger = measured("spring", phase, "wave")
     assert abs(made) < 1e-3 * 0.5 * 0.3**2  # of the wave's power
-    assert ledger.passive
     assert ledger.created_j < 1e-12
 
 
@@ -205,21 +162,19 @@ def test_a_lossless_line_holds_what_is_in_flight(delay, given_ports):
         down.append(w)
         in_flight = 0.5 * dt * math.fsum(float(x @ x) for x in up + down)
         ledger.add(effort_m, flow_m, effort_s, flow_s, dt, stored_j=in_flight)
-        assert ledger.stored_j == pytest.approx(in_flight, rel=1e-9, abs=1e-9)
+        assert ledger.net_j == pytest.approx(in_flight, rel=1e-9, abs=1e-9)
     assert ledger.created_j <= 1e-9 * (1.0 + in_flight)
 
 
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: to_waves(1.0, 1.0, 0.0), "impedance must be a finite number above 0"),
+        (lambda: to_waves(1.0, 1.0, 0.0), "impedance must be a finite number > 0"),
         (lambda: to_waves(1.0, 1.0, math.nan), "impedance"),
         (lambda: to_waves([1.0, 2.0], 1.0, 1.0), "of one shape"),
         (lambda: to_waves([1.0, math.inf], [1.0, 1.0], 1.0), "effort must be finite"),
-        (lambda: ChannelLedger(math.nan), "initial_storage_j"),
-        (lambda: ChannelLedger().add(1.0, 1.0, 1.0, 1.0, 0.0), "time_s"),
-        (lambda: ChannelLedger().add(1.0, 1.0, 1.0, 1.0, 1.0, stored_j=-1.0), "stored_j"),
-        (lambda: ChannelLedger().add([1.0], [1.0], [1.0, 2.0], [1.0], 1.0), "effort_s and flow_s"),
+        (lambda: ChannelLedger().add([1.0], [1.0], [1.0, 2.0], [1.0], 1.0), "one shape"),
+        (lambda: ChannelLedger().add(math.inf, 1.0, 0.0, 0.0, 1.0), "finite"),
     ],
 )
 def test_what_cannot_be_worked_with_is_refused(call, says):

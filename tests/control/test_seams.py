@@ -38,8 +38,7 @@ def slow_blend(blend, sent, prior, new, n, low=-math.inf, high=math.inf):
     else:
         slope, bend = (new[1] - new[0] if n == 0 else new[n] - new[n - 1]), 0.0
     ends = [[sent[-1], rate, second], [new[n], slope, bend]]
-    kept = 2 if blend == "hermite" else 3
-    bridge = BPoly.from_derivatives([0.0, n + 1.0], [end[:kept] for end in ends])
+    bridge = BPoly.from_derivatives([0.0, n + 1.0], ends)
     return [min(max(float(bridge(i + 1.0)), low), high) for i in range(n)] + [new[n]]
 
 

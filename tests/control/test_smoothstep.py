@@ -22,12 +22,9 @@ LIMIT = st.floats(0.01, 100)
 def test_smoothstep_is_the_quintic_between_rests_and_clamped_outside():
     oracle = BPoly.from_derivatives([0, 1], [[0, 0, 0], [1, 0, 0]])
     s = np.linspace(0, 1, 101)
-    for derivative in range(3):
-        np.testing.assert_allclose(smoothstep(s, derivative), oracle(s, derivative), atol=1e-12)
+    np.testing.assert_allclose(smoothstep(s), oracle(s), atol=1e-12)
     np.testing.assert_array_equal(smoothstep([-1.0, 0.0, 1.0, 7.0]), [0, 0, 1, 1])
-    for derivative in (1, 2):
-        np.testing.assert_array_equal(smoothstep([-1.0, 0.0, 1.0, 7.0], derivative), 0.0)
-    assert smoothstep(0.5, 1) == SMOOTHSTEP_PEAK_RATE == smoothstep(np.linspace(0, 1, 10_001), 1).max()
+    assert oracle(0.5, 1) == pytest.approx(SMOOTHSTEP_PEAK_RATE)
     assert np.all(np.diff(smoothstep(np.linspace(0, 1, 100_001))) >= 0.0)
 
 
@@ -58,7 +55,6 @@ def test_the_latched_formula_is_too_short_for_a_moving_endpoint():
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: smoothstep(0.5, 3), "derivative of the smoothstep is 0, 1 or 2"),
         (lambda: shortest_latched_blend(1.0, 0.0), "rate_limit must be > 0"),
         (lambda: shortest_latched_blend(np.nan, 1.0), "step must be finite"),
         (lambda: shortest_latched_blend("far", 1.0), "step is a number"),

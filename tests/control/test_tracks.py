@@ -3,7 +3,6 @@
 import pickle
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import blind_covariance, double_integrator_covariance
@@ -45,23 +44,6 @@ def test_many_short_times_are_one_long_one_and_what_ahead_foretells(times, seed)
     for motion, before, after in zip(stepwise.motions, at_start, stepwise.covariance, strict=True):
         a, _, q = motion.matrices()
         np.testing.assert_allclose(after, blind_covariance(before, a, q, sum(times)), rtol=1e-9, atol=1e-11)
-
-
-def test_ahead_changes_nothing():
-    tracks = started()
-    mean, covariance = tracks.mean.copy(), tracks.covariance.copy()
-    tracks.ahead([0.1, 3.0])
-    assert (tracks.mean == mean).all() and (tracks.covariance == covariance).all()
-
-
-def test_the_mean_goes_to_the_mean_velocity_by_the_exponential():
-    tracks = Tracks([MOTIONS[1]])
-    tracks.start(np.array([[1, 2, 3, 4]]), np.zeros((1, 4, 4), dtype=int))  # whole numbers are numbers
-    tracks.advance(0.9)
-    mean, kept = np.array([1.0, -2.0]), np.exp(-0.9 / 0.7)
-    off = np.array([3.0, 4.0]) - mean
-    np.testing.assert_allclose(tracks.velocities[0], mean + kept * off, rtol=1e-12)
-    np.testing.assert_allclose(tracks.positions[0], [1, 2] + mean * 0.9 + 0.7 * (1 - kept) * off, rtol=1e-12)
 
 
 def test_simulated_things_are_where_the_covariance_says():
@@ -118,14 +100,3 @@ def test_its_memory_does_not_grow_with_ever_new_times():
         tracks.ahead([0.1, 0.2 + 1e-5 * i])
         sizes.append(len(pickle.dumps(tracks)))
     assert max(sizes[300:]) <= max(sizes[:300])
-
-
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_tracks_do_not_mix(order):
-    both = started()
-    alone = Tracks([MOTIONS[i] for i in order])
-    alone.start(both.mean[list(order)], both.covariance[list(order)])
-    for tracks in (both, alone):
-        tracks.advance(0.3)
-    np.testing.assert_array_equal(alone.mean, both.mean[list(order)])
-    np.testing.assert_array_equal(alone.covariance, both.covariance[list(order)])

@@ -12,7 +12,6 @@ from safe_wrappers.control.teleop.wave_line import WaveLine
 from safe_wrappers.errors import ConfigurationError
 
 DT = 2.0**-10
-RULES = ("queue", "hold", "zero")
 # The square of a smaller one is no number of full precision any more.
 WAVES = st.floats(-1e3, 1e3).map(lambda x: x if abs(x) > 1e-100 else 0.0)
 
@@ -31,9 +30,9 @@ def energy(wave):
     return sum((Fraction(float(x)) ** 2 for x in wave), Fraction(0)) / 2 * Fraction(DT)
 
 
-def run(rule, waves, late, declare_lost=True):
+def run(waves, late, declare_lost=True):
     """All ticks until the last packet has arrived and a little longer: the line and what it put out."""
-    line, out = WaveLine(DT, rule, components=2), []
+    line, out = WaveLine(DT, components=2), []
     for tick in range(len(waves) + 15):
         if tick < len(waves):
             line.send(waves[tick], tick)
@@ -46,16 +45,16 @@ def run(rule, waves, late, declare_lost=True):
         yield tick, line, out
 
 
-def finished(rule, waves, late):
+def finished(waves, late):
     """The line at the end, and all that it put out, shape (ticks, 2)."""
-    *_, (_, line, out) = run(rule, waves, late)
+    *_, (_, line, out) = run(waves, late)
     return line, np.array(out)
 
 
-@given(st.sampled_from(RULES), traffic(), st.booleans())
-def test_no_more_comes_out_than_has_arrived(rule, given_traffic, declare_lost):
+@given(traffic(), st.booleans())
+def test_no_more_comes_out_than_has_arrived(given_traffic, declare_lost):
     waves, late = given_traffic
-    for tick, line, out in run(rule, waves, late, declare_lost):
+    for tick, line, out in run(waves, late, declare_lost):
         sent = sum((energy(w) for w in waves[: tick + 1]), Fraction(0))
         there = sum(
             (energy(w) for k, w in enumerate(waves) if late[k] and k + min(late[k]) <= tick), Fraction(0)
@@ -75,20 +74,18 @@ def test_no_more_comes_out_than_has_arrived(rule, given_traffic, declare_lost):
         assert line.in_flight_j == pytest.approx(exact, rel=1e-12, abs=1e-25 * float(sent))
 
 
-@pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("delay", [0, 1, 7])
-def test_a_fixed_delay_is_a_fixed_delay_bit_for_bit(rule, delay):
+def test_a_fixed_delay_is_a_fixed_delay_bit_for_bit(delay):
     rng = np.random.default_rng(0)
     waves = rng.normal(size=(50, 2))
-    line, out = finished(rule, waves, [[delay]] * 50)
+    line, out = finished(waves, [[delay]] * 50)
     np.testing.assert_array_equal(out[delay : delay + 50], waves)
     np.testing.assert_array_equal(out[:delay], np.zeros((delay, 2)))
-    if rule != "hold":
-        assert not np.any(out[delay + 50 :])
+    assert not np.any(out[delay + 50 :])
     assert (line.in_flight_j, line.lost_j, line.reserve_j) == (0.0, pytest.approx(0.0, abs=1e-15), 0.0)
 
 
-def test_holding_the_last_sample_makes_energy_and_no_rule_does():
+def test_holding_the_last_sample_makes_energy_and_a_line_does_not():
     """One packet in four arrives; what a plain channel does is to repeat the last."""
     waves = [np.array([1.0, 0.0])] * 24
     late = [[0] if k % 4 == 0 else [] for k in range(24)]
@@ -98,9 +95,8 @@ def test_holding_the_last_sample_makes_energy_and_no_rule_does():
         repeated += 0.5 * DT * float(last @ last)
     arrived = 6 * 0.5 * DT
     assert repeated == 4.0 * arrived
-    for rule in RULES:
-        line, _ = finished(rule, waves, late)
-        assert 0.99 * arrived <= line.put_out_j <= arrived
+    line, _ = finished(waves, late)
+    assert line.put_out_j == arrived
 
 
 def test_the_queue_turns_jitter_into_the_delay_of_the_latest_packet():
@@ -110,7 +106,7 @@ def test_the_queue_turns_jitter_into_the_delay_of_the_latest_packet():
     arrives = np.maximum.accumulate(np.arange(400) + rng.integers(2, 10, size=400))
     late = [[int(at - k)] for k, at in enumerate(arrives)]
     assert late[0] != [9]
-    line, out = finished("queue", waves, late)
+    line, out = finished(waves, late)
     assert line.put_out_j == pytest.approx(line.put_in_j, rel=1e-12)
     np.testing.assert_allclose(out.sum(axis=0), waves.sum(axis=0), atol=1e-10)
     latest = late.index([9])
@@ -119,50 +115,15 @@ def test_the_queue_turns_jitter_into_the_delay_of_the_latest_packet():
     assert not np.array_equal(out[9 : latest + 9], waves[:latest])  # until then it was shorter
 
 
-def test_hold_is_paid_from_what_came_in_surplus():
-    line = WaveLine(DT, "hold")
-    for sequence in range(4):
-        line.send(2.0, sequence)
-    assert line.deliver([]) == 0.0  # nothing held yet
-    assert line.deliver([(0, 2.0), (2, 2.0), (1, 2.0)]) == 2.0
-    assert line.reserve_j == pytest.approx(2 * 2.0 * DT)
-    assert line.deliver([]) == 2.0
-    assert line.deliver([]) == 2.0
-    assert line.deliver([]) == 0.0  # used up
-    assert line.deliver([(3, 2.0)]) == 2.0
-
-
-def test_hold_takes_the_newest_and_an_older_one_pays_only():
-    line = WaveLine(DT, "hold", components=2)
-    line.send([1.0, 0.0], 5)
-    line.send([0.0, 3.0], 6)
-    np.testing.assert_array_equal(line.deliver([(6, [0.0, 3.0])]), [0.0, 3.0])
-    late = line.deliver([(5, [1.0, 0.0])])
-    np.testing.assert_allclose(late, [0.0, 1.0])  # the newest, made as small as the energy of the older
-    assert late @ late <= 1.0
-
-
-def test_zero_adds_what_comes_at_once_and_scales_it_to_its_energy():
-    line = WaveLine(DT, "zero")
-    for sequence, wave in enumerate((3.0, 4.0, 2.0, -2.0)):
-        line.send(wave, sequence)
-    both = float(line.deliver([(0, 3.0), (1, 4.0)])[0])
-    assert both == pytest.approx(5.0)  # 7 would carry 49, and 25 arrived
-    assert both**2 <= 25.0
-    assert line.deliver([(2, 2.0), (3, -2.0)]) == 0.0
-    assert line.lost_j == pytest.approx(0.5 * DT * 8.0)
-
-
 def test_a_packet_that_grew_on_the_way_pays_with_what_was_sent():
-    for rule in RULES:
-        line = WaveLine(DT, rule)
-        line.send(1.0, 0)
-        assert float(line.deliver([(0, 50.0)])[0]) == pytest.approx(1.0)
-        assert line.put_out_j <= line.put_in_j
+    line = WaveLine(DT)
+    line.send(1.0, 0)
+    assert float(line.deliver([(0, 50.0)])[0]) == pytest.approx(1.0)
+    assert line.put_out_j <= line.put_in_j
 
 
 def test_a_packet_that_was_written_off_comes_too_late():
-    line = WaveLine(DT, "queue")
+    line = WaveLine(DT)
     line.send(1.0, 0)
     line.lose(0)
     assert line.lost_j == 0.5 * DT
@@ -171,19 +132,10 @@ def test_a_packet_that_was_written_off_comes_too_late():
         line.lose(0)
 
 
-def test_what_is_returned_may_be_written_on():
-    line = WaveLine(DT, "hold")
-    line.send(1.0, 0)
-    line.send(1.0, 1)
-    line.deliver([(0, 1.0), (1, 1.0)])[:] = 7.0
-    assert line.deliver([]) == 1.0
-
-
 @pytest.mark.parametrize(
     ("call", "says"),
     [
         (lambda: WaveLine(0.0), "time_s"),
-        (lambda: WaveLine(DT, "last"), "rule must be one of queue, hold, zero, got 'last'"),
         (lambda: WaveLine(DT, components=0), "components"),
         (lambda: WaveLine(DT).send(math.nan, 0), "finite"),
         (lambda: WaveLine(DT).send(1e200, 0), "finite"),

@@ -10,12 +10,12 @@ import safe_wrappers as sw
 from safe_wrappers.filter.constraint import BoundConstraint
 
 HOLD, WALL = 0.1, -0.3
-PENALTIES = {"penalty": 5.0, "per_correction": 0.5, "per_squared": 0.25, "bounded": 2.0, "scale": 0.7}
+PENALTIES = {"penalty": 5.0, "per_correction": 0.5}
 
 
 def cost(correction):
     """What a changed step costs, by those penalties."""
-    return 5.0 + 0.5 * correction + 0.25 * correction**2 + 2.0 * (1.0 - np.exp(-((correction / 0.7) ** 2)))
+    return 5.0 + 0.5 * correction
 
 
 class Line(gym.Env):

@@ -1,7 +1,5 @@
 """Stable-Baselines3 policies that emit whole chunks, and single-action ones as chunks of one."""
 
-import contextlib
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,12 +8,9 @@ pytest.importorskip("stable_baselines3")
 torch = pytest.importorskip("torch")
 from stable_baselines3 import PPO, SAC  # noqa: E402
 from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
-from stable_baselines3.common.env_util import make_vec_env  # noqa: E402
 from stable_baselines3.common.monitor import Monitor  # noqa: E402
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv  # noqa: E402
 
 import safe_wrappers as sw  # noqa: E402
-from safe_wrappers.info import KEYS  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:a command was held back:UserWarning")
 LIMIT = 8.0
@@ -80,18 +75,6 @@ def test_a_policy_of_whole_chunks_learns_and_predicts(name):
     assert env.step(action)[4]["handover/latency"] in (-1, 0, 1, 2)
     episodes = [i["episode"] for i in infos.seen if "episode" in i]
     assert {e["l"] for e in episodes} == {13}, "50 control steps are 13 chunks of 4"
-
-
-@pytest.mark.parametrize("kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.slow)])
-def test_in_both_vector_modes_infos_come_whole(kind):
-    torch.set_num_threads(1)
-    with contextlib.closing(make_vec_env(chunked, 2, vec_env_cls=kind, seed=0)) as envs:
-        infos = Infos()
-        model = PPO("MlpPolicy", envs, seed=0, n_steps=32, batch_size=32, n_epochs=1)
-        model.learn(64, callback=infos)
-    keys = {frozenset(k for k in i if k.startswith("handover/")) for i in infos.seen}
-    assert keys == {frozenset(name for name in KEYS if name.startswith("handover/"))}
-    assert max(i["handover/peak_jerk"] for i in infos.seen) <= LIMIT
 
 
 def test_a_single_action_policy_as_chunks_of_one():

@@ -2,17 +2,15 @@
 
 import functools
 
-import goal_line
 import numpy as np
 import pytest
 import torch
-from goal_line import BonusLine, filtered, penalised
+from goal_line import filtered, penalised
 from line_world import HOLD, WALL, cost
 from scipy import stats
 from stable_baselines3 import SAC, HerReplayBuffer
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
 
@@ -128,16 +126,6 @@ def test_without_a_changed_step_it_is_sb3s_buffer_bit_for_bit(mode, n_envs):
         np.testing.assert_array_equal(mine, other)
 
 
-def test_the_penalty_is_all_that_sb3s_buffer_lacks():
-    ours = draw(learn("adaption_penalty").replay_buffer, 500)
-    theirs = draw(learn("adaption_penalty", buffer=HerReplayBuffer).replay_buffer, 500)
-    for name in sorted(vars(ours).keys() - {"reward"}):
-        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
-    np.testing.assert_array_equal(ours.reward[:100], theirs.reward[:100])
-    np.testing.assert_allclose(ours.reward[100:], (theirs.reward - ours.charged)[100:], atol=1e-4)
-    assert ours.refused[100:].any()
-
-
 def test_both_draws_uniformly_from_all_transitions():
     buffer = learn("both").replay_buffer
     whole = sum(len(slots) for _, slots in episodes(buffer))
@@ -147,13 +135,6 @@ def test_both_draws_uniformly_from_all_transitions():
     _, counts = np.unique(np.stack([drawn.number, drawn.refused]), axis=1, return_counts=True)
     assert len(counts) == whole + twice
     assert stats.chisquare(counts).pvalue > 1e-3
-
-
-def test_a_full_buffer_forgets_whole_episodes():
-    drawn = draw(learn("both", n_envs=1, buffer_size=40).replay_buffer, 400)
-    np.testing.assert_allclose(drawn.reward, -np.abs(drawn.x_after - drawn.goal) - drawn.charged, atol=1e-4)
-    assert len(np.unique(drawn.number)) <= 40
-    assert drawn.refused.any() and not drawn.refused.all()
 
 
 @all_modes
@@ -177,116 +158,9 @@ def test_saved_loaded_and_gone_on_with(mode, tmp_path):
     assert np.isin(last, drawn.number).all()
 
 
-@all_modes
-def test_what_is_drawn_is_normalised_after_the_penalty(mode):
-    model = learn(mode, normalize=True)
-    envs = model.get_vec_normalize_env()
-    raw = draw(model.replay_buffer, 200)
-    np.random.seed(1)
-    drawn = model.replay_buffer.sample(200, env=envs)
-    scale = np.sqrt(envs.ret_rms.var + envs.epsilon)
-    np.testing.assert_allclose(drawn.rewards.ravel(), np.clip(raw.reward / scale, -10, 10), rtol=1e-4)
-    rms = envs.obs_rms["desired_goal"]
-    centred = np.clip((raw.goal - rms.mean) / np.sqrt(rms.var + envs.epsilon), -10, 10)
-    np.testing.assert_allclose(drawn.observations["desired_goal"].ravel(), centred, rtol=1e-4, atol=1e-5)
-
-
-@all_modes
-def test_a_reward_that_needs_the_infos_gets_those_of_its_step(mode):
-    make = functools.partial(ENVS[mode], task=BonusLine)
-    drawn = draw(learn(mode, make, copy_info_dict=True).replay_buffer, 300)
-    expected = 100.0 * drawn.steps_after - np.abs(drawn.x_after - drawn.goal) - drawn.charged
-    np.testing.assert_allclose(drawn.reward, expected, atol=2e-4)
-
-
-def test_compute_reward_is_the_tasks_through_all_wrappers_and_processes():
-    for vec_env in (DummyVecEnv, functools.partial(SubprocVecEnv, start_method="fork")):
-        envs = vec_env([penalised] * 2)
-        achieved, goals = np.array([[0.0], [0.25], [-1.0]]), np.array([[1.0], [0.0], [-1.0]])
-        (rewards,) = envs.env_method("compute_reward", achieved, goals, [{}] * 3, indices=[0])
-        np.testing.assert_array_equal(rewards, [-1.0, -0.25, 0.0])
-        envs.close()
-
-
-def test_it_works_with_envs_in_other_processes():
-    fork = functools.partial(SubprocVecEnv, start_method="fork")
-    there, here = learn("both", vec_env=fork), learn("both")
-    np.testing.assert_array_equal(there.replay_buffer.penalties, here.replay_buffer.penalties)
-    there.env.close()
-
-
 # One step, by hand ---------------------------------------------------------------------------------------------
-
-
-class Pays:
-    """Stands for the vectorised env: HER asks it for nothing but rewards."""
-
-    def env_method(self, name, achieved, goals, infos, indices):
-        assert (name, indices, len(infos)) == ("compute_reward", [0], len(goals))
-        return [goal_line.GoalLine.compute_reward(None, achieved, goals, infos)]
-
-
-def by_hand(mode):
-    space = goal_line.GoalLine()
-    return ExecutedActionHerReplayBuffer(
-        8, space.observation_space, space.action_space, env=Pays(), device="cpu", mode=mode
-    )
 
 
 def info(proposed, executed, **more):
     wrote = {keys.PROPOSED_ACTION: [proposed], keys.EXECUTED_ACTION: [executed]}
     return wrote | {keys.CBF_INTERVENED: proposed != executed} | more
-
-
-def add(buffer, action, reward, done, wrote):
-    seen = {
-        "observation": np.zeros((1, 3)),
-        "achieved_goal": np.full((1, 1), 2.0),
-        "desired_goal": np.zeros((1, 1)),
-    }
-    buffer.add(seen, seen, np.array([[action]], np.float32), np.array([reward]), np.array([done]), [wrote])
-
-
-@pytest.mark.parametrize("mode", ["both", "adaption_penalty"])
-def test_an_action_that_is_not_finite_is_neither_stored_nor_charged(mode):
-    buffer = by_hand(mode)
-    charged = {keys.ADAPTION_PENALTY: 7.0, keys.ADAPTION_TASK_REWARD: -2.0}
-    add(buffer, np.nan, -9.0, True, info(0.5, 0.0, **charged))
-    drawn = draw(buffer, 50)
-    np.testing.assert_allclose(drawn.action, -0.2, atol=1e-6)  # 0 of [-2, 3]
-    np.testing.assert_allclose(drawn.reward[:10], -2.0)
-    np.testing.assert_allclose(drawn.reward[10:], 0.0)  # the new goal is where it was
-
-
-@pytest.mark.parametrize(
-    ("mode", "wrote", "message"),
-    [
-        ("adaption_penalty", {}, "mode 'adaption_penalty' stores a penalised transition; wrap the env in"),
-        ("safe_action", {keys.ADAPTION_PENALTY: 0.0}, "has an AdaptionPenalty"),
-    ],
-)
-def test_infos_that_do_not_fit_are_refused(mode, wrote, message):
-    with pytest.raises(sw.SafeWrappersError, match=message):
-        add(by_hand(mode), 0.2, 0.0, True, info(1.0, 1.0, **wrote))
-
-
-def test_no_whole_episode_is_sb3s_error_and_an_unknown_mode_ours():
-    buffer = by_hand("both")
-    add(
-        buffer,
-        0.2,
-        0.0,
-        False,
-        info(1.0, 1.0, **{keys.ADAPTION_PENALTY: 0.0, keys.ADAPTION_TASK_REWARD: 0.0}),
-    )
-    with pytest.raises(RuntimeError, match="learning_starts"):
-        buffer.sample(4)
-    buffer.truncate_last_trajectory()
-    assert draw(buffer, 4).reward.shape == (4,)
-    buffer.env = None
-    with pytest.raises(sw.SafeWrappersError, match=r"call set_env\(vec_env\)"):
-        buffer.sample(4)
-    with pytest.raises(
-        sw.SafeWrappersError, match="or 'adaption_penalty', got 'naive'; the naive learner uses"
-    ):
-        by_hand("naive")

@@ -11,11 +11,11 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from line_world import HOLD, WALL, cost, filtered, penalised
 from scipy import stats
-from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -135,18 +135,6 @@ def test_sac_stores_what_the_mode_says(mode, n_envs):
 
 
 @both_modes
-@pytest.mark.parametrize("algorithm", [TD3, DDPG])
-def test_so_do_td3_and_ddpg(mode, algorithm):
-    check(*learn(mode, algorithm=algorithm, steps=100), mode)
-
-
-@both_modes
-def test_infos_arrive_whole_from_other_processes(mode):
-    fork = functools.partial(SubprocVecEnv, start_method="fork")
-    check(*learn(mode, n_envs=2, steps=100, vec_env=fork), mode)
-
-
-@both_modes
 def test_batches_are_drawn_uniformly_from_all_transitions(mode):
     model, record = learn(mode, n_envs=2, steps=120)
     # Two steps along the wall can be the same transition.
@@ -184,13 +172,6 @@ def test_an_inactive_filter_changes_nothing_of_the_learning():
         assert torch.equal(mine, other)
     n = len(record.steps)
     np.testing.assert_array_equal(ours.replay_buffer.actions[:n], theirs.replay_buffer.actions[:n])
-
-
-def test_both_with_an_inactive_filter_stores_every_step_once():
-    model, record = learn("both", make=functools.partial(penalised, wall=100.0), steps=80)
-    n = len(record.steps)
-    assert not model.replay_buffer.changed.any()
-    np.testing.assert_array_equal(model.replay_buffer.rewards[:n], record["paid"].astype(np.float32))
 
 
 @both_modes
@@ -274,14 +255,6 @@ def test_what_is_stored_is_raw_and_what_is_drawn_is_normalised(mode):
     np.testing.assert_array_equal(drawn.actions, raw.actions)
 
 
-def test_memory_saving_works_with_the_safe_action():
-    settings = {"mode": "safe_action", "handle_timeout_termination": False}
-    model, record = learn("safe_action", steps=100, optimize_memory_usage=True, replay_buffer_kwargs=settings)
-    given = record["given"].astype(np.float32)[..., None]
-    np.testing.assert_allclose(model.replay_buffer.actions[:100], model.policy.scale_action(given), atol=1e-6)
-    assert rows(model.replay_buffer.sample(50)).shape == (50, 7)
-
-
 # One step, by hand ---------------------------------------------------------------------------------------------
 
 SPACE = Box(np.array([-2.0, 0.0], np.float32), np.array([3.0, 10.0], np.float32))
@@ -346,26 +319,6 @@ def test_what_an_escape_executed_is_stored_in_place_of_the_policys_action():
     np.testing.assert_allclose(buffer.actions[:, 0], executed, atol=1e-6)
 
 
-def test_an_executed_action_that_is_not_finite_is_refused():
-    with pytest.raises(sw.SafeWrappersError, match="executed action is not finite"):
-        add(buffer(), [[0.0, 0.0]], [1.0], [info([0.5, 5.0], [np.nan, 5.0])])
-
-
-@pytest.mark.parametrize(
-    ("mode", "wrote", "message"),
-    [
-        ("safe_action", {}, r"no info\['executed_action'\].*needs a CBFActionFilter"),
-        ("both", info([0.5, 5.0], [0.5, 5.0]), r"no info\['adaption/penalty'\].*AdaptionPenalty\(env"),
-        ("safe_action", info([0.5, 5.0], [0.5, 5.0], 0.0), "has an AdaptionPenalty.*use mode 'both'"),
-        ("safe_action", info([0.4, 5.0], [0.4, 5.0]), "take that wrapper away"),
-        ("safe_action", info([0.5], [0.5]), r"has shape \(1,\), the action space \(2,\)"),
-    ],
-)
-def test_infos_that_do_not_fit_are_refused(mode, wrote, message):
-    with pytest.raises(sw.SafeWrappersError, match=message):
-        add(buffer(mode), [[0.0, 0.0]], [1.0], [wrote])
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -380,24 +333,3 @@ def test_what_it_refuses(arguments, message):
     given = {"observation_space": Box(-1, 1, (1,)), "action_space": SPACE, **arguments}
     with pytest.raises(sw.SafeWrappersError, match=message):
         ExecutedActionReplayBuffer(8, **given)
-
-
-def test_the_dict_buffer_wants_dict_observations():
-    with pytest.raises(sw.SafeWrappersError, match="ExecutedActionReplayBuffer for all others"):
-        ExecutedActionDictReplayBuffer(8, Box(-1, 1, (1,)), SPACE)
-
-
-def test_an_env_without_a_filter_and_a_rescaled_one_are_refused_at_the_first_step():
-    with pytest.raises(sw.SafeWrappersError, match="without a filter use SB3's own ReplayBuffer"):
-        learn("safe_action", make=line_world.Line, steps=2)
-
-    def rescaled():
-        return gym.wrappers.RescaleAction(filtered(), np.float32(-10.0), np.float32(10.0))
-
-    with pytest.raises(sw.SafeWrappersError, match="SB3 scales actions to"):
-        learn("safe_action", make=rescaled, steps=20)
-
-
-def test_n_steps_is_ignored_with_a_warning_as_the_docstring_says():
-    with pytest.warns(UserWarning, match="`n_steps=3` is ignored"):
-        learn("safe_action", steps=2, n_steps=3)

@@ -130,25 +130,6 @@ def test_the_multiplier_goes_on_from_a_saved_model(tmp_path):
     )
 
 
-def test_episodes_of_several_envs_are_counted_apart():
-    tasks = [Toll(), Toll()]
-    model = ppo(DummyVecEnv([lambda task=task: task for task in tasks]))
-    model.learn(40, callback=LagrangianMultiplier(cost_limit=1.0, rate=0.01, initial=1.0))
-    multiplier = 1.0
-    for end in range(LENGTH, 21, LENGTH):
-        for task in tasks:
-            multiplier += 0.01 * (sum(cost for _, cost in task.made[end - LENGTH : end]) - 1.0)
-    assert model.lagrangian_multiplier == pytest.approx(multiplier)
-
-
-def test_a_learner_with_a_price_on_cost_stops_paying_it():
-    free, priced = ppo(Toll(), learning_rate=0.01), ppo(Toll(), learning_rate=0.01)
-    free.learn(2_000)
-    priced.learn(2_000, callback=LagrangianMultiplier(cost_limit=0.0, rate=0.05))
-    at = np.zeros(1, np.float32)
-    assert free.predict(at, deterministic=True)[0] > 0.0 > priced.predict(at, deterministic=True)[0]
-
-
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 import safe_wrappers as sw
 
 pytest.importorskip("stable_baselines3")
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.sb3 import GymnasiumVecEnv, MarginCurriculum
@@ -72,27 +71,6 @@ def test_a_training_that_goes_on_has_the_margin_of_where_it_stands(tmp_path):
         96, callback=[MarginCurriculum(1.0, 0.0), rest], reset_num_timesteps=False
     )
     assert margins.seen[32:] == rest.seen == [0.75] * 32 + [0.5] * 32 + [0.25] * 32
-
-
-def test_an_off_policy_training_too():
-    margins = Margins()
-    SAC("MlpPolicy", reacher(), learning_starts=1000, buffer_size=100, device="cpu").learn(
-        100, callback=[MarginCurriculum(1.0, 0.0), margins]
-    )
-    assert margins.seen[0] == 1.0 and margins.seen[50] == pytest.approx(0.5) and margins.seen[-1] < 0.02
-
-
-def test_envs_in_other_processes_have_it_too():
-    envs = SubprocVecEnv([reacher] * 2, start_method="forkserver")
-    margins = Margins()
-    learner(envs).learn(128, callback=[MarginCurriculum(0.5, 0.5), margins])
-    assert margins.seen == [0.5] * 64
-    envs.close()
-
-
-def test_an_env_without_a_filter_is_refused():
-    with pytest.raises(ConfigurationError, match="CBFActionFilter"):
-        learner(gym.make("Reacher-v5")).learn(32, callback=MarginCurriculum(0.1))
 
 
 def test_a_filter_of_many_envs_is_refused():
@@ -166,13 +144,6 @@ def test_what_constraints_remember_of_the_episode_stays():
     assert env.filter.memories == memory and np.array_equal(env.filter.last, last)
 
 
-def test_the_same_margin_again_changes_nothing_in_an_episode():
-    # Detours, declarations and estimates go on, bit for bit.
-    for name in ("SafePointGoal1-v0", "SafeCarGoal1-v0", "SafeRover-v0"):
-        env = sw.protect(gym.make(name), margin=0.01)
-        assert np.array_equal(trace(env, 120), trace(env, 120, change=0.01, at=60))
-
-
 def test_a_margin_that_leaves_nothing_is_refused_and_the_old_one_stays():
     env = reacher(0.25)
     before = env.filter
@@ -181,9 +152,3 @@ def test_a_margin_that_leaves_nothing_is_refused_and_the_old_one_stays():
             env.set_margin(wrong)
     assert env.added_margin == 0.25 and env.filter is before
     assert env.constraints[0].margin == pytest.approx(0.26)
-
-
-def test_vector_envs_of_single_filters_are_changed_one_by_one():
-    envs = DummyVecEnv([reacher] * 2)
-    envs.env_method("set_margin", 0.5)
-    assert envs.get_attr("added_margin") == [0.5, 0.5]

@@ -15,7 +15,7 @@ from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.files import read_rows
-from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, resume
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, resume
 from safe_wrappers.train.run.model import check_task
 from safe_wrappers.train.run.stack import make_stack, make_vec_env
 from safe_wrappers.train.run.training import train_run
@@ -30,7 +30,7 @@ LEARNERS = {
     "adaption_penalty": "{kind: adaption_penalty, penalty: 7.0}",
     "safe_action": "safe_action",
     "both": "{kind: both, penalty: 7.0}",
-    "safe_set_map": "{kind: safe_set_map, anchor: closest}",
+    "safe_set_map": "safe_set_map",
 }
 SB3S_BUFFER = ("naive", "safe_set_map")
 
@@ -160,23 +160,3 @@ def test_compute_reward_is_the_tasks_through_the_whole_stack(fake_experiment, na
     here = after["achieved_goal"]
     (paid,) = envs.env_method("compute_reward", here, here, [{}], indices=[0])
     assert paid == {"FetchReach-v4": 0.0, "PointMaze_UMaze-v3": 1.0}[name]
-
-
-@pytest.mark.parametrize("name", PUBLIC)
-def test_sac_with_hindsight_learns_through_protect_on_a_public_task(fake_experiment, name):
-    pytest.importorskip("gymnasium_robotics")
-    env, nu = PUBLIC[name]
-    experiment = one_arm(
-        fake_experiment, "safe_action", f"env={env}", "arms.a.filter=protect", "total_steps=104",
-        "checkpoint_every=1000",
-    )  # fmt: skip
-    (arm,) = experiment.arms
-    check_task(arm, make_stack(arm.env, arm.filter, arm.learner))
-    folder = experiment.run_folder(arm, 0)
-    train_run(arm, 0, folder, Reports().progress)
-    rows = read_rows(folder / "episodes.csv")
-    assert [row["length"] for row in rows] == [25.0] * 4
-    model = load_model(latest_checkpoint(folder / "checkpoints").folder, "SAC", "cpu")
-    assert model._n_updates > 5 and model.action_space.shape == (nu,)
-    evaluate_run(arm, 0, folder, EvaluationConfig(1, 7), FilterConfig(), Reports().progress)
-    assert len(read_rows(evaluation_folder(folder) / "filter_on.csv")) == 1

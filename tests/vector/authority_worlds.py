@@ -30,7 +30,6 @@ def cart(index=0, chunked=True):
         fallback="hold",
         max_lease_s=0.3,
         min_lease_s=0.1,
-        brake_blend_time=0.1,
     )
     env = sw.RecordInterventions(env)
     if chunked:

@@ -3,19 +3,13 @@
 import contextlib
 import functools
 
-import numpy as np
 import pytest
 from authority_worlds import TASKS, CarriedOn
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from random_episodes import lengths
 from single_loops import assert_same_episodes, by_hand, script, unroll
 from vector_worlds import KINDS, WAYS, sub_envs
 
 SEED, STEPS = 5, 30
 ENDS = {"ends": [[7, -9, 5], [-6, 8, 8], [9, 4, -7]]}
-every_mode = pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 pytestmark = [
     pytest.mark.filterwarnings("ignore:the policy's action is not finite:UserWarning"),
     pytest.mark.filterwarnings("ignore:a command was held back:UserWarning"),
@@ -65,27 +59,3 @@ def test_a_vector_env_is_its_single_envs(task, kind, mode):
         episodes = unroll(envs, actions_for(task), seed=SEED, steps=STEPS, options=options_for(task))
     for i, (got, wanted) in enumerate(zip(episodes, single(task), strict=True)):
         assert assert_same_episodes(got, wanted, f"sub-env {i}, ") >= 2
-
-
-@every_mode
-def test_any_ends_and_any_actions(mode):
-    envs = SyncVectorEnv(sub_envs(TASKS["cart"]), autoreset_mode=mode)
-    shape = envs.single_action_space.shape
-
-    @settings(max_examples=10)
-    @given(
-        seed=st.integers(0, 2**20),
-        ends=st.lists(lengths, min_size=3, max_size=3),
-        said=st.lists(st.sampled_from([0.0, 1.0, -1.0, 0.3, -np.inf, np.nan]), min_size=1, max_size=9),
-    )
-    def check(seed, ends, said):
-        def actions(i, k, t):
-            return np.full(shape, said[(3 * k + t + i) % len(said)], np.float32)
-
-        episodes = unroll(envs, actions, seed=seed, steps=12, options={"ends": ends})
-        make = CarriedOn(TASKS["cart"])
-        for i, got in enumerate(episodes):
-            wanted = by_hand(make, actions, i, seed=seed + i, steps=12, options={"ends": ends})
-            assert_same_episodes(got, wanted, f"sub-env {i}, ")
-
-    check()

@@ -3,20 +3,16 @@
 import contextlib
 import functools
 
-import gymnasium as gym
 import pytest
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from single_loops import assert_same_episodes, by_hand, script, unroll
 from vector_worlds import KINDS, TASKS, WAYS, sub_envs
-
-import safe_wrappers as sw
 
 PIPES = {"async, pipes": functools.partial(AsyncVectorEnv, shared_memory=False)}
 PLAYED = [(task, *way) for task in TASKS for way in WAYS]
 PLAYED += [("cart", kind, mode) for kind in ("async", *PIPES) for mode in AutoresetMode]
 SEED, STEPS = 5, 30
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action is not finite:UserWarning")
-every_mode = pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 
 
 def actions_for(task):
@@ -64,26 +60,3 @@ def test_a_vector_env_is_its_single_envs(task, kind, mode):
         assert calls[i] == sum(len(episode.steps) for episode in got)
     firsts = {episodes[i][0].observation.tobytes() for i in range(3)}
     assert len(firsts) == 3, "every sub-env has a seed of its own"
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings(
-    "ignore::safe_wrappers.UnsafeStateWarning"
-)  # a delay that is declared, but not there
-@every_mode
-@pytest.mark.parametrize("level", [1, 2])
-def test_long_episodes_beside_vases_are_single_ones_too(level, mode):
-    # On level 2 vases sleep and wake, in the env and in the plant that predicts over the delay.
-    make = functools.partial(long_goal, level)
-    envs = SyncVectorEnv(sub_envs(make, 2), autoreset_mode=mode)
-    actions = script(envs.single_action_space, drive=0.95)
-    episodes = unroll(envs, actions, seed=3, steps=700)
-    for i, got in enumerate(episodes):
-        wanted = by_hand(make, actions, i, seed=3 + i, steps=700)
-        assert assert_same_episodes(got, wanted, f"sub-env {i}, ") >= 4
-        assert any(s.info["cbf/correction"] > 0.0 for e in got for s in e.steps)
-
-
-def long_goal(level, index):
-    env = gym.make(f"SafePointGoal{level}-v0", max_episode_steps=150 + index)
-    return sw.RecordInterventions(sw.protect(env, plant=sw.MujocoPlant(delay_s=0.05)))

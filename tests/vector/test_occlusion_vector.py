@@ -77,22 +77,3 @@ def test_later_episodes_go_on_with_the_noise_and_not_with_the_estimates():
         if over:
             assert infos["interventions"]["seen"][0] == info["interventions"]["seen"]
     assert resets >= 2
-
-
-def test_sb3_sees_the_same():
-    vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
-    envs = vec_env.DummyVecEnv([partial(make, i) for i in range(2)])
-    envs.seed(SEED)
-    first = envs.reset()
-    wanted = [episode(SEED + i) for i in range(2)]
-    for i in range(2):
-        np.testing.assert_allclose(first[i], wanted[i][0][0])
-    for t in range(1, LENGTH + 1):
-        observations, rewards, dones, infos = envs.step(np.ones((2, 3), np.float32))
-        for i in range(2):
-            observation, reward, _, over, info = wanted[i][t]
-            assert rewards[i] == np.float32(reward) and dones[i] == over
-            told = infos[i]["terminal_observation"] if over else observations[i]
-            np.testing.assert_array_equal(told, observation)
-            for key in ("occlusion/visible", "occlusion/sigma", "occlusion/expired", "occlusion/penalty"):
-                np.testing.assert_array_equal(infos[i][key], info[key])

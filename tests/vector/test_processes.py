@@ -2,25 +2,19 @@
 
 import contextlib
 import functools
-import multiprocessing
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.vector import AsyncVectorEnv
 from single_loops import assert_same_episodes, by_hand, script, unroll
-from vector_worlds import DT, TASKS, ScheduledCart, cart, cart_filter, drift, push, read, sub_envs
+from vector_worlds import DT, TASKS, ScheduledCart, cart_filter, drift, push, read, sub_envs
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError
-from safe_wrappers.wrappers.record_interventions import read_episodes
 
 # Gymnasium logs a process's error as a warning before it raises it.
 pytestmark = pytest.mark.filterwarnings("ignore:.*ERROR:UserWarning")
-
-
-def recorded(folder, index):
-    return sw.RecordInterventions(cart_filter(index), folder / f"{index}.csv")
 
 
 def wrong_fallback(plant):
@@ -50,19 +44,6 @@ def test_the_same_in_a_process_that_starts_from_nothing(context):
     assert assert_same_episodes(episodes[0], wanted) == 1
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
-@pytest.mark.parametrize("shared_memory", [True, False])
-def test_closing_leaves_no_process(mode, shared_memory):
-    before = set(multiprocessing.active_children())
-    envs = AsyncVectorEnv(sub_envs(cart), shared_memory=shared_memory, autoreset_mode=mode)
-    envs.reset(seed=0)
-    envs.step(envs.action_space.sample())
-    assert len(set(multiprocessing.active_children()) - before) == 3
-    envs.close()
-    assert [process.exitcode for process in envs.processes] == [0, 0, 0]
-    assert set(multiprocessing.active_children()) == before
-
-
 def test_the_filters_attributes_are_read_across_processes():
     with contextlib.closing(AsyncVectorEnv(sub_envs(TASKS["point_goal"], 2))) as envs:
         envs.reset(seed=0)
@@ -79,19 +60,6 @@ def test_the_filters_attributes_are_read_across_processes():
         envs.set_attr("filter_calls", [10, 20])
         envs.step(envs.action_space.sample())
         assert envs.get_attr("filter_calls") == (11, 21)
-
-
-def test_every_sub_env_writes_its_own_file(tmp_path):
-    envs = AsyncVectorEnv([functools.partial(recorded, tmp_path, i) for i in range(2)])
-    lengths = [[3, -1, 2], [-5, 4]]
-    with contextlib.closing(envs):
-        envs.reset(seed=0, options={"ends": lengths})
-        for _ in range(9):
-            envs.step(np.zeros((2, 1), np.float32))
-    assert [[row["length"] for row in read_episodes(tmp_path / f"{i}.csv")] for i in range(2)] == [
-        [3, 1, 2],
-        [5],
-    ]
 
 
 def test_a_refusal_in_a_process_arrives_as_ours_with_its_words():

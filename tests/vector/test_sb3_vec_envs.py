@@ -2,19 +2,15 @@
 
 import contextlib
 import functools
-import multiprocessing
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from random_episodes import STEPS, plays, spoken
 from sb3_loops import assert_same, unroll
 from single_loops import by_hand, script
-from vector_worlds import AtHazard, cart, cart_filter
+from vector_worlds import AtHazard, cart
 
 import safe_wrappers as sw
-from safe_wrappers import info as keys
 
 pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.monitor import Monitor
@@ -29,7 +25,7 @@ every_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 def monitored_cart(index):
-    return Monitor(cart(index), info_keywords=keys.RUNNING)
+    return Monitor(cart(index))
 
 
 def stack(env_id, name, steps, index):
@@ -70,24 +66,6 @@ def test_a_vec_env_is_its_single_envs(task, kind):
             info = episode.steps[-1].info
             assert info["episode"]["l"] == info["interventions"]["length"] == len(episode.steps)
             assert info["episode"]["r"] == round(info["interventions"]["return"], 6)
-            assert {key: info["episode"][key] for key in keys.RUNNING} == {k: info[k] for k in keys.RUNNING}
-
-
-@pytest.mark.parametrize(("kind", "examples"), [("dummy", 12), ("subproc", 8)])
-def test_any_actions_and_any_ends(kind, examples):
-    envs = KINDS[kind]([functools.partial(monitored_cart, i) for i in range(3)])
-
-    @settings(max_examples=examples)
-    @given(play=plays)
-    def check(play):
-        actions, options = spoken(play["said"]), {"ends": play["ends"]}
-        episodes = unroll(envs, actions, seed=play["seed"], steps=STEPS, options=options)
-        for i, got in enumerate(episodes):
-            wanted = by_hand(monitored_cart, actions, i, seed=play["seed"] + i, steps=STEPS, options=options)
-            assert_same(got, wanted, kind, f"sub-env {i}, ")
-
-    with contextlib.closing(envs):
-        check()
 
 
 @every_kind
@@ -110,15 +88,6 @@ def test_methods_and_attributes_by_sub_env(kind):
         assert envs.env_is_wrapped(Monitor) == [True, True]
 
 
-def test_closing_leaves_no_process():
-    before = set(multiprocessing.active_children())
-    envs = KINDS["subproc"]([functools.partial(monitored_cart, i) for i in range(2)])
-    envs.reset()
-    assert len(set(multiprocessing.active_children()) - before) == 2
-    envs.close()
-    assert set(multiprocessing.active_children()) == before
-
-
 SHARED = [
     sw.constraints.HeadingDriveClearance(
         [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004, detour=True
@@ -129,7 +98,7 @@ SHARED = [
 
 def sharing(index):
     env = sw.CBFActionFilter(AtHazard(gym.make("SafePointGoal1-v0", max_episode_steps=8 + index)), SHARED)
-    return Monitor(sw.RecordInterventions(env), info_keywords=keys.RUNNING)
+    return Monitor(sw.RecordInterventions(env))
 
 
 def test_two_envs_in_one_process_share_nothing_but_what_they_were_given():
@@ -146,45 +115,3 @@ def test_two_envs_in_one_process_share_nothing_but_what_they_were_given():
         assert assert_same(got, alone, "dummy", f"sub-env {i}, ") >= 2
         assert any(s.info["cbf/intervened"] for e in got for s in e.steps)
     assert (repr(SHARED), set(vars(SHARED[0]))) == before
-
-
-def test_not_a_number_in_one_sub_env_is_its_own_affair():
-    envs, healthy = (DummyVecEnv([functools.partial(monitored_cart, i) for i in range(3)]) for _ in range(2))
-    actions = script(envs.action_space)
-
-    def sick(i, k, t):
-        return np.array([np.nan], np.float32) if i == 1 and t == 1 else actions(i, k, t)
-
-    ill, well = (unroll(e, a, seed=2, steps=10) for e, a in ((envs, sick), (healthy, actions)))
-    for i in (0, 2):
-        assert_same(ill[i], well[i], kind="dummy")
-    assert ill[1][0].steps[1].info["cbf/nonfinite"] and not well[1][0].steps[1].info["cbf/nonfinite"]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_infos_are_the_readers_own(kind):
-    # What a callback does to an info reaches neither the filter nor the next step's info.
-    with contextlib.closing(KINDS[kind]([functools.partial(cart_filter, i) for i in range(2)])) as envs:
-        envs.set_options({"start": [-1.0, 0.0]})
-        envs.reset()
-        infos = envs.step(np.full((2, 1), 0.5, np.float32))[3]
-        kept = [dict(info) for info in infos]
-        for info in infos:
-            info["executed_action"][:] = 9.0
-            info["cbf/margin"] = -1.0
-        infos = envs.step(np.full((2, 1), np.nan, np.float32))[3]
-    for info, before in zip(infos, kept, strict=True):
-        assert info["executed_action"] == 0.5  # held
-        assert info["cbf/margin"] > 0.0 and before["cbf/margin"] > 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("start_method", ["spawn", "forkserver"])
-def test_the_same_in_a_process_that_starts_from_nothing(start_method):
-    make = TASKS["point_goal"]
-    envs = SubprocVecEnv([functools.partial(make, i) for i in range(2)], start_method=start_method)
-    with contextlib.closing(envs):
-        actions = script(envs.action_space, drive=0.9)
-        episodes = unroll(envs, actions, seed=1, steps=20)
-    for i, got in enumerate(episodes):
-        assert assert_same(got, by_hand(make, actions, i, seed=1 + i, steps=20), "subproc") >= 2

@@ -179,10 +179,9 @@ def smooth(s):
 class Book:
     """What must be sent, step by step: tell it what comes and what is seen."""
 
-    def __init__(self, hold, leases, *, longest, blend, brake_blend, clock_error):
+    def __init__(self, hold, leases, *, longest, blend):
         self.hold, self.leases, self.longest = hold, leases, longest
-        self.blend, self.brake_blend = (math.ceil(x / hold - 1e-6) for x in (blend, brake_blend))
-        self.clock_error = clock_error
+        self.blend = math.ceil(blend / hold - 1e-6)
         self.k, self.end, self.newest = 0, None, -math.inf
         self.command = self.last = None
         self.acting = True  # does the policy act? with nothing executed before there is nothing to blend
@@ -194,15 +193,14 @@ class Book:
         comes, refused, fresh = stamp is not None, False, False
         if comes:
             usable = np.isfinite(action).all()
-            usable &= self.newest - same <= stamp <= now + self.clock_error + same
+            usable &= self.newest - same <= stamp <= now + same
             comes, refused = bool(usable), not usable
             fresh = comes and stamp > self.newest + same
         had_lease = self.end is not None
         if fresh:
             self.newest = stamp
             old = max(now - stamp, 0.0)
-            budget = old + self.brake_blend * self.hold + self.clock_error
-            lease = min(self.leases(*see(), budget), self.longest)
+            lease = min(self.leases(*see(), old), self.longest)
             self.granted = lease + same >= self.hold
             if self.granted:
                 self.end = now + lease
@@ -218,7 +216,7 @@ class Book:
         else:
             self.end = None
             if self.acting:
-                self._switch(False, self.brake_blend)
+                self._switch(False, 0)
             target = np.array([0.0, 1.0])
         if self.fade is not None:
             latched, n, i = self.fade

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.interpolate import BPoly
 
-BLENDS = ("smoothstep", "quintic", "hermite")
+BLENDS = ("smoothstep", "quintic")
 
 
 def smooth(s):
@@ -28,7 +28,7 @@ class Tick:
     refused: bool = False
     latency: int = -1
     entry: int = -1
-    """Which entry of which chunk it is made from, where no ensemble and no fallback made it."""
+    """Which entry of which chunk it is made from, where no fallback made it."""
     observed: int = -1
 
 
@@ -40,12 +40,10 @@ class Slow:
     limit: float = math.inf
     low: float = -math.inf
     high: float = math.inf
-    decay: float = 0.01
     dtype: type = np.float32
     close_calls: int = 0
     """Decisions that rounding might turn: the comparison ends there."""
     coming: list = field(default_factory=list)
-    at_hand: list = field(default_factory=list)
     sent: list = field(default_factory=list)
     plan: list = field(default_factory=list)
     now: int = 0
@@ -132,7 +130,7 @@ class Slow:
         self.coming = [c for c in self.coming if c["due"] > self.now]
         alive = [c for c in there if self.now - c["observed"] < len(c["rows"])]
         best = max([c["observed"] for c in alive], default=-1)
-        tick.refused = any(c["observed"] > best or self.blend == "ensemble" for c in there if c not in alive)
+        tick.refused = any(c["observed"] > best for c in there if c not in alive)
         if not alive:
             return
         newest = max(alive, key=lambda c: c["observed"])
@@ -140,10 +138,6 @@ class Slow:
         age = self.now - newest["observed"]
         tick.latency = age
         self.in_force, self.source_in_force = newest["observed"], newest["source"]
-        if self.blend == "ensemble":
-            self.at_hand += alive
-            tick.seam = bool(self.sent)
-            return
         fresh = newest["rows"][age:]
         if self.blend == "replace":
             self.plan = [(row, True, False) for row in fresh]
@@ -156,21 +150,6 @@ class Slow:
             self.fade = None
 
     def planned(self, tick):
-        if self.blend == "ensemble":
-            voices = []
-            for c in sorted(self.at_hand, key=lambda c: c["observed"]):
-                j = self.now - c["observed"]
-                if j < len(c["rows"]):
-                    voices.append(c["rows"][j])
-            if not voices:
-                return None, False, False
-            weights = [math.exp(-self.decay * i) for i in range(len(voices))]
-            total = sum(weights)
-            mean = [
-                sum(w * v[k] for w, v in zip(weights, voices, strict=True)) / total
-                for k in range(len(voices[0]))
-            ]
-            return mean, len(voices) == 1, False
         if not self.plan:
             return None, False, False
         tick.entry = self.now - self.in_force
@@ -240,8 +219,7 @@ class Slow:
                 slope, bend = (ahead[n + 1] - ahead[n - 1]) / 2, ahead[n + 1] - 2 * ahead[n] + ahead[n - 1]
             else:
                 slope, bend = (ahead[n] - ahead[n - 1] if n else 0.0), 0.0
-            kept = 2 if self.blend == "hermite" else 3
-            ends = [[last[k], rate, second][:kept], [ahead[n], slope, bend][:kept]]
+            ends = [[last[k], rate, second], [ahead[n], slope, bend]]
             bridge = BPoly.from_derivatives([0.0, n + 1.0], ends)
             for i in range(n):
                 plan[i][k] = min(max(float(bridge(i + 1.0)), self.low), self.high)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 
 STEPS = 1500
 
@@ -161,100 +160,4 @@ def alone(hazards, agent=(0.0, 0.0, 0.0), **options):
     return env
 
 
-def closest(env, action, steps):
-    near = math.inf
-    for _ in range(steps):
-        info = env.step(np.asarray(action, np.float32))[4]
-        assert info["cost_substep"] == 0.0
-        gaps = np.linalg.norm(env.unwrapped._path[:, None] - env.unwrapped.hazard_positions, axis=2)
-        near = min(near, gaps.min())
-    return near - 0.2
-
-
-def test_head_on_it_comes_close_and_stops():
-    env = alone([[1.5, 0.0]])
-    near = closest(env, [1.0, 0.0], 500)
-    # The price of stopping straight ahead: the margin, the reserve, and twice the centre of mass's offset.
-    assert 0.002 <= near <= 0.06
-    assert abs(env.unwrapped.data.qvel[0]) < 0.02
-
-
-def test_a_larger_margin_and_state_error_keep_it_farther_away():
-    plain, wide, unsure = (
-        closest(alone([[1.5, 0.0]], **o), [1.0, 0.0], 400)
-        for o in ({}, {"margin": 0.102}, {"state_error": 0.1})
-    )
-    assert wide == pytest.approx(plain + 0.1, abs=0.01)
-    assert unsure == pytest.approx(plain + 0.1, abs=0.01)
-
-
-def test_surrounded_it_stays_inside():
-    ring = [[0.5 * math.cos(a), 0.5 * math.sin(a)] for a in np.linspace(0, math.tau, 8, endpoint=False)]
-    env = alone(ring)
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        closest(env, rng.choice([-1.0, 1.0], 2), 15)
-    assert np.linalg.norm(env.unwrapped.agent_position) < 0.5
-
-
-def test_far_from_everything_the_filter_is_silent():
-    env = alone([[50.0, 0.0]])
-    for _ in range(100):
-        info = env.step(np.array([1.0, 0.3], np.float32))[4]
-        assert not info["cbf/intervened"]
-
-
-def test_without_any_disc_there_is_no_limit():
-    env = alone([])
-    info = env.step(np.array([1.0, 0.3], np.float32))[4]
-    assert not info["cbf/intervened"] and info["cbf/margin"] == 0.0
-
-
 # Refusals -----------------------------------------------------------------------------------------------------
-
-DISCS = [sw.constraints.Discs("hazard_positions", 0.2)]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"obstacles": []}, "obstacles is a list with at least one obstacle"),
-        ({"obstacles": DISCS[0]}, "obstacles is a list with at least one obstacle"),
-        ({"margin": -0.01}, "margin must be a finite number >= 0 in m, got -0.01"),
-        ({"state_error": -0.01}, "state_error must be a finite number >= 0 in m"),
-        ({"uncertainty": -0.1}, "uncertainty must be a finite number >= 0"),
-        ({"uncertainty": 1.0}, r"uncertainty is a fraction in \[0, 1\), got 1.0"),
-        ({"uncertainty": np.nan}, "uncertainty must be a finite number"),
-        ({"body": "agnet"}, "no body 'agnet'; give another by body=; it has: .*agent"),
-    ],
-)
-def test_constructor_refuses_nonsense(arguments, message):
-    with pytest.raises(ConfigurationError, match=message):
-        limit = sw.constraints.HeadingDriveClearance(**{"obstacles": DISCS, **arguments})
-        sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [limit])
-
-
-@pytest.mark.parametrize(
-    "obstacle",
-    [
-        sw.constraints.Plane([1, 0], [-1, 0]),
-        sw.constraints.Box([1, 0], [0.1, 0.1]),
-        sw.constraints.Sphere([1, 0, 0], 0.1),
-    ],
-)
-def test_obstacles_that_are_no_discs_are_refused(obstacle):
-    with pytest.raises(ConfigurationError, match="Disc"):
-        env = sw.CBFActionFilter(
-            gym.make("SafePointGoal1-v0"), [sw.constraints.HeadingDriveClearance([obstacle])]
-        )
-        env.reset(seed=0)
-
-
-def test_an_analytic_plant_is_refused():
-    plant = sw.AnalyticPlant(
-        f=np.zeros_like, g=lambda x: np.eye(2), state=lambda env: env.agent_position, control_dt=0.02
-    )
-    with pytest.raises(UnsupportedEnvError, match="HeadingDriveClearance needs a MujocoPlant"):
-        sw.CBFActionFilter(
-            gym.make("SafePointGoal1-v0"), [sw.constraints.HeadingDriveClearance(DISCS)], plant=plant
-        )

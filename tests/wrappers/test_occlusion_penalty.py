@@ -1,19 +1,18 @@
-"""OcclusionPenalty against sums by hand and statistics: estimates, permissions, penalty, observation, randomness."""
-
-import copy
+"""What is not seen is estimated as declared: tracks, sensors, inertial units, penalties."""
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from occlusion_world import STILL, WALL, Turning, straight
 from oracles import blind_covariance, double_integrator_covariance
+from scipy.spatial.transform import Rotation
 
 import safe_wrappers as sw
 from safe_wrappers.errors import (
     ConfigurationError,
-    SafeWrappersError,
     UnknownNameError,
     UnsupportedEnvError,
 )
@@ -123,23 +122,6 @@ def test_without_the_lever_arm_the_estimate_is_off_by_it(arm):
             np.testing.assert_allclose(env.tracking.mean[0] - truth, wrong, atol=2e-5)
 
 
-def test_with_it_the_mean_error_is_zero_on_a_robot_that_spins():
-    env = sw.OcclusionPenalty(
-        Turning(SPIN),
-        [straight(acceleration_noise=0.5)],
-        sw.occlusion.Sensor(site="eye", velocity_std=0.1),
-        tolerance=1.0,
-    )
-    errors = []
-    for seed in range(25):
-        env.reset(seed=seed)
-        for _ in range(40):
-            env.step(STILL)
-        errors.append(env.tracking.positions[0] - env.unwrapped.data.qpos[1:3])
-        spread = np.sqrt(np.diag(env.tracking.position_covariances[0]))
-    assert (np.abs(np.mean(errors, axis=0)) < 4.0 * spread / 5.0).all()
-
-
 def test_velocities_alone_leave_positions_unresolved_and_it_says_so():
     only = sw.occlusion.Sensor(site="eye", position_std=None, velocity_std=0.1)
     env = sw.OcclusionPenalty(Turning(), [straight("thing*")], only, tolerance=1.0)
@@ -180,40 +162,6 @@ def test_a_wall_hides_and_last_seen_stays():
     assert np.array(visible)[:, 1].all()
 
 
-def test_published_points_are_looked_at_level():
-    world = WALL.replace("0 0.5", "0 0").replace("3 1", "3 0.4")  # lower than the sensor
-    for text, expected in ((WALL, [False, True]), (world, [True, True])):
-        points = sw.occlusion.Track(published="spots", acceleration_noise=0.1)
-        aside = (0, 1, -2, -1, 0), (0, 0, 0, 0, 0)
-        env = sw.OcclusionPenalty(Turning(aside, world=text), [points], EYE, tolerance=1.0)
-        assert env.track_names == ["spots[0]", "spots[1]"]
-        assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == expected
-
-
-def test_points_and_bodies_together_keep_their_order():
-    tracks = [
-        sw.occlusion.Track(published="spots", acceleration_noise=0.1, start_position_std=1e-9),
-        straight("thing2"),
-    ]
-    env = sw.OcclusionPenalty(Turning(), tracks, EYE, tolerance=1.0)
-    env.reset(seed=0)
-    assert env.track_names == ["spots[0]", "spots[1]", "thing2"]
-    np.testing.assert_allclose(env.tracking.positions, [[4, 0], [0, 1], [-1, 0]], atol=0.5)
-
-
-def test_points_that_come_and_go_cannot_be_tracked():
-    class Shrinking(Turning):
-        spots = np.zeros((2, 2))
-
-    env = sw.OcclusionPenalty(
-        Shrinking(), [sw.occlusion.Track(published="spots", acceleration_noise=0.1)], EYE, tolerance=1.0
-    )
-    env.reset(seed=0)
-    env.unwrapped.spots = np.zeros((1, 2))
-    with pytest.raises(ConfigurationError, match=r"had 2 points.*has 1 now"):
-        env.step(STILL)
-
-
 def test_a_truth_that_is_no_number_is_not_seen():
     class Broken(Turning):
         spots = np.array([[1.0, 0.0]])
@@ -225,15 +173,6 @@ def test_a_truth_that_is_no_number_is_not_seen():
     env.unwrapped.spots = np.array([[np.nan, 0.0]])
     observation, _, _, _, info = env.step(STILL)
     assert not info["occlusion/visible"].any() and np.isfinite(observation).all()
-
-
-def test_in_space_the_height_is_estimated_too():
-    env = sw.OcclusionPenalty(Turning(), [straight()], EYE, tolerance=1.0, axes="xyz")
-    env.reset(seed=0)
-    for _ in range(200):
-        observation = env.step(STILL)[0]
-    np.testing.assert_allclose(env.tracking.positions[0], [1.0, 0.0, 0.5], atol=0.05)
-    assert observation.shape == (1 + 9,)
 
 
 # Permissions ------------------------------------------------------------------------------------------------------
@@ -264,24 +203,10 @@ def test_a_permission_expires_before_the_bound_crosses_and_no_more_than_a_step_b
         soon = 0.04 * (k + 1)
         if not expired:
             assert bound(0.04 * k) <= tolerance and bound(soon) <= tolerance * (1 + 1e-12)
-            assert env.permissions()[0] >= 0.04 * (1 - 1e-9)
         else:
             assert bound(soon) > tolerance * (1 - 1e-12)
-            assert env.permissions()[0] <= 0.04 * (1 + 1e-9)
             break
         info = env.step(STILL)[4]
-
-
-def test_permissions_say_for_how_long_they_last():
-    env = crossing(tolerance=1.5, sensor=sw.occlusion.Sensor("eye", range_m=0.01))
-    env.reset(seed=0)
-    foretold = env.permissions()
-    assert np.isfinite(foretold).all() and (foretold > 0.2).all()
-    expired_at = np.full(6, np.nan)
-    for k, (_, _, _, _, info) in enumerate(steps(env, 300)):
-        new = info["occlusion/expired"] & np.isnan(expired_at)
-        expired_at[new] = 0.04 * (k + 1)
-    assert (expired_at <= foretold + 1e-9).all() and (expired_at > foretold - 0.081).all()
 
 
 def test_a_permission_comes_back_when_the_thing_is_seen():
@@ -318,27 +243,8 @@ def test_the_penalty_is_what_it_says_and_is_taken_off():
         expected = 0.3 * share[near].mean() if near.any() else 0.0
         near_none |= not near.all()
         assert info["occlusion/penalty"] == pytest.approx(expected, abs=1e-12)
-        assert info["occlusion/task_reward"] == task
         assert reward == pytest.approx(task - expected, abs=1e-12)
     assert near_none
-
-
-def test_without_a_weight_the_reward_is_the_task_s_own():
-    env, bare = crossing(), gym.make("OccludedCrossing-v0")
-    env.reset(seed=3)
-    bare.reset(seed=3)
-    for with_it, without in zip(steps(env, 30), steps(bare, 30), strict=True):
-        assert with_it[1] == without[1] and type(with_it[1]) is type(without[1])
-        assert with_it[4]["occlusion/penalty"] == 0.0
-
-
-def test_no_track_in_range_costs_nothing():
-    blind = sw.occlusion.Sensor(site="eye", range_m=0.3)
-    env = sw.OcclusionPenalty(
-        Turning(((0, 9, 0, -9, 0), (0,) * 5)), [straight("thing*")], blind, tolerance=0.1, weight=1.0
-    )
-    env.reset(seed=0)
-    assert env.step(STILL)[4]["occlusion/penalty"] == 0.0
 
 
 def there_and_away(env):
@@ -383,27 +289,6 @@ def test_the_observation_gains_the_estimates_relative_to_the_robot(axes):
     np.testing.assert_allclose(table[:, 2], deviations, atol=1e-12)
 
 
-def test_with_observe_off_the_observation_and_its_space_are_the_env_s():
-    env = crossing(observe=False)
-    assert env.observation_space == gym.make("OccludedCrossing-v0").observation_space
-    assert env.reset(seed=0)[0].shape == (17,)
-
-
-def test_a_dict_gains_a_key_and_float32_stays_float32():
-    spaces = {"a": gym.spaces.Box(-1, 1, (2,), np.float32)}
-    env = sw.OcclusionPenalty(
-        Turning(space=gym.spaces.Dict(spaces)), [straight("thing*")], EYE, tolerance=1.0
-    )
-    observation = env.reset(seed=0)[0]
-    assert set(observation) == {"a", "tracks"} and observation["tracks"].shape == (12,)
-    assert env.observation_space.contains(observation)
-    env = sw.OcclusionPenalty(
-        Turning(space=gym.spaces.Box(-1, 1, (3,), np.float32)), [straight()], EYE, tolerance=1.0
-    )
-    assert env.observation_space.contains(env.reset(seed=0)[0])
-    assert env.observation_space.dtype == np.float32
-
-
 # Randomness and episodes ------------------------------------------------------------------------------------------
 
 
@@ -436,136 +321,7 @@ def test_seeds_repeat_and_differ_and_the_env_s_own_generator_is_untouched():
     assert a == b
 
 
-def test_episodes_without_a_seed_go_on_and_do_not_repeat():
-    env = sw.OcclusionPenalty(Turning(), [straight()], EYE, tolerance=1.0)
-    env.reset(seed=1)
-    one, two = env.reset()[0], env.reset()[0]
-    assert one.tobytes() != two.tobytes()
-
-
-def test_the_noise_of_a_track_does_not_depend_on_what_else_is_seen():
-    def last(world):
-        env = sw.OcclusionPenalty(
-            Turning(((0, 3, 0, -1, 0), (0,) * 5), world=world), [straight("thing*")], EYE, tolerance=1.0
-        )
-        env.reset(seed=4)
-        for _ in range(5):
-            env.step(STILL)
-        return env.last_seen_positions
-
-    assert (
-        last(WALL)[1].tobytes() == last("")[1].tobytes() and last(WALL)[0].tobytes() != last("")[0].tobytes()
-    )
-
-
-def test_a_reset_starts_every_track_anew():
-    env = sw.OcclusionPenalty(
-        Turning(),
-        [straight(acceleration_noise=1.0)],
-        sw.occlusion.Sensor(site="eye", range_m=0.01),
-        tolerance=1.0,
-    )
-    info = env.reset(seed=0)[1]
-    for _ in range(100):
-        env.step(STILL)
-    again = env.reset(seed=0)[1]
-    assert again["occlusion/sigma"] == info["occlusion/sigma"] == 0.3
-
-
-def test_the_first_fix_has_the_declared_accuracy():
-    blind = sw.occlusion.Sensor(site="eye", range_m=0.01)
-    env = sw.OcclusionPenalty(
-        Turning(), [straight(start_position_std=[0.5, 0.1], mean_velocity=[2.0, 0.0])], blind, tolerance=1.0
-    )
-    env.reset(seed=0)
-    fixes = []
-    for _ in range(1500):
-        env.reset()
-        fixes.append(env.tracking.positions[0] - [1.0, 0.0])
-    np.testing.assert_allclose(np.std(fixes, axis=0), [0.5, 0.1], rtol=0.1)
-    np.testing.assert_allclose(np.mean(fixes, axis=0), 0.0, atol=0.06)
-    assert env.tracking.velocities.tolist() == [[2.0, 0.0]]
-
-
-def test_time_that_runs_backwards_is_refused():
-    env = crossing()
-    env.reset(seed=0)
-    for _ in steps(env, 5):
-        pass
-    env.unwrapped.data.time = 0.0
-    with pytest.raises(SafeWrappersError, match=r"backwards by 0\.16 s.*Reset the env"):
-        env.step(env.action_space.sample())
-    env.reset(seed=0)
-    env.step(env.action_space.sample())
-
-
-def test_a_state_that_is_set_is_seen_where_it_is():
-    env = sw.OcclusionPenalty(Turning(), [straight(acceleration_noise=100.0)], EYE, tolerance=1.0)
-    env.reset(seed=0)
-    env.unwrapped.data.qpos[1:3] = [0.0, -2.0]
-    env.step(STILL)
-    np.testing.assert_allclose(env.last_seen_positions[0], [0.0, -2.0], atol=0.25)
-
-
-def test_steps_of_any_length_grow_as_long_as_they_last():
-    class Uneven(Turning):
-        def step(self, action):
-            self.frame_skip = int(action[0])
-            return super().step(STILL)
-
-    env = sw.OcclusionPenalty(
-        Uneven(),
-        [straight(acceleration_noise=0.3)],
-        sw.occlusion.Sensor(site="eye", range_m=0.01),
-        tolerance=9.0,
-    )
-    env.reset(seed=0)
-    for skip in (4, 1, 7, 30, 4):
-        info = env.step(np.array([skip]))[4]
-    sigma = np.sqrt(double_integrator_covariance(np.diag([0.09, 0.09]), 0.3, 0.46)[0, 0])
-    assert info["occlusion/sigma"][0] == pytest.approx(sigma, rel=1e-10)
-
-
-def test_another_model_at_a_reset_is_looked_at_and_other_things_are_refused():
-    env = sw.OcclusionPenalty(Turning(), [straight("thing*")], EYE, tolerance=1.0)
-    assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == [True, True]
-    raw = env.unwrapped
-    raw.build(WALL.replace("2 0", "0.7 0"), "0.4 0 0")
-    assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == [False, True]
-    raw.build('<body name="thing3"><geom size="0.1"/></body>', "0.4 0 0")
-    with pytest.raises(
-        ConfigurationError, match=r"another model.*thing3, thing, thing2 and not thing, thing2"
-    ):
-        env.reset(seed=0)
-
-
-def test_an_env_that_names_no_time_step_is_taken_at_its_physics():
-    class Timeless(Turning):
-        dt = property()
-
-    env = sw.OcclusionPenalty(Timeless(), [straight()], EYE, tolerance=1.0)
-    env.reset(seed=0)
-    env.step(STILL)
-    maze = pytest.importorskip("gymnasium_robotics")
-    gym.register_envs(maze)
-    particle = sw.occlusion.Track("particle", acceleration_noise=0.1)
-    env = sw.OcclusionPenalty(
-        gym.make("PointMaze_UMaze-v3"), [particle], sw.occlusion.Sensor(site="target"), tolerance=1.0
-    )
-    env.reset(seed=0)
-    assert env.step(env.action_space.sample())[0]["tracks"].shape == (6,)
-
-
 # What Gymnasium asks ----------------------------------------------------------------------------------------------
-
-
-def test_a_copy_in_the_middle_goes_on_alike():
-    env = sw.OcclusionPenalty(Turning(SPIN), [straight("thing*")], EYE, tolerance=1.0)
-    env.reset(seed=0)
-    env.step(STILL)
-    again = copy.deepcopy(env)
-    for _ in range(5):
-        assert env.step(STILL)[0].tobytes() == again.step(STILL)[0].tobytes()
 
 
 # What is refused --------------------------------------------------------------------------------------------------
@@ -651,17 +407,84 @@ def test_what_cannot_be_is_refused_at_construction_with_the_reason(given, error,
         made(**given)
 
 
-def test_unnamed_bodies_do_not_fit_any_pattern():
-    assert made(tracks=[straight("*")]).track_names == ["robot", "thing", "thing2"]
+PUSH = np.full(1, 0.004)  # about 4 rad/s²
 
 
-def test_wrong_orders_are_refused():
-    with pytest.raises(ConfigurationError, match="already; give that one all the tracks"):
-        made(env=made())
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
-    arm = sw.occlusion.Track("body1", acceleration_noise=1)
-    with pytest.raises(ConfigurationError, match=r"put it outside: CBFActionFilter\(OcclusionPenalty"):
-        made(env=filtered, tracks=[arm])
-    chunks = sw.ChunkHandover(gym.make("Reacher-v5"), 4, 2)
-    with pytest.raises(ConfigurationError, match=r"put it outside: ChunkHandover\(OcclusionPenalty"):
-        made(env=chunks, tracks=[arm])
+def tracked(lever_arm=True, start_rate=0.0, world=None, **options):
+    imu = sw.occlusion.Imu("eye", lever_arm=lever_arm, **options)
+    sensor = sw.occlusion.Sensor(site="eye", position_std=1e-3, imu=imu)
+    world = world or Turning(((0, 1, 0, -1, 0), (start_rate, 0, 0, 0, 0)))
+    return sw.OcclusionPenalty(world, [straight("thing*")], sensor, tolerance=0.5)
+
+
+def off(env):
+    """Error of where the body is taken to be, m."""
+    return np.linalg.norm(env.ego_motion.position - env.unwrapped.data.body("robot").xpos)
+
+
+def test_its_readings_are_those_of_mujocos_sensors():
+    env = tracked()
+    raw = env.unwrapped
+    spec = mujoco.MjSpec.from_string(_text(raw))
+    for kind in (mujoco.mjtSensor.mjSENS_ACCELEROMETER, mujoco.mjtSensor.mjSENS_GYRO):
+        spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="eye")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    env.reset(seed=0)
+    for action in (PUSH, -PUSH, 0.3 * PUSH, PUSH):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = raw.data.qpos, raw.data.qvel, action
+        mujoco.mj_forward(model, data)
+        forces, before = [], data.site("eye").xmat.reshape(3, 3).copy()
+        for _ in range(raw.frame_skip):
+            mujoco.mj_forward(model, data)
+            forces.append(data.site("eye").xmat.reshape(3, 3) @ data.sensordata[:3])
+            mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        env.step(action)
+        np.testing.assert_allclose(env.ego_motion.rate, data.sensordata[3:], atol=1e-12)
+        turn = Rotation.from_matrix(before.T @ data.site("eye").xmat.reshape(3, 3))
+        middle = before @ Rotation.from_rotvec(0.5 * turn.as_rotvec()).as_matrix()
+        expected = np.mean(forces, axis=0) @ middle
+        np.testing.assert_allclose(env.ego_motion.specific_force, expected, rtol=0.05, atol=0.03)
+        assert np.linalg.norm(env.ego_motion.specific_force) > 0.3
+
+
+def _text(raw):
+    from occlusion_world import TEXT
+
+    world, arm = raw.arguments
+    return TEXT.format(world=world, arm=arm)
+
+
+def test_the_body_stays_where_it_is_with_the_arm_and_goes_astray_without():
+    ends = {}
+    for lever_arm in (True, False):
+        env = tracked(lever_arm, start_rate=2.0)
+        env.reset(seed=0)
+        errors = [(env.step(STILL), off(env))[1] for _ in range(100)]
+        ends[lever_arm] = errors[-1]
+        wrong = np.hypot(*(env.tracking.positions - [[1, 0], [-1, 0]]).T)
+        assert (wrong < 0.05).all() if lever_arm else (wrong > 1.0).all()
+        assert env.unwrapped.data.qvel[0] == pytest.approx(2.0)
+    assert ends[True] < 0.01
+    # closed form: the circle of the arm, less the straight line of the velocity that it began with
+    arm = 0.4 * np.array([np.cos(8.0) - 1.0, np.sin(8.0) - 2.0 * 4.0])
+    assert ends[False] == pytest.approx(np.hypot(*arm), rel=0.02)
+
+
+def test_what_is_seen_is_put_where_the_reckoned_pose_has_it():
+    env = tracked(accelerometer_std=1.0, gyro_std=0.5)
+    env.reset(seed=0)
+    for _ in range(40):
+        observation = env.step(PUSH)[0]
+    ego, raw = env.ego_motion, env.unwrapped
+    mujoco.mj_kinematics(raw.model, raw.data)  # poses lag a substep behind after a step
+    truth = raw.data.body("robot")
+    turned = Rotation.from_matrix(ego.rotation) * Rotation.from_matrix(truth.xmat.reshape(3, 3)).inv()
+    assert turned.magnitude() > 0.01 and off(env) > 0.01
+    for name in ("thing", "thing2"):
+        apparent = ego.position + turned.apply(raw.data.body(name).xpos - truth.xpos)
+        seen = env.sensor.measured(env._sight, 2, raw.data.body(name).xpos[None], None, ego)[0]
+        np.testing.assert_allclose(seen, apparent[:2], atol=1e-9)
+    shown = observation[1:3] + ego.position[:2]
+    np.testing.assert_allclose(shown, env.tracking.positions[0], atol=1e-9)

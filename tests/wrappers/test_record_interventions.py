@@ -1,4 +1,5 @@
-import contextlib
+"""Counts of interventions and costs, and a cost for tasks that have none."""
+
 import copy
 import pickle
 from pathlib import Path
@@ -6,11 +7,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.record_interventions import (
     COLUMNS,
     RecordInterventions,
@@ -118,30 +117,9 @@ def test_counts_of_an_episode():
     }
 
 
-def test_running_keys_at_every_step_with_one_dtype():
-    infos, _ = play(scripted_env())
-    for info in infos:
-        assert [type(info[key]) for key in keys.RUNNING] == [float] * len(keys.RUNNING)
-        assert all(np.isfinite(info[key]) for key in keys.RUNNING)
-    assert [info["interventions/rate"] for info in infos] == [0.0, 0.5, 2 / 3, 0.5]
-    assert [info["interventions/cost_substep"] for info in infos] == [0.0, 1.0, 2.0, 2.0]
-    assert [info["interventions/margin_min"] for info in infos] == [1.0, 0.2, -0.1, -0.1]
-
-
-def test_a_new_episode_starts_from_nothing():
-    env = scripted_env()
-    first, _ = play(env)
-    second, _ = play(env)
-    for key in keys.RUNNING:
-        assert [info[key] for info in first] == [info[key] for info in second]
-
-
 def test_what_neither_the_stack_nor_the_task_reports_is_never_zero(tmp_path):
     env = RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=3), tmp_path / "episodes.csv")
-    reset = env.reset(seed=0)[1]
     infos, _ = play(env)
-    for info in (reset, *infos):
-        assert all(np.isnan(info[key]) and isinstance(info[key], float) for key in keys.RUNNING)
     assert infos[-1][keys.EPISODE_SUMMARY].keys() == {"length", "return"}
     assert read_episodes(tmp_path / "episodes.csv")[0].keys() == {"length", "return"}
     assert env.filter_time_us is None
@@ -149,14 +127,12 @@ def test_what_neither_the_stack_nor_the_task_reports_is_never_zero(tmp_path):
 
 def test_a_layer_s_zeros_appear_only_with_the_layer():
     filtered = RecordInterventions(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=3)))
-    reset = filtered.reset(seed=0)[1]
-    assert reset["interventions/infeasible"] == 0.0 and reset["interventions/rate"] == 0.0
     summary = play(filtered)[0][-1][keys.EPISODE_SUMMARY]
     assert {"infeasible", "fallback", "unsafe", "cost", "violations"} <= summary.keys()
     assert not any(name.startswith("lease") for name in summary)
     judged = play(RecordInterventions(gym.make("SafePointGoal1-v0", max_episode_steps=3)))[0][-1]
-    assert judged[keys.EPISODE_SUMMARY]["violations"] == judged["interventions/cost"] == 0
-    assert "infeasible" not in judged[keys.EPISODE_SUMMARY] and np.isnan(judged["interventions/rate"])
+    assert judged[keys.EPISODE_SUMMARY]["violations"] == 0
+    assert "infeasible" not in judged[keys.EPISODE_SUMMARY]
 
 
 @pytest.mark.parametrize(
@@ -173,30 +149,6 @@ def test_a_zero_needs_a_judgement_of_every_step(costs, violations, cost):
     infos, _ = play(scripted_env(infos=[{} if c is None else {"cost": c} for c in costs]))
     summary = infos[-1][keys.EPISODE_SUMMARY]
     assert (summary.get("violations"), summary.get("cost")) == (violations, cost)
-    np.testing.assert_equal(infos[-1]["interventions/cost"], np.nan if cost is None else cost)
-
-
-@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
-def test_in_a_vector_env_what_is_not_judged_is_nan_and_float(mode):
-    def make():
-        return RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2))
-
-    with contextlib.closing(gym.vector.AsyncVectorEnv([make] * 2, autoreset_mode=mode)) as envs:
-        envs.reset(seed=0)
-        for _ in range(2):
-            truncated, info = envs.step(np.zeros((2, 1), np.float32))[3:]
-            info = info.get("final_info", info)
-            for key in keys.RUNNING:
-                assert info[key].dtype == np.float64 and np.isnan(info[key]).all()
-        assert truncated.all() and "cost" not in info[keys.EPISODE_SUMMARY]
-
-
-def test_monitor_s_file_says_nan_for_what_is_not_judged(tmp_path):
-    monitor = pytest.importorskip("stable_baselines3.common.monitor")
-    env = RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2))
-    play(monitor.Monitor(env, str(tmp_path / "log"), info_keywords=keys.RUNNING))
-    row = (tmp_path / "log.monitor.csv").read_text().splitlines()[-1]
-    assert row.split(",")[3:] == ["nan"] * len(keys.RUNNING)
 
 
 def test_what_is_not_judged_equals_itself_also_in_another_process():
@@ -205,28 +157,6 @@ def test_what_is_not_judged_equals_itself_also_in_another_process():
     assert again is keys.NOT_JUDGED and again == keys.NOT_JUDGED and float("nan") == keys.NOT_JUDGED
     assert keys.NOT_JUDGED != 0.0 and keys.NOT_JUDGED != "nan" and np.isnan(keys.NOT_JUDGED)
     assert len({keys.NOT_JUDGED, again}) == 1
-
-
-def test_filter_time_is_an_attribute_and_never_in_info():
-    env = scripted_env()
-    assert env.filter_time_us is None
-    infos, _ = play(env)
-    assert env.filter_time_us == pytest.approx(5.0)
-    assert not any("time" in key or "seconds" in key for info in infos for key in info)
-
-
-def test_gymnasium_contract():
-    env = gym.make("Pendulum-v1")
-    wrapped = RecordInterventions(env)
-    check_env(wrapped, skip_render_check=True)
-    rebuilt = gym.make(wrapped.spec)
-    assert isinstance(rebuilt, RecordInterventions)
-    options = {"x_init": 0.1}
-    scripted = scripted_env()
-    scripted.reset(seed=3, options=options)
-    assert scripted.env.seen == (3, options)
-    assert options == {"x_init": 0.1}
-    assert isinstance(pickle.loads(pickle.dumps(wrapped)), RecordInterventions)
 
 
 @pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
@@ -240,7 +170,6 @@ def test_vector_env_counts_episodes_apart_in_every_autoreset_mode(mode):
         if truncated.any():
             ends += 1
             assert info[keys.EPISODE_SUMMARY]["length"].tolist() == [4, 4]
-            assert info["interventions/cost"].dtype == np.float64
             if mode is gym.vector.AutoresetMode.DISABLED:
                 envs.reset(options={"reset_mask": truncated})
     assert ends >= 2
@@ -260,30 +189,6 @@ def test_file_gains_one_row_per_episode(tmp_path: Path):
     assert set(first) == set(COLUMNS) - {"stuck", "mismatch", "spin_outs", "collisions", "seen", "expiries"}
 
 
-def test_spin_outs_are_counted_where_the_task_reports_them(tmp_path: Path):
-    path = tmp_path / "rover.csv"
-    script = [cbf(spin_out=value) for value in (1.0, 0.0, 1.0, 1.0)]
-    env = scripted_env(path, script)
-    for _ in range(2):  # an episode's own
-        infos, _ = play(env)
-        assert infos[-1][keys.EPISODE_SUMMARY]["spin_outs"] == 3
-    assert [row["spin_outs"] for row in read_episodes(path)] == [3.0, 3.0]
-    calm = [cbf(spin_out=0.0)] * 4
-    assert play(scripted_env(infos=calm))[0][-1][keys.EPISODE_SUMMARY]["spin_outs"] == 0
-    assert "spin_outs" not in play(scripted_env())[0][-1][keys.EPISODE_SUMMARY]
-
-
-def test_a_rovers_spin_outs_are_those_of_its_own_judge():
-    env = RecordInterventions(gym.make("SafeRover-v0", max_episode_steps=40))
-    env.reset(seed=0)
-    reported = 0
-    for step in range(40):
-        info = env.step(np.array([1, 1, 1, 1, 0] if step < 20 else np.zeros(5), np.float32))[4]
-        reported += info[keys.SPIN_OUT] > 0.0
-    assert 10 < reported < 40
-    assert info[keys.EPISODE_SUMMARY]["spin_outs"] == reported
-
-
 @pytest.mark.parametrize("cut", [1, 3, 30])
 def test_half_written_last_line_is_dropped_and_the_file_continued(tmp_path: Path, cut: int):
     path = tmp_path / "episodes.csv"
@@ -298,17 +203,73 @@ def test_half_written_last_line_is_dropped_and_the_file_continued(tmp_path: Path
     assert rows[0]["cost"] == rows[1]["cost"] == 1.0
 
 
-def test_file_killed_inside_its_header(tmp_path: Path):
-    path = tmp_path / "episodes.csv"
-    path.write_text("length,ret")
-    play(scripted_env(path))
-    assert len(read_episodes(path)) == 1
+def tip_speed(env):
+    """Above 0 once the pendulum turns faster than 1 rad/s."""
+    return max(0.0, abs(env.state[1]) - 1.0)
 
 
-def test_refused_paths(tmp_path: Path):
-    with pytest.raises(ConfigurationError, match="is a folder; give a file name in it"):
-        scripted_env(tmp_path)
-    other = tmp_path / "other.csv"
-    other.write_text("a,b\n1,2\n")
-    with pytest.raises(ConfigurationError, match=r"has other columns .'a,b'; expected 'length,return"):
-        scripted_env(other)
+def is_fast(env):
+    return bool(abs(env.state[1]) > 1.0)
+
+
+def pendulum(fn, steps=30):
+    return sw.CostFunction(gym.make("Pendulum-v1", max_episode_steps=steps), fn)
+
+
+def drive(env, steps=30):
+    env.reset(seed=0)
+    return [env.step(env.action_space.high) for _ in range(steps)]
+
+
+@pytest.mark.parametrize("fn", [tip_speed, f"{__name__}:tip_speed"])
+def test_the_cost_is_judged_on_the_true_state_after_the_step(fn):
+    # The observation holds the speed of the state that the step has led to.
+    env, bare = pendulum(fn), gym.make("Pendulum-v1", max_episode_steps=30)
+    start, info = env.reset(seed=0)
+    assert info[keys.COST] == pytest.approx(max(0.0, abs(start[2]) - 1.0), abs=1e-6)
+    costs = []
+    for (observation, reward, *_, info), expected in zip(drive(env), drive(bare), strict=True):
+        assert type(info[keys.COST]) is float and keys.COST_SUBSTEP not in info
+        assert info[keys.COST] == pytest.approx(max(0.0, abs(observation[2]) - 1.0), abs=1e-6)
+        np.testing.assert_array_equal(observation, expected[0])
+        assert reward == expected[1]
+        costs.append(info[keys.COST])
+    assert min(costs) == 0.0 and max(costs) > 1.0
+
+
+def test_a_recorder_outside_counts_it_as_the_task_s_own():
+    infos = [step[4] for step in drive(sw.RecordInterventions(pendulum(is_fast)))]
+    hits = sum(info[keys.COST] for info in infos)
+    assert 5 < hits < 30
+    summary = infos[-1][keys.EPISODE_SUMMARY]
+    assert summary["violations"] == summary["cost"] == hits
+    assert "cost_substep" not in summary
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), None, "1", [1.0], np.zeros(2), 1j])
+def test_what_is_no_finite_number_is_refused(bad):
+    env = pendulum(lambda env: bad)
+    with pytest.raises(sw.SafeWrappersError, match="must return one finite number, got"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("fn", "message"),
+    [
+        (3, "or its name 'module:function'; got 3"),
+        ("math", "or its name 'module:function'; got 'math'"),
+        ("math:pi", "got 'math:pi'"),
+        ("no_such_module:cost", "cannot be imported: No module named 'no_such_module'"),
+        ("math:no_such", "cannot be imported: module 'math' has no attribute 'no_such'"),
+        ("a b:c", "cannot be imported"),
+    ],
+)
+def test_what_is_no_function_is_refused(fn, message):
+    with pytest.raises(sw.SafeWrappersError, match=message):
+        pendulum(fn)
+
+
+def test_a_task_s_own_cost_is_not_hidden():
+    env = sw.CostFunction(gym.make("SafePointGoal1-v0"), lambda env: 0.0)
+    with pytest.raises(sw.SafeWrappersError, match="reports a cost of its own"):
+        drive(env, 1)

@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 import safe_wrappers as sw
 from benchmarks import car_drivers
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.scene import MOST_MARKS, arrows, find_renderer, put, set_size
+from safe_wrappers.drawing.scene import MOST_MARKS, put
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
 
@@ -86,37 +86,6 @@ def test_an_env_without_frames_is_refused_with_the_line_to_write():
         sw.SafetyOverlay(sw.protect(gym.make(TASK, render_mode="depth_array")))
 
 
-def test_windows_of_other_envs_and_nothing_to_draw_are_refused():
-    with pytest.raises(ConfigurationError, match=r"windows of MuJoCo envs alone.*rgb_array"):
-        sw.SafetyOverlay(Plain("human"))
-    with pytest.raises(ConfigurationError, match="nothing to draw"):
-        sw.SafetyOverlay(Plain(), scene=False, strip=False)
-
-
-@pytest.mark.parametrize(
-    "outer",
-    [
-        sw.protect,
-        lambda env: sw.CostFunction(env, lambda task: 0.0),
-        lambda env: sw.LeaseExpiry(
-            env, sw.StoppingBudget(sw.constraints.JointSpeedLimit(9.0), closing_speed=1.0)
-        ),
-        lambda env: sw.TeleopChannel(env, 0.0, 0.0),
-    ],
-)
-def test_what_the_overlay_would_not_see_belongs_inside(outer):
-    with pytest.raises(ConfigurationError, match=r"draw nothing of what is outside.*SafetyOverlay\(\w+\(env"):
-        outer(sw.SafetyOverlay(gym.make(TASK, render_mode="rgb_array")))
-
-
-def test_an_overlay_is_put_on_once_and_inside_of_chunks():
-    with pytest.raises(ConfigurationError, match="an overlay already"):
-        sw.SafetyOverlay(sw.SafetyOverlay(make()))
-    with pytest.raises(ConfigurationError, match=r"whole chunk.*ChunkHandover\(SafetyOverlay\(env"):
-        sw.SafetyOverlay(sw.ChunkHandover(make(), 4, 2))
-    sw.ChunkHandover(sw.SafetyOverlay(make()), 4, 2)
-
-
 # Nothing is changed -------------------------------------------------------------------------------------------
 
 
@@ -183,28 +152,6 @@ def test_observations_rewards_infos_and_random_numbers_are_those_without_it(task
         assert any(step[-1][keys.CBF_INTERVENED] for step in bare[1:])
 
 
-def test_looking_counts_as_no_observation():
-    env = make()
-    env.reset(seed=0)
-    count = env.plant.observation_id
-    assert len(env.look()) == 1 and env.plant.observation_id == count
-
-
-def test_a_state_that_is_not_a_number_is_not_drawn():
-    env = sw.SafetyOverlay(make())
-    env.reset(seed=0)
-    assert env.marks()
-    env.unwrapped.data.qvel[0] = np.nan
-    assert env.marks() == []
-
-
-def test_before_the_first_reset_and_without_a_filter_there_is_nothing_in_the_scene():
-    assert sw.SafetyOverlay(make()).marks() == []
-    bare = sw.SafetyOverlay(gym.make(TASK, render_mode="rgb_array"))
-    bare.reset(seed=0)
-    assert bare.marks() == []
-
-
 @pytest.mark.parametrize("filtered", [True, False])
 def test_a_lease_s_clearance_is_drawn_once(filtered):
     rail = sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"])
@@ -221,17 +168,6 @@ def test_a_lease_s_clearance_is_drawn_once(filtered):
     assert lease.look() and bound.plant.observation_id == count
     env.unwrapped.data.qvel[0] = np.nan
     assert env.marks() == []
-
-
-def test_a_lease_that_keeps_another_distance_than_the_filter_is_drawn_too_and_a_function_has_no_place():
-    near, far = (sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"], margin=m) for m in (0.0, 0.2))
-    inside = sw.CBFActionFilter(gym.make("InvertedPendulum-v5", render_mode="rgb_array"), [near])
-    env = sw.SafetyOverlay(sw.LeaseExpiry(inside, sw.StoppingBudget(far, acceleration=30.0)))
-    env.reset(seed=0)
-    at = [mark.position[0] for mark in env.marks() if mark.role == "keep out"]
-    np.testing.assert_allclose(at, [-0.9, 0.9, -0.7, 0.7])
-    told = sw.StoppingBudget(lambda env: ([1.0], [0.0]), braking=8.0, acceleration=30.0)
-    assert sw.LeaseExpiry(inside, told).look() == ()
 
 
 # Pictures -----------------------------------------------------------------------------------------------------
@@ -278,61 +214,7 @@ def test_a_window_gets_marks_and_words_before_each_step():
     assert renderer.viewer.words[1].startswith("margin ") and set(renderer.modes) == {"human"}
 
 
-def test_the_renderer_of_a_maze_is_its_robot_s():
-    pytest.importorskip("gymnasium_robotics")
-    env = gym.make("PatrolledPointMaze-v0", render_mode="rgb_array")
-    assert find_renderer(env) is env.unwrapped.point_env.mujoco_renderer
-    assert find_renderer(Plain()) is None
-
-
-def test_a_size_is_set_where_mujoco_draws():
-    env = gym.make(TASK, render_mode="rgb_array")
-    set_size(env, 320, 200)
-    renderer, drawn = find_renderer(env), env.unwrapped.model.vis.global_
-    assert (renderer.width, renderer.height) == (drawn.offwidth, drawn.offheight) == (320, 200)
-    set_size(Plain(), 320, 200)
-
-
 # Arrows -------------------------------------------------------------------------------------------------------
-
-
-def drawn_arrows(env, proposed, executed):
-    bound = env.look()
-    found = arrows(env.plant, [b.spec for b in bound], np.array(proposed), np.array(executed))
-    return {mark.role: mark for mark in found}
-
-
-def test_a_drive_points_along_the_heading_and_a_turn_alone_nowhere():
-    env = make()
-    env.reset(seed=0)
-    heading = env.unwrapped.data.body("agent").xmat.reshape(3, 3)[:, 0]
-    found = drawn_arrows(env, [0.0, 1.0], [1.0, 0.0])
-    assert set(found) == {"executed"}
-    np.testing.assert_allclose(found["executed"].axes[:, 2], heading, atol=1e-6)
-    low = env.plant.acting_range[0][0]  # no control pushes harder
-    back = drawn_arrows(env, [0.5 * low, 0.0], [low, 0.0])
-    assert (
-        drawn_arrows(env, [0.5 * low, 0.0], [3.0 * low, 0.0])["executed"].size[2] == back["executed"].size[2]
-    )
-    np.testing.assert_allclose(back["executed"].axes[:, 2], -heading, atol=1e-6)
-    assert back["executed"].size[2] == pytest.approx(2.0 * back["proposed"].size[2])
-
-
-def test_a_gripper_s_arrow_is_its_displacement():
-    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    env = make("FetchReach-v4")
-    env.reset(seed=0)
-    arrow = drawn_arrows(env, [0.0] * 4, [0.6, 0.0, -0.8, 1.0])["executed"]
-    np.testing.assert_allclose(arrow.axes[:, 2], [0.6, 0.0, -0.8], atol=1e-12)
-
-
-def test_machines_of_many_actuators_and_plants_without_a_body_have_bars_alone():
-    legged = make("SafeHalfCheetahVelocity-v0")
-    legged.reset(seed=0)
-    assert drawn_arrows(legged, np.ones(6), np.ones(6)) == {}
-    arm = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
-    arm.reset(seed=0)
-    assert drawn_arrows(arm, np.ones(2), np.ones(2)) == {}
 
 
 # With GL ------------------------------------------------------------------------------------------------------

@@ -129,7 +129,7 @@ def check_numbers(env):
         both = zip(asked.actions, witness.executed, strict=True)
         changed = sum(not np.array_equal(given, done) for given, done in both)
         if "SafeActionMap" in layers:
-            scales = [i[keys.MAP_SCALE] for i in infos if i[keys.MAP_ANCHOR]]
+            scales = [i[keys.MAP_SCALE] for i in infos if not np.isnan(i[keys.MAP_SCALE])]
             # A lease's brake is not mapped, and the filter may have to change it.
             braked = sum(i.get(keys.LEASE_BRAKING, False) for i in infos)
             assert changed <= braked and len(scales) > 0 and min(scales) < 1.0
@@ -153,8 +153,6 @@ def check_numbers(env):
             assert summary["lease_braking"] == sum(i[keys.LEASE_BRAKING] for i in infos)
     for name, key in (("ContactMonitor", keys.CONTACT_PARTIAL), ("BalanceMonitor", keys.BALANCE_PARTIAL)):
         assert name not in layers or not any(i[key] for i in infos)
-    if "ChunkHandover" in layers:
-        assert sum(i[keys.HANDOVER_STEPS] for i in infos) == steps
 
 
 def base(task_id):
@@ -215,15 +213,6 @@ def test_recorders_of_others_are_not_refused(outer):
     for recorder in (gym.wrappers.RecordEpisodeStatistics, monitor):
         MAKE[outer](recorder(base("SafePointGoal1-v0")))
         recorder(MAKE[outer](base("SafePointGoal1-v0")))
-
-
-def test_what_a_filter_inside_out_reported():
-    # The report that made this a rule: 27 of 50 steps were changed, and the recorder inside said 0.0.
-    env = base("SafePointGoal1-v0")
-    with pytest.raises(
-        ConfigurationError, match=r"put it outside: RecordInterventions\(protect\(env, \.\.\.\)"
-    ):
-        sw.protect(sw.RecordInterventions(env))
 
 
 class Renamed(sw.RecordInterventions):

@@ -1,4 +1,4 @@
-"""Where leases come from: constraints with an approach speed, constraints with a value, functions of the env."""
+"""What a stop takes by clearances and constraints, what commands may do, and which chunks are within reach."""
 
 import copy
 import math
@@ -6,15 +6,21 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+import ruckig
 from asking import Asked
-from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection, read_cart
-from worlds import BoundSpeedRow, SpeedRow
+from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection
+from hypothesis import given
+from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint
+from safe_wrappers.wrappers.admission import Admission
+from safe_wrappers.wrappers.stopping_budget import BoundBudget
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+
 RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
 FULL = np.array([1.0, 0.0])
 
@@ -71,22 +77,6 @@ def test_a_clearance_on_a_mujoco_cart(reserve):
     assert leases > 5 and refused > 5
 
 
-def test_its_own_braking_unless_another_is_given():
-    def lease_of(**more):
-        cart = BrakedCart(wall=5.0, v=2.0, drive=0.0)
-        near = sw.constraints.Clearance(
-            [sw.constraints.Plane([5.0], [-1.0])], braking=1.0, position=[0], velocity=[1]
-        )
-        env = lease(
-            cart, near, acceleration=0.0, plant=cart_plant(0.1), fallback="zero", max_lease_s=9.0, **more
-        )
-        env.reset()
-        return granted(env, FULL)
-
-    assert lease_of() == pytest.approx((5.0 - 2.0) / 2.0, abs=1e-6)
-    assert lease_of(braking=4.0) == pytest.approx((5.0 - 0.5) / 2.0, abs=1e-6)
-
-
 def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
     # It sees the clearance after the delay: the way of the commands that were sent is gone by then.
     def lease(delay, throttle):
@@ -122,35 +112,6 @@ def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
 # Other constraints --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Reacher-v5"])
-def test_a_joint_position_limit_with_a_closing_speed(env_id):
-    joint = {"InvertedPendulum-v5": "slider", "Reacher-v5": "joint1"}[env_id]
-    limit = sw.constraints.JointPositionLimit(-0.8, 0.8, [joint], margin=0.05)
-    env = sw.LeaseExpiry(
-        gym.make(env_id),
-        sw.StoppingBudget(limit, closing_speed=4.0, margin=0.02, localisation=0.01),
-        detect_s=0.015,
-        max_lease_s=2.0,
-    )
-    again, plant = copy.deepcopy(limit), sw.MujocoPlant()
-    plant.bind(env.env)
-    again = Asked(again, plant)
-    env.reset(seed=3)
-    rng, seen = np.random.default_rng(0), set()
-    for _ in range(60):
-        plant.observe()
-        value = again.value().min()
-        assert value <= 0.8 - abs(env.unwrapped.data.joint(joint).qpos[0]) + 1e-12
-        wanted = (value - 0.05 - 0.02 - 0.01) / 4.0 - 0.015
-        got = granted(env, env.action_space.high * rng.choice([-1.0, 1.0]))
-        if got is None:
-            assert wanted < env.control_dt
-        else:
-            assert got == pytest.approx(wanted, abs=1e-6)
-        seen.add(got is None)
-    assert seen == {True, False}
-
-
 HAZARDS = [sw.constraints.Discs("hazard_positions", radius=0.2)]
 
 
@@ -160,29 +121,6 @@ def at_hazard(robot):
     dx, dy = to[np.argmin((to**2).sum(1))]
     angle = math.remainder(math.atan2(dy, dx) - robot.agent_heading, math.tau)
     return np.array([1.0, np.clip(4.0 * angle, -1.0, 1.0)], np.float32)
-
-
-def test_a_heading_drive_brakes_by_its_own_backup():
-    clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01)
-    env = sw.LeaseExpiry(
-        gym.make("SafePointGoal1-v0"), sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=0.2
-    )
-    again, plant = copy.deepcopy(clearance), sw.MujocoPlant()
-    plant.bind(env.env)
-    again = Asked(again, plant)
-    layout = {"layout": {"agent": [0.0, 0.0, 0.0], "hazards": [[1.5, 0.0]]}}
-    env.reset(seed=0, options=layout)
-    braked = 0
-    for t in range(120):
-        if t > 25:
-            env.set_observation_time(None)
-        plant.observe()
-        wanted = again.backup()
-        info = env.step(np.array([1.0, 0.0], np.float32))[4]
-        if info["lease/braking"]:
-            braked += 1
-            np.testing.assert_allclose(info["executed_action"], np.clip(wanted, -1.0, 1.0), atol=1e-6)
-    assert braked > 50 and float(np.linalg.norm(env.unwrapped.data.qvel[:2])) < 1e-2
 
 
 def test_a_heading_drive_never_violates_when_commands_stop():
@@ -220,76 +158,6 @@ def test_a_heading_drive_never_violates_when_commands_stop():
     assert entered == 0 and braked > 100
 
 
-class Far(SpeedRow):
-    """Whose value says that nothing is near, or that nothing can be read."""
-
-    def bind(self, plant):
-        return BoundFar(self, plant)
-
-
-class BoundFar(BoundSpeedRow):
-    def value(self):
-        return np.array(self.spec.values)
-
-
-@pytest.mark.parametrize(
-    ("values", "wanted"),
-    [([], 0.4), ([math.inf], 0.4), ([math.inf, 0.3], 0.3), ([math.nan], None), ([-math.inf, 1.0], None)],
-)
-def test_a_value_of_nothing_near_is_no_limit(values, wanted):
-    far = Far(1.0)
-    far.values = values
-    env = sw.LeaseExpiry(
-        BrakedCart(),
-        sw.StoppingBudget(far, closing_speed=1.0),
-        max_lease_s=0.4,
-        plant=cart_plant(0.1),
-        fallback="zero",
-    )
-    env.reset()
-    got = granted(env, FULL)
-    assert got is None if wanted is None else got == pytest.approx(wanted, abs=1e-6)
-
-
-def test_a_state_error_counts_for_values_too():
-    def lease(error):
-        clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01, state_error=error)
-        env = sw.LeaseExpiry(
-            gym.make("SafePointGoal1-v0"), sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=5.0
-        )
-        env.reset(seed=0, options={"layout": {"agent": [0.0, 0.0, 0.0], "hazards": [[1.0, 0.0]]}})
-        return granted(env, np.zeros(2, np.float32))
-
-    assert lease(0.08) == pytest.approx(lease(0.0) - 0.08 / 4.0, abs=1e-6)
-
-
-def test_a_constraint_forgets_the_episode():
-    begun = []
-
-    class Counted(Far):
-        def bind(self, plant):
-            return BoundCounted(self, plant)
-
-    class BoundCounted(BoundFar):
-        def start(self):
-            begun.append(len(begun))
-            return begun[-1]
-
-        def observe(self, memory):
-            assert memory == begun[-1]
-
-    counted = Counted(1.0)
-    counted.values = [1.0]
-    env = sw.LeaseExpiry(
-        BrakedCart(), sw.StoppingBudget(counted, closing_speed=1.0), plant=cart_plant(0.1), fallback="zero"
-    )
-    for _ in range(2):
-        before = len(begun)
-        env.reset()
-        assert len(begun) > before
-        env.step(np.zeros(2, np.float32))
-
-
 # Functions ----------------------------------------------------------------------------------------------------
 
 
@@ -305,25 +173,6 @@ def told(answer, **more):
     return env
 
 
-@pytest.mark.parametrize(
-    ("answer", "wanted"),
-    [
-        ((1.5, 1.0), 1.0),
-        (([1.5, 9.0], [1.0, 1.0]), 1.0),
-        ((np.array([9.0, 1.5]), 1.0), 1.0),
-        (([9.0, -1.5, 3.5], [-9.0, -2.0, 2.0]), None),  # behind the surface, though it leaves
-        (([], []), 2.0),
-        ((np.zeros((0,)), np.zeros((0,))), 2.0),
-        ((1.0, 0.0), 2.0),
-        ((1.0, -3.0), 2.0),
-        ((0.4, 1.0), None),
-    ],
-)
-def test_the_shortest_lease_of_all_surfaces_counts(answer, wanted):
-    got = granted(told(answer), FULL)
-    assert got is None if wanted is None else got == pytest.approx(wanted, abs=1e-6)
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("where", [0, 1])
 def test_a_reading_that_is_not_finite_revokes(bad, where):
@@ -335,25 +184,6 @@ def test_a_reading_that_is_not_finite_revokes(bad, where):
     assert info["lease/refused"] and info["lease/braking"] and info["lease/remaining_s"] == 0.0
     answer[where][1] = 0.1
     assert granted(env, FULL) is not None
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_it_revokes_whatever_the_least_lease_is(bad):
-    readings = [[9.0], [0.1]]
-    inside = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [rail()])
-    env = sw.LeaseExpiry(
-        inside,
-        sw.StoppingBudget(lambda env: readings, braking=1.0, acceleration=1.0),
-        min_lease_s=0.04,
-        max_lease_s=1.0,
-    )
-    env.reset(seed=0)
-    action = np.zeros(1, np.float32)
-    assert granted(env, action) is not None
-    readings[0][0] = 1e-9  # no room at all: the filter inside vouches for the step
-    assert granted(env, action) == pytest.approx(0.04)
-    readings[0][0] = bad
-    assert granted(env, action) is None
 
 
 @pytest.mark.parametrize(
@@ -378,55 +208,7 @@ def test_a_mujoco_state_that_is_not_a_number_revokes_and_nothing_else_passes(cle
 # Sharing ------------------------------------------------------------------------------------------------------
 
 
-def test_a_constraint_may_serve_the_filter_inside_and_a_second_env_too():
-    def run(share):
-        mine = [sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01) for _ in range(3)]
-        if share:
-            mine = mine[:1] * 3
-        env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [mine[0]])
-        env = sw.LeaseExpiry(env, sw.StoppingBudget(mine[1], closing_speed=4.0), max_lease_s=0.3)
-        other = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), sw.StoppingBudget(mine[2], closing_speed=4.0))
-        env.reset(seed=0)
-        other.reset(seed=5)
-        seen = []
-        for t in range(120):
-            if t % 30 > 15:
-                env.set_observation_time(None)
-            info = env.step(at_hazard(env.unwrapped))[4]
-            theirs = other.step(at_hazard(other.unwrapped))[4]
-            seen.append(
-                (info["lease/remaining_s"], info["executed_action"].tobytes(), theirs["lease/remaining_s"])
-            )
-        return seen
-
-    assert run(True) == run(False)
-
-
 # Bad input ----------------------------------------------------------------------------------------------------
-
-
-def test_what_constraints_with_a_value_need():
-    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, ["joint1"])
-    with pytest.raises(ConfigurationError, match=r"JointPositionLimit does not say how fast.*closing_speed"):
-        sw.LeaseExpiry(gym.make("Reacher-v5"), limit)
-    for value in (0.0, -1.0, math.nan, math.inf, "fast"):
-        with pytest.raises(ConfigurationError, match="closing_speed"):
-            sw.StoppingBudget(limit, closing_speed=value)
-    for name in ("braking", "acceleration", "top_speed"):
-        with pytest.raises(ConfigurationError, match="closing_speed alone"):
-            sw.StoppingBudget(limit, closing_speed=1.0, **{name: 1.0})
-    with pytest.raises(ConfigurationError, match="SpeedRow has no value"):
-        budget = sw.StoppingBudget(SpeedRow(1.0), closing_speed=1.0)
-        sw.LeaseExpiry(BrakedCart(), budget, plant=cart_plant(0.1), fallback="zero")
-
-
-def test_a_clearance_still_needs_the_acceleration():
-    with pytest.raises(ConfigurationError, match="acceleration is missing"):
-        sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), rail())
-    with pytest.raises(ConfigurationError, match="closing_speed is for constraints"):
-        sw.LeaseExpiry(
-            gym.make("InvertedPendulum-v5"), sw.StoppingBudget(rail(), acceleration=1.0, closing_speed=1.0)
-        )
 
 
 def test_least_s_needs_a_filter_inside_and_no_more_than_max_lease_s():
@@ -437,20 +219,6 @@ def test_least_s_needs_a_filter_inside_and_no_more_than_max_lease_s():
         sw.LeaseExpiry(inside, sw.StoppingBudget(rail(), acceleration=1.0), min_lease_s=2.0)
     with pytest.raises(ConfigurationError, match="min_lease_s"):
         sw.LeaseExpiry(inside, sw.StoppingBudget(rail(), acceleration=1.0), min_lease_s=-0.1)
-
-
-def test_reading_is_of_the_env_that_it_wraps():
-    seen = []
-
-    def look(env):
-        seen.append(env)
-        return read_cart(env)
-
-    inner = gym.wrappers.TimeLimit(BrakedCart(), 100)
-    env = sw.LeaseExpiry(inner, sw.StoppingBudget(look, braking=1.0, acceleration=1.0), fallback="zero")
-    env.reset()
-    env.step(FULL)
-    assert seen == [inner]
 
 
 class Checked(sw.Constraint):
@@ -479,3 +247,126 @@ def test_what_only_a_state_can_show_is_refused_at_the_reset():
     cart.unwrapped.reset_model = lambda: cart.unwrapped.set_state(np.array([2.0, 0.0]), np.zeros(2))
     with pytest.raises(ConfigurationError, match="too far out"):
         lease.reset(seed=0)
+
+
+HOLD, BRAKING = 0.1, 4.0
+
+
+def measured(room, own, reserves):
+    """The budget of a cart at rest, so far from a wall."""
+    cart, plant = BrakedCart(dt=HOLD, wall=room), cart_plant(HOLD)
+    wall = sw.constraints.Plane([room], [-1.0])
+    clearance = sw.constraints.Clearance([wall], braking=1.0, position=[0], velocity=[1], **own)
+    cart.reset()
+    # So fast a cart could be that no command is let through unseen.
+    bound = BoundBudget(sw.StoppingBudget(clearance, BRAKING, acceleration=1e3, **reserves), cart)
+    plant.bind(cart)
+    bound.bind(bound.plant_of(plant))
+    bound.reset()
+    bound.measure()
+    return bound
+
+
+def throttle(value):
+    return np.array([value, 0.0])
+
+
+@pytest.mark.parametrize("room", [0.0, 0.002, 0.008])
+@pytest.mark.parametrize(
+    ("own", "extra"),
+    [
+        ({}, {}),
+        ({"margin": 0.2}, {}),
+        ({"state_error": 0.2}, {}),
+        ({}, {"margin": 0.2}),
+        ({}, {"localisation": 0.2}),
+        ({"margin": 0.05, "state_error": 0.03}, {"margin": 0.08, "localisation": 0.04}),
+    ],
+    ids=str,
+)
+def test_what_a_command_may_do_counts_the_clearances_reserves_and_the_budgets(own, extra, room):
+    """From rest, one hold of an acceleration takes a h^2 / 2, and one hold of braking back to rest as much."""
+    left = room + sum(own.values()) + sum(extra.values())
+    budget = measured(left, own, extra)
+    most = room / HOLD**2
+    for more, admitted in ((-1.0, True), (-1e-6, True), (1e-6, False), (0.5, False)):
+        assert budget.can_stop_after(throttle(most + more), HOLD) == admitted
+
+
+def test_while_the_brake_only_begins_to_act_no_command_is_known_to_lead_away():
+    for act_s, admitted in ((0.0, True), (0.01, False)):
+        budget = measured(0.0, {}, {"act_s": act_s})
+        assert budget.longest_time() < HOLD
+        assert budget.can_stop_after(throttle(-1.0), HOLD) == admitted
+
+
+LIMITS = {"max_acceleration": 2.0, "max_speed": 1.0, "max_jerk": 8.0}
+
+
+class Nowhere(gym.Env):
+    """Says nothing of where it is."""
+
+
+def admission(state, arrival="moving", **changed):
+    motion_limits = {**LIMITS, "arrival": arrival, **changed}
+    return Admission(Nowhere(), motion_limits, lambda env: state, len(state[0]))
+
+
+def quickest(start, end):
+    """Ruckig's time to a moving end, one axis."""
+    request = ruckig.InputParameter(1)
+    request.current_position, request.current_velocity, request.current_acceleration = ([x] for x in start)
+    request.target_position, request.target_velocity, request.target_acceleration = ([x] for x in end)
+    request.max_velocity, request.max_acceleration, request.max_jerk = [1.0], [2.0], [8.0]
+    trajectory = ruckig.Trajectory(1)
+    ruckig.Ruckig(1).calculate(request, trajectory)
+    return trajectory.duration
+
+
+numbers = st.integers(-800, 800).map(lambda thousandths: thousandths / 1000.0)
+
+
+@given(numbers, numbers, st.floats(-0.4, 0.4), st.floats(-0.9, 0.9), st.floats(0.0, 0.5))
+def test_what_a_motion_reaches_is_admitted_and_rest_needs_the_constrained_time(q, v, a, goal, late):
+    v, a = 0.9 * v, a if abs(v) < 0.5 else 0.0  # a start that can keep the speed limit
+    needed = quickest((q, v, a), (goal, 0.0, 0.0))
+    state = ([q], [v], [a])
+    end = np.array([goal])
+    assert admission(state, "rest").admits(end, needed + 1e-9 + late)
+    assert admission(state).admits(end, needed + 1e-9 + late)  # what can stop there can pass there
+    if needed > 1e-3:
+        assert not admission(state, "rest").admits(end, needed * (1.0 - 1e-6) - 1e-9)
+
+
+def test_moving_admits_ends_at_which_no_machine_could_stop_in_time():
+    state = ([0.0, 0.0], [0.9, 0.0], [0.0, 0.0])
+    end = np.array([0.09, 0.0])
+    assert admission(state).admits(end, 0.1)
+    assert not admission(state, "rest").admits(end, 0.1)
+
+
+def test_without_a_measured_acceleration_the_most_of_it_is_counted_on():
+    still, known = ([0.0], [0.0]), ([0.0], [0.0], [0.0])
+    end = np.array([0.2])
+    assert admission(still).admits(end, 0.5)
+    assert not admission(known).admits(end, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("motion_limits", "measured", "error", "words"),
+    [
+        ({**LIMITS, "arrival": "soon"}, lambda env: ([0.0], [0.0]), UnknownNameError, "'moving' or 'rest'"),
+        ({"max_speed": 1.0}, lambda env: ([0.0], [0.0]), ConfigurationError, "max_acceleration"),
+        (
+            {**LIMITS, "max_speed": [1.0, 2.0]},
+            lambda env: ([0.0], [0.0]),
+            ConfigurationError,
+            "1 action comp",
+        ),
+        ({**LIMITS, "max_speed": 0.0}, lambda env: ([0.0], [0.0]), ConfigurationError, "max_speed"),
+        (LIMITS, None, UnsupportedEnvError, "pass measured"),
+    ],
+)
+def test_bad_limits(motion_limits, measured, error, words):
+    with pytest.raises(error, match=words):
+        Admission(Nowhere(), motion_limits, measured, 1)

@@ -9,7 +9,6 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, Unsupport
 from safe_wrappers.plants.mujoco.contacts import Replay
 
 KINDS = ("forecast", "pyramid", "cone")
-KEYS = {"whole_body/contacts", "whole_body/cone_margin"}
 
 
 def flagged(info):
@@ -120,25 +119,7 @@ def test_actions_that_are_none_or_outside_do_not_get_through(contacts):
         info = env.step(action)[4]
         assert np.isfinite(info["executed_action"]).all() and (np.abs(info["executed_action"]) <= 1.0).all()
         assert info["cbf/fallback"] == (not np.isfinite(bad)) or flagged(info)
-        assert info["cbf/intervened"] or info["cbf/clipped"] > 0.0
-
-
-@pytest.mark.parametrize("contacts", KINDS)
-def test_reports_have_the_same_keys_and_types_at_every_reset_and_step(contacts):
-    env = sw.WholeBodyFilter(gym.make("Walker2d-v5"), contacts, zmp_inset=0.01)
-    own = KEYS | ({"whole_body/zmp_margin", "whole_body/supported"} if contacts == "forecast" else set())
-    rng = np.random.default_rng(0)
-    infos = [env.reset(seed=0)[1]]
-    infos += [env.step(rng.uniform(-1, 1, 6).astype(np.float32))[4] for _ in range(15)]
-    infos.append(env.reset(seed=0)[1])
-    for info in infos:
-        assert {key for key in info if key.startswith("whole_body/")} == own
-        assert type(info["whole_body/contacts"]) is int
-        assert all(
-            type(info[key]) is float and np.isfinite(info[key]) for key in own - {"whole_body/contacts"}
-        )
-    for info in (infos[0], infos[-1]):
-        assert all(info[key] == 0 for key in own)
+        assert info["cbf/correction"] > 0.0
 
 
 def test_joints_stay_off_their_stops_at_every_evaluation():
@@ -167,44 +148,3 @@ def test_joints_stay_off_their_stops_at_every_evaluation():
             unflagged += far > 0.1 + 1e-6 and name == "filtered" and not (flagged(info) or info["cbf/unsafe"])
         counts[name] = outside, unflagged
     assert counts["filtered"][1] == 0 and counts["bare"][0] > counts["filtered"][0]
-
-
-def test_its_constraints_compose_in_one_projection():
-    limits = [
-        sw.constraints.ContactFeasibility(0.7),
-        sw.constraints.JointSpeedLimit(12.0, horizon=1),
-        sw.constraints.JointPositionLimit(-0.9, 1.4, margin=0.0, horizon=2),
-    ]
-    env = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), limits)
-    rng = np.random.default_rng(0)
-    env.reset(seed=0)
-    fast, changed, silent = 0.0, 0, 0
-    for _ in range(30):
-        info = env.step(rng.uniform(-1, 1, 6).astype(np.float32))[4]
-        changed += info["cbf/intervened"]
-        if not flagged(info) and not info["cbf/unsafe"]:
-            silent += 1
-            assert info["whole_body/cone_margin"] >= -0.01 - 1e-6
-            fast = max(fast, float(np.abs(env.unwrapped.data.qvel[3:9]).max()))
-    assert changed > 5 and silent > 5 and fast <= 12.0 + 1e-5
-
-
-@pytest.mark.parametrize("kind", ["ContactFeasibility", "SupportMargin", "Stance"])
-def test_two_that_would_write_the_same_report_are_refused(kind):
-    one = {"ContactFeasibility": sw.constraints.ContactFeasibility, "Stance": sw.constraints.Stance}.get(
-        kind, lambda: sw.constraints.SupportMargin(0.1)
-    )
-    with pytest.raises(ConfigurationError, match="2 times"):
-        sw.CBFActionFilter(gym.make("Hopper-v5"), [one(), one()])
-
-
-def test_a_delay_and_other_masses_are_the_plants_business():
-    heavy = sw.MujocoPlant(delay_s=0.008)
-    heavy.perturb(mass=1.5)
-    env = sw.WholeBodyFilter(gym.make("Walker2d-v5"), plant=heavy)
-    again = gym.make(env.spec)
-    assert again.plant is not env.plant and again.plant.delay_s == 0.008
-    assert again.plant.weight_n == env.plant.weight_n > 1.4 * 9.81 * env.unwrapped.model.body_mass.sum()
-    env.reset(seed=0)
-    for _ in range(5):
-        assert np.isfinite(env.step(env.action_space.sample())[4]["whole_body/cone_margin"])

@@ -101,8 +101,6 @@ class LearnerConfig(Section):
     """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
     """For the same: taken off per unit of correction."""
-    anchor: Literal["centre", "backup", "closest"] = "centre"
-    """For `safe_set_map`."""
     margin_curriculum: MarginCurriculumConfig | None = None
     """A margin that the arm's filter adds in training and that changes; see [its
     keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
@@ -127,8 +125,6 @@ class LearnerConfig(Section):
             raise ConfigurationError(
                 "multiplier_rate belongs to cost_limit: {cost_limit: 25, multiplier_rate: 0.001}."
             )
-        if self.anchor != LearnerConfig.anchor and not self.maps:
-            raise ConfigurationError(f"{self.kind} takes no anchor; safe_set_map does.")
         return self
 
     @property
@@ -177,8 +173,8 @@ class FilterConfig(Section):
     """Further arguments of the factory."""
     lease: Annotated[Options | None, with_keys(arguments(LeaseExpiry, "plant", "measured"))] = None
     """Arguments of a [LeaseExpiry](wrappers/late-commands.md#leaseexpiry) around the filter."""
-    escape: Annotated[Options | None, with_keys(arguments(StuckEscape, "value"))] = None
-    """Arguments of a [StuckEscape](wrappers/learner.md#stuckescape) around the filter, but for `value`."""
+    escape: Annotated[Options | None, with_keys(arguments(StuckEscape))] = None
+    """Arguments of a [StuckEscape](wrappers/learner.md#stuckescape) around the filter."""
 
     @model_validator(mode="before")
     @classmethod

@@ -93,7 +93,7 @@ def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], A
         return ["x (m)", "y (m)", *nearest], lambda _: _from_above(task, hazards)
     if hasattr(task, "model") and hasattr(task, "data"):
         model = task.model
-        hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+        hinge = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
         turning = model.jnt_qposadr[hinge & (model.jnt_limited == 0)]
 
         def joints(_: Any) -> Array:

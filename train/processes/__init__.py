@@ -12,7 +12,7 @@ from typing import Any, Final
 from safe_wrappers.errors import SafeWrappersError
 
 Message = tuple[str, Any]
-"""`steps`, `figures`, `say`, or at last `end` with what stopped or killed it, "" for nothing."""
+"""`steps`, `say`, or at last `end` with what stopped or killed it, "" for nothing."""
 STOPPED: Final = "stopped"
 
 
@@ -42,7 +42,6 @@ class Progress:
 
     steps: Callable[[int], None]
     say: Callable[[str], None]
-    figures: Callable[[Mapping[str, str]], None] = lambda _: None
     stopping: Callable[[], bool] = lambda: False
 
 
@@ -65,7 +64,6 @@ def work(job: Job, tell: Callable[[Message], None], stopping: Callable[[], bool]
     progress = Progress(
         steps=lambda steps: tell(("steps", steps)),
         say=lambda text: tell(("say", text)),
-        figures=lambda figures: tell(("figures", dict(figures))),
         stopping=stopping,
     )
     try:

@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import Progress, TaskID, TextColumn
+from rich.progress import Progress, TaskID
 
 from . import STOPPED, Interrupted, Job, Message, RunsFailedError, environment, work
 
@@ -81,7 +81,7 @@ def run_jobs(
                 elif kind == "say":
                     shown.say(f"{name}: {told}")
                 else:
-                    shown.update(name, kind, told)
+                    shown.steps(name, told)
             shown.tick()
             if signals and wait_until == float("inf"):
                 wait_until = time.monotonic() + _SAVE_S
@@ -135,22 +135,17 @@ class _Shown:
     """A bar for each running job on a terminal; now and then a line for each in a file or a pipe."""
 
     def __init__(self, console: Console) -> None:
-        columns = (*Progress.get_default_columns(), TextColumn("{task.fields[figures]}"))
-        self.bars = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self.bars = Progress(console=console, transient=True, disable=not console.is_terminal)
         self._tasks: dict[str, TaskID] = {}
         self._said_at = time.monotonic()
 
     def start(self, job: Job) -> None:
-        self._tasks[job.name] = self.bars.add_task(job.name, total=job.total, figures="")
+        self._tasks[job.name] = self.bars.add_task(job.name, total=job.total)
         if not self.bars.console.is_terminal:
             self.say(f"{job.name}: started ({job.total:,} {job.unit})")
 
-    def update(self, name: str, kind: str, told: Any) -> None:
-        """A job's `steps` or `figures`."""
-        if kind == "steps":
-            self.bars.update(self._tasks[name], completed=told)
-        else:
-            self.bars.update(self._tasks[name], figures=", ".join(f"{key} {told[key]}" for key in told))
+    def steps(self, name: str, done: int) -> None:
+        self.bars.update(self._tasks[name], completed=done)
 
     def end(self, name: str, how: str) -> None:
         self.bars.remove_task(self._tasks.pop(name))
@@ -164,7 +159,7 @@ class _Shown:
         if not self.bars.console.is_terminal and time.monotonic() - self._said_at > _LINES_S:
             self._said_at = time.monotonic()
             for task in self.bars.tasks:
-                self.say(f"  {task.description}: {task.percentage:.0f} % {task.fields['figures']}".rstrip())
+                self.say(f"  {task.description}: {task.percentage:.0f} %")
 
 
 _here: dict[str, Any] = {}

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from safe_wrappers import info as keys
@@ -44,44 +42,21 @@ class EpisodeRows(BaseCallback):
 
 
 class ProgressCallback(BaseCallback):
-    """Reports the step count, and the return and the share of changed steps over the last 100 episodes.
-
-    At most twice a second. `violations` are the steps in violation of this process's episodes, or "not judged".
-    """
+    """Reports the step count, at most twice a second."""
 
     def __init__(self, progress: Progress) -> None:
         super().__init__()
         self.progress = progress
         self._next = 0.0
-        self._episodes: deque[Mapping[str, Any]] = deque(maxlen=100)
-        self._violations: int | None = None
 
     def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
-            if keys.EPISODE_SUMMARY in info:
-                self._episodes.append(info[keys.EPISODE_SUMMARY])
-                if keys.COST in info or keys.COST_SUBSTEP in info:
-                    self._violations = (self._violations or 0) + info[keys.EPISODE_SUMMARY]["violations"]
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + 0.5
             self.progress.steps(self.num_timesteps)
-            if self._episodes:
-                self.progress.figures(self._figures())
         return True
 
     def _on_training_end(self) -> None:
         self.progress.steps(self.num_timesteps)
-
-    def _figures(self) -> dict[str, str]:
-        values = {
-            "return": f"{np.mean([episode['return'] for episode in self._episodes]):.1f}",
-            "violations": "not judged" if self._violations is None else f"{self._violations:,}",
-        }
-        if all("intervention_rate" in episode for episode in self._episodes):
-            steps = sum(episode["length"] for episode in self._episodes)
-            changed = sum(episode["intervention_rate"] * episode["length"] for episode in self._episodes)
-            values["changed"] = f"{100 * changed / steps:.1f} %"
-        return values
 
 
 class CheckpointCallback(BaseCallback):

@@ -118,7 +118,7 @@ def make_stack(
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
     if learner.maps and action_filter.kind != "none":
-        task = sw.SafeActionMap(task, learner.anchor)
+        task = sw.SafeActionMap(task)
     if observed is not None:
         task = _with_features(task, observed)
     if action_filter.escape is not None:
@@ -126,7 +126,7 @@ def make_stack(
     recorded: gym.Env[Any, Any] = sw.RecordInterventions(task)
     for name, arguments in env.faults.items():
         recorded = _called(f"env.faults.{name}", FAULTS[name], recorded, arguments)
-    monitored = Monitor(recorded, info_keywords=keys.RUNNING)
+    monitored = Monitor(recorded)
     return sw.AdaptionPenalty(monitored, **learner.penalties) if learner.penalised else monitored
 
 

@@ -68,7 +68,7 @@ class InSight(gym.Wrapper[Any, Any, Any, Any]):
             viewer.scn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
             root = robot_root(renderer.model)
             if root is not None:
-                viewer.cam.type, viewer.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, root
+                viewer.cam.type, viewer.cam.trackbodyid = int(mujoco.mjtCamera.mjCAMERA_TRACKING), root
         return self.env.render()
 
 

@@ -29,14 +29,11 @@ class Motion(NamedTuple):
         intensity: Of the acceleration noise, q, shape (d, d), m^2/s^3.
         reversion_s: Time constant with which the velocity reverts to its mean, s; inf for none.
         mean_velocity: Shape (d,), m/s.
-        turn_noise: Of a velocity that turns at a rate of its own, intensity of the white noise in that rate's
-            derivative, rad^2/s^3; None for one that does not turn. See `turning_tracks`.
     """
 
     intensity: Array
     reversion_s: float
     mean_velocity: Array
-    turn_noise: float | None = None
 
     def matrices(self) -> tuple[Array, Array, Array]:
         """A (2d, 2d), the constant drift b (2d,) and the noise intensity Q (2d, 2d) of `x' = A x + b + w`."""

@@ -6,17 +6,16 @@ Source: appendix "Smooth Trajectories and Bumpless Transfer": matched ends say n
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
 from safe_wrappers.checks import Array, positive
-from safe_wrappers.control.handover.blend_curves import BlendCurve, Motion
-from safe_wrappers.control.handover.interior import knot_torque_step
+from safe_wrappers.control.handover.curves import BlendCurve, Motion, knot_torque_step
 from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE
 from safe_wrappers.errors import ConfigurationError
 
-Entries = float | Sequence[float | None] | None
+Entries = float | Sequence[float] | None
 Inertia = Callable[[Array], Array]
 """Of joint positions, shape (k, m): their inertia matrices, shape (k, m, m), kg m^2."""
 Torques = Callable[[Motion], Array]
@@ -29,10 +28,7 @@ _UNITS: Final = {
     "torque": "N m",
     "torque_slew": "N m/s",
 }
-_DERIVATIVES: Final = {
-    "position": {"velocity": 1, "acceleration": 2, "jerk": 3},
-    "torque": {"torque": 0, "torque_slew": 1},
-}
+_DERIVATIVES: Final = {"velocity": 1, "acceleration": 2, "jerk": 3}
 _SMOOTHSTEP_PEAKS: Final = (1.0, SMOOTHSTEP_PEAK_RATE, 10.0 / math.sqrt(3.0), 60.0)
 """Largest magnitude of the smoothstep and its derivatives."""
 _ROUNDING: Final = 1.0 + 1e-9
@@ -42,20 +38,18 @@ _ROUNDING: Final = 1.0 + 1e-9
 class SeamLimits:
     """What a machine was measured to bear, for `ChunkHandover(limits=)`; what is None is not judged.
 
-    Each is one number for all entries of a command, or one for each of them, None for those that are not judged.
+    Each is one number for all entries of a command, or one for each of them.
 
     Attributes:
-        velocity: Of a position command, action units per s.
-        acceleration: Of a position command, action units per s^2.
-        jerk: Of a position command, action units per s^3.
-        torque: N m. Of a torque command itself; of a position command that which its joint needs, by inverse dynamics
-            of the env's MuJoCo model.
+        velocity: Action units per s.
+        acceleration: Action units per s^2.
+        jerk: Action units per s^3.
+        torque: Of commands that are positions of joints: that which the joint needs, by inverse dynamics of the env's
+            MuJoCo model, N m.
         torque_slew: N m/s, likewise.
-        command: What a command is: "position" or "torque".
-        max_blend_time: s, of a blend; None: the rest of the chunk.
 
     Raises:
-        ConfigurationError: A limit that is not positive, one that the command has not, or none at all.
+        ConfigurationError: A limit that is not positive, or none at all.
     """
 
     velocity: Entries = None
@@ -63,40 +57,27 @@ class SeamLimits:
     jerk: Entries = None
     torque: Entries = None
     torque_slew: Entries = None
-    command: Literal["position", "torque"] = "position"
-    max_blend_time: float | None = None
 
     def __post_init__(self) -> None:
-        if self.command not in _DERIVATIVES:
-            raise ConfigurationError(f'command is "position" or "torque", got {self.command!r}')
         for name, unit in _UNITS.items():
             object.__setattr__(self, name, _entries(f"limits.{name}", getattr(self, name), unit))
-        given = [name for name in _UNITS if getattr(self, name) is not None]
-        if not given:
+        if all(getattr(self, name) is None for name in _UNITS):
             raise ConfigurationError(f"limits has none; it takes {', '.join(_UNITS)}")
-        others = [name for name in given if name not in _DERIVATIVES["torque"]]
-        if self.command == "torque" and others:
-            raise ConfigurationError(
-                f"limits.{others[0]} is of a position, and the command is a torque: limit its torque_slew"
-            )
-        if self.max_blend_time is not None:
-            longest = positive("limits.max_blend_time", self.max_blend_time, "s")
-            object.__setattr__(self, "max_blend_time", longest)
 
     def of(self, name: str, controls: int) -> Array | None:
-        """A limit for each entry of a command, shape (controls,), infinite where it is not judged; None for none."""
+        """A limit for each entry of a command, shape (controls,); None for none."""
         value = getattr(self, name)
         if value is None:
             return None
         each = value if isinstance(value, tuple) else (value,) * controls
         if len(each) != controls:
             raise ConfigurationError(f"limits.{name} has {len(each)} entries, a command {controls}")
-        return np.array([math.inf if one is None else one for one in each])
+        return np.array(each)
 
     @property
     def needs_dynamics(self) -> bool:
         """Whether torques are limited that only a model can tell."""
-        return self.command == "position" and (self.torque is not None or self.torque_slew is not None)
+        return self.torque is not None or self.torque_slew is not None
 
 
 class SeamCheck:
@@ -120,18 +101,14 @@ class SeamCheck:
     ) -> None:
         self._control_dt, self._torques, self._inertia = control_dt, torques, inertia
         every = {name: limits.of(name, controls) for name in _UNITS}
-        found = {d: every[name] for name, d in _DERIVATIVES[limits.command].items()}
+        found = {d: every[name] for name, d in _DERIVATIVES.items()}
         self._bounds: Mapping[int, Array] = {d: bound for d, bound in found.items() if bound is not None}
         none = np.full(controls, math.inf)
         self._torque = none if every["torque"] is None else every["torque"]
         self._slew = none if every["torque_slew"] is None else every["torque_slew"]
-        longest = math.inf if limits.max_blend_time is None else limits.max_blend_time
-        self._most_steps = longest / control_dt * _ROUNDING - 1.0
 
     def accepts(self, blend: Any, sent: Array, prior: Array, new: Array, steps: int) -> bool:
         """Whether a blend of `seams.join` that mixes `steps` commands keeps all limits up to its end."""
-        if steps > max(self._most_steps, 0.0):
-            return False
         curve = BlendCurve.of(blend, sent, prior, new, steps, self._control_dt)
         if any((curve.peak(d) > bound * _ROUNDING).any() for d, bound in self._bounds.items()):
             return False
@@ -141,15 +118,13 @@ class SeamCheck:
         """Whether the torque steps at a cubic spline's knots, M times the acceleration's, keep the torque's slew.
 
         Args:
-            knots: Positions, shape (k, m); their rates are central differences.
+            knots: Positions, shape (k, m).
             spacing: From one to the next, s.
         """
         if self._inertia is None or len(knots) < 3:
             return True
-        times = spacing * np.arange(len(knots))
-        rates = np.gradient(knots, spacing, axis=0)
-        steps = knot_torque_step(self._inertia(knots[1:-1]), times, knots.T, rates.T)
-        return bool((self._slew * self._control_dt * _ROUNDING >= np.abs(steps).T).all())
+        steps = knot_torque_step(self._inertia(knots[1:-1]), spacing, knots)
+        return bool((self._slew * self._control_dt * _ROUNDING >= np.abs(steps)).all())
 
     def shortest_fade(self, change: Array) -> float:
         """Duration of the shortest smoothstep between two held commands, s: `peak |change| / T^d` within each limit.
@@ -157,9 +132,7 @@ class SeamCheck:
         Args:
             change: |u_new - u_prior|, shape (m,). A torque that inverse dynamics would tell is not asked for.
         """
-        spans = [
-            (_SMOOTHSTEP_PEAKS[d] * change / bound) ** (1.0 / d) for d, bound in self._bounds.items() if d > 0
-        ]
+        spans = [(_SMOOTHSTEP_PEAKS[d] * change / bound) ** (1.0 / d) for d, bound in self._bounds.items()]
         return float(np.max(spans, initial=0.0))
 
     def _bears(self, motion: Motion, torques: Torques) -> bool:
@@ -169,9 +142,9 @@ class SeamCheck:
         return bool((np.abs(torque) <= self._torque * _ROUNDING).all() and slow.all())
 
 
-def _entries(name: str, value: Any, unit: str) -> float | tuple[float | None, ...] | None:
+def _entries(name: str, value: Any, unit: str) -> float | tuple[float, ...] | None:
     if value is None:
         return None
     if isinstance(value, list | tuple | np.ndarray):
-        return tuple(None if one is None else positive(name, one, unit) for one in value)
+        return tuple(positive(name, one, unit) for one in value)
     return positive(name, value, unit)

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.handover.smoothstep import smoothstep
-from safe_wrappers.control.handover.splines import hermite_at, quintic_coefficients, value
 
-Blend = Literal["smoothstep", "quintic", "hermite"]
-BLENDS: Final = ("smoothstep", "quintic", "hermite")
+Blend = Literal["smoothstep", "quintic"]
+BLENDS: Final = ("smoothstep", "quintic")
 
 DIFFERENCES: Final = 3
 """Orders of differences by which seams are measured: first, second, third."""
@@ -33,13 +32,11 @@ class Seam:
         plan: The commands from the seam on, shape (n, m): the blend, then the new stream bit for bit.
         steps: Control steps of the blend: the first `steps` commands are mixed.
         limited: Which commands were rate-limited in addition to the blend, shape (n,).
-        stretched: A shorter blend keeps the rate limit and was not accepted.
     """
 
     plan: Array
     steps: int
     limited: NDArray[np.bool_]
-    stretched: bool = False
 
 
 def join(
@@ -59,8 +56,8 @@ def join(
     """The shortest blend from what was sent into a new stream that keeps the rate limit.
 
     "smoothstep" mixes the two streams, the prior one held at the last command unless it lasts for the whole blend.
-    "quintic" and "hermite" bridge from the last command to the new stream with matching first (and, for quintic,
-    second) derivatives at both ends, clipped to the box. If no blend that ends inside the new stream keeps the limit,
+    "quintic" bridges from the last command to the new stream with matching first and second derivatives at both ends,
+    clipped to the box. If no blend that ends inside the new stream keeps the limit,
     the one that exceeds it least is rate-limited step by step.
 
     Args:
@@ -71,7 +68,7 @@ def join(
         blend: See above.
         fewest: Least number of steps of the blend (fewer only if the new stream is shorter).
         rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
-        low: Action box, for the bridges, shape (m,) or a number.
+        low: Action box, for the bridge, shape (m,) or a number.
         high: Likewise.
         accepts: Whether a blend of so many steps will do, 0 for none, asked from the shortest on of those that keep
             the rate limit and that the box does not cut. If none will do, the result is None.
@@ -91,7 +88,7 @@ def join(
         if blend == "smoothstep":
             candidates = _mixed(sent, prior, new, first)
         else:
-            bridges = _bridged(sent, new, blend, first)
+            bridges = _bridged(sent, new, first)
             candidates = np.clip(bridges, low, high)
             uncut = np.asarray(np.isclose(bridges, candidates, rtol=1e-9, atol=1e-12).all(axis=(1, 2)))
     peaks = _peaks(candidates, sent[-1], first, step)
@@ -104,7 +101,7 @@ def join(
     steps = first + chosen
     plan = np.concatenate([candidates[chosen, :steps], new[steps:]])
     plan, limited = limit_rate(plan, sent[-1], held)
-    return Seam(plan, steps, limited, stretched=bool(kept.size and chosen > kept[0]))
+    return Seam(plan, steps, limited)
 
 
 def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
@@ -158,16 +155,13 @@ def _weights(first: int, longest: int) -> Array:
 
 
 @lru_cache(maxsize=256)
-def _basis(order: int, first: int, longest: int) -> Array:
-    """Contribution of each boundary value of a bridge of unit duration at every step, (c, longest + 1, 2 order)."""
-    unit = np.eye(2 * order)
-    phases = np.array([_phases(n, longest) for n in range(first, longest + 1)])[:, :, None]
-    if order == 2:
-        q0, v0, q1, v1 = unit
-        weights = hermite_at((q0, v0, q1, v1), np.ones(()), phases, 0)
-    else:
-        q0, v0, a0, q1, v1, a1 = unit
-        weights = value(quintic_coefficients(q0, v0, a0, q1, v1, a1, 1.0), phases)
+def _basis(first: int, longest: int) -> Array:
+    """Contribution of each boundary value of a quintic of unit duration at every step, (c, longest + 1, 6)."""
+    from scipy.interpolate import BPoly  # here: SciPy takes a while to import
+
+    unit = np.eye(6)
+    phases = np.array([_phases(n, longest) for n in range(first, longest + 1)])
+    weights = np.asarray(BPoly.from_derivatives([0.0, 1.0], [unit[:3], unit[3:]])(phases))
     weights.flags.writeable = False
     return weights
 
@@ -182,16 +176,15 @@ def _mixed(sent: Array, prior: Array, new: Array, first: int) -> Array:
     return np.asarray(np.where(weight < 1.0, before + weight * (new - before), new))
 
 
-def _bridged(sent: Array, new: Array, blend: Blend, first: int) -> Array:
+def _bridged(sent: Array, new: Array, first: int) -> Array:
     """Every candidate bridge, shape (c, n, m). Derivatives are per control step: n steps last n + 1 of them."""
     n = len(new)
     ends = np.arange(first, n)
-    order = 2 if blend == "hermite" else 3
-    at_start, at_end = backward_differences(sent, order), stream_derivatives(new)
+    at_start, at_end = backward_differences(sent, 3), stream_derivatives(new)
     lasts = (ends + 1.0)[:, None]
     given = [np.broadcast_to(d, (len(ends), d.size)) * lasts**k for k, d in enumerate(at_start)]
-    given += [d[ends] * lasts**k for k, d in enumerate(at_end[:order])]
-    bridged = _basis(order, first, n - 1) @ np.stack(given, axis=1)
+    given += [d[ends] * lasts**k for k, d in enumerate(at_end)]
+    bridged = _basis(first, n - 1) @ np.stack(given, axis=1)
     return np.asarray(np.where((np.arange(n) < ends[:, None])[:, :, None], bridged, new))
 
 

@@ -17,29 +17,12 @@ ROUND_UP = 1.0 + 1e-12
 """Blend times are lengthened by this factor, so that rounding never makes them too short."""
 
 
-def check_positive(name: str, values: Array) -> None:
-    """Refuse values that are not all > 0."""
-    if not (values > 0.0).all():
-        raise ConfigurationError(f"{name} must be > 0, got {values}")
-
-
-def smoothstep(s: ArrayLike, derivative: int = 0) -> Array:
-    """alpha(s) = 6 s^5 - 15 s^4 + 10 s^3 for s in [0, 1], 0 before it and 1 after it; or its derivative by s.
-
-    Args:
-        s: Normalised time, any shape.
-        derivative: 0, 1 or 2.
-    """
+def smoothstep(s: ArrayLike) -> Array:
+    """alpha(s) = 6 s^5 - 15 s^4 + 10 s^3 for s in [0, 1], 0 before it and 1 after it, of any shape."""
     s = np.clip(np.asarray(s, dtype=np.float64), 0.0, 1.0)
-    if derivative == 0:
-        near = np.minimum(s, 1.0 - s)  # alpha(1 - s) = 1 - alpha(s): the half without cancellation
-        half = near**3 * (near * (6.0 * near - 15.0) + 10.0)
-        return np.asarray(np.where(s <= 0.5, half, 1.0 - half))
-    if derivative == 1:
-        return np.asarray(30.0 * (s * (1.0 - s)) ** 2)
-    if derivative == 2:
-        return np.asarray(60.0 * s * (1.0 - s) * (1.0 - 2.0 * s))
-    raise ConfigurationError(f"derivative of the smoothstep is 0, 1 or 2, got {derivative!r}")
+    near = np.minimum(s, 1.0 - s)  # alpha(1 - s) = 1 - alpha(s): the half without cancellation
+    half = near**3 * (near * (6.0 * near - 15.0) + 10.0)
+    return np.asarray(np.where(s <= 0.5, half, 1.0 - half))
 
 
 def shortest_latched_blend(step: ArrayLike, rate_limit: ArrayLike) -> Array:
@@ -49,5 +32,6 @@ def shortest_latched_blend(step: ArrayLike, rate_limit: ArrayLike) -> Array:
         ConfigurationError: For a limit that is not positive, or input that is not finite.
     """
     step, limit = finite_arrays(step=step, rate_limit=rate_limit)
-    check_positive("rate_limit", limit)
+    if not (limit > 0.0).all():
+        raise ConfigurationError(f"rate_limit must be > 0, got {limit}")
     return np.asarray(SMOOTHSTEP_PEAK_RATE * np.abs(step) / limit * ROUND_UP)

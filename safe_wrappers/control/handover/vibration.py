@@ -42,20 +42,14 @@ def modes(inertia: Array, stiffness: Array, damping: Array) -> Modes:
     return Modes(omega, ratios, shapes)
 
 
-def smoothstep_share(phase: ArrayLike, cut_short: bool = False) -> Array:
-    """Most that a smoothstep leaves, s = 10 x^3 - 15 x^4 + 6 x^5, x = t / T.
+def smoothstep_share(phase: ArrayLike) -> Array:
+    """Most that a smoothstep leaves, s = 10 x^3 - 15 x^4 + 6 x^5, x = t / T, at a phase w T, rad.
 
-    At its end the integral is 15 j2(k) / k^2 with k = w T / 2 and the spherical Bessel function j2, which stays below
-    sqrt(1 + 3/k^2 + 9/k^4) / k. Stopped on its way, a change whose rate rises once and falls once leaves at most
-    2 max(s') / w, by parts: 3.75 / (w T) here.
-
-    Args:
-        phase: w T, rad.
-        cut_short: Bound it for a change that may stop anywhere on its way, where its rate is not zero.
+    The integral is 15 j2(k) / k^2 with k = w T / 2 and the spherical Bessel function j2, which stays below
+    sqrt(1 + 3/k^2 + 9/k^4) / k.
     """
     k = np.asarray(phase, dtype=np.float64) / 2.0
-    share = 1.875 / k if cut_short else 15.0 / k**3 * np.sqrt(1.0 + 3.0 / k**2 + 9.0 / k**4)
-    return np.asarray(np.minimum(1.0, share) ** 2)
+    return np.asarray(np.minimum(1.0, 15.0 / k**3 * np.sqrt(1.0 + 3.0 / k**2 + 9.0 / k**4)) ** 2)
 
 
 def shortest_smoothstep(share: float, resonance: float) -> float:

@@ -5,7 +5,6 @@ rad/s); their product is power. A channel is passive when no more energy comes o
 went in; the wave transform keeps that for a *fixed* delay only. A sum of samples is the integral only if one of the
 two is held over the interval and the other is its mean; a product of two samples is an estimate.
 
-Efforts, flows and waves are numbers or arrays of shape (m,); functions without memory also take batch axes, (..., m).
 What is not finite raises `ConfigurationError`.
 """
 
@@ -15,17 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array
-from safe_wrappers.control.teleop.port_checks import (
-    RunningSum,
-    energy_j,
-    port_energy,
-    port_vectors,
-    positive,
-    same_shape,
-)
-
-_EPS = float(np.finfo(np.float64).eps)
+from safe_wrappers.checks import Array, finite_array, float_array, positive
+from safe_wrappers.errors import ConfigurationError
 
 
 class Waves(NamedTuple):
@@ -52,8 +42,8 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
         flow: v, m/s, of the same shape, positive together with F into the component that u goes into.
         impedance: b > 0, N s/m.
     """
-    f, v = same_shape(effort=effort, flow=flow)
-    b = positive("impedance", impedance)
+    f, v = _of_one_shape(effort=effort, flow=flow)
+    b = positive("impedance", impedance, "N s/m")
     root = math.sqrt(2.0 * b)
     return Waves(np.asarray((f + b * v) / root), np.asarray((f - b * v) / root))
 
@@ -66,8 +56,8 @@ def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) 
         incoming: w, sqrt(W), of the same shape.
         impedance: b > 0, N s/m.
     """
-    v, w = same_shape(flow=flow, incoming=incoming)
-    b = positive("impedance", impedance)
+    v, w = _of_one_shape(flow=flow, incoming=incoming)
+    b = positive("impedance", impedance, "N s/m")
     root = math.sqrt(2.0 * b)
     return EffortAndWave(np.asarray(b * v + root * w), np.asarray(root * v + w))
 
@@ -77,14 +67,13 @@ class ChannelLedger:
 
     F.v is positive into the channel at the port m (the operator's), and out of it at s (the remote one).
 
-    Args:
-        initial_storage_j: E_ch(0), or a bound on it, at least 0 J.
+    Attributes:
+        net_j: Integral of P_m - P_s, J: net energy into the channel.
+        created_j: Largest excess so far of energy out (or in flight) over energy in, J; 0 is passive.
     """
 
-    def __init__(self, initial_storage_j: float = 0.0) -> None:
-        self._initial = energy_j("initial_storage_j", initial_storage_j)
-        self._net = RunningSum()
-        self._created = self._rounding = 0.0
+    def __init__(self) -> None:
+        self.net_j = self.created_j = 0.0
 
     def add(
         self,
@@ -93,40 +82,45 @@ class ChannelLedger:
         effort_s: ArrayLike,
         flow_s: ArrayLike,
         time_s: float,
-        stored_j: float | None = None,
+        stored_j: float = 0.0,
     ) -> None:
         """Account one interval of `time_s` > 0.
 
         Efforts (N) and flows (m/s) at the operator's port m and the remote port s are numbers, or of shape (m,) at
-        each port. `stored_j` is the energy in flight at its end, if known, at least 0; None counts as 0.
+        each port. `stored_j` is the energy in flight at its end, as far as it is known.
         """
-        f_m, v_m = port_vectors(effort_m=effort_m, flow_m=flow_m)
-        f_s, v_s = port_vectors(effort_s=effort_s, flow_s=flow_s)
-        effort, flow = np.concatenate([f_m, -f_s]), np.concatenate([v_m, v_s])
-        time = positive("time_s", time_s)
-        stored = 0.0 if stored_j is None else energy_j("stored_j", stored_j)
-        self._net.add(port_energy(effort, flow, time))
-        # The storage is computed from waves that are rounded at every step, so its rounding counts each time.
-        exchanged = float(np.abs(effort) @ np.abs(flow)) * time
-        self._rounding += (effort.size + 4) * _EPS * (exchanged + stored)
-        self._created = max(self._created, stored - self._net.value - self._initial)
+        into = port_energy(port_vector("effort_m", effort_m), port_vector("flow_m", flow_m), time_s)
+        out = port_energy(port_vector("effort_s", effort_s), port_vector("flow_s", flow_s), time_s)
+        self.net_j += into - out
+        self.created_j = max(self.created_j, stored_j - self.net_j)
 
-    @property
-    def net_j(self) -> float:
-        """Integral of P_m - P_s, J: net energy into the channel."""
-        return self._net.value
 
-    @property
-    def stored_j(self) -> float:
-        """Largest possible energy in the channel now, `E_ch(0) + net`, J; below 0: not passive."""
-        return self._initial + self._net.value
+def port_vector(name: str, value: ArrayLike) -> Array:
+    """One quantity of a port as (m,); a number is (1,). `port_energy` checks that it is finite."""
+    vector = float_array(name, value)
+    if vector.ndim > 1 or vector.size == 0:
+        raise ConfigurationError(f"expected {name} as a number or of shape (m,), got {vector.shape}")
+    return vector.reshape(-1)
 
-    @property
-    def created_j(self) -> float:
-        """Largest excess so far of energy out (or in flight) over energy in and initial storage, J."""
-        return self._created
 
-    @property
-    def passive(self) -> bool:
-        """Whether it has created no energy so far, to rounding."""
-        return self._created <= self._rounding + 4.0 * _EPS * self._initial
+def port_energy(effort: Array, flow: Array, time_s: float) -> float:
+    """`F.v dt`, J, of effort and flow (m,); a product that is not finite is refused."""
+    if effort.shape != flow.shape:
+        raise ConfigurationError(
+            f"effort and flow of a port have one shape, got {effort.shape} and {flow.shape}"
+        )
+    # The product is checked instead of both factors, which saves time at every tick.
+    with np.errstate(over="ignore", invalid="ignore"):
+        energy = float(effort @ flow) * time_s
+    if not math.isfinite(energy):
+        raise ConfigurationError(f"effort, flow and so their product must be finite; got {effort}, {flow}")
+    return energy
+
+
+def _of_one_shape(**values: ArrayLike) -> tuple[Array, Array]:
+    """Two finite arrays, without broadcasting."""
+    first, second = (finite_array(name, value) for name, value in values.items())
+    if first.shape != second.shape:
+        a, b = values
+        raise ConfigurationError(f"expected {a} and {b} of one shape, got {first.shape} and {second.shape}")
+    return first, second

@@ -8,11 +8,6 @@ fit into the clearance:
 
 In the appendix the machine keeps its speed until it brakes; with `acceleration` it may speed up until then. A lease
 of zero or less means: revoke now. Rounding only shortens a lease, and inputs that are not finite revoke.
-
-With a limited jerk (appendix "Trajectory transit time and reachable distance") the stop is a suffix of its own: the
-acceleration is wound down first, then the braking is built up, and taken back until the machine stands. From u and no
-acceleration that takes `2 sqrt(u / j)` where the full braking b is not reached, else `u / b + b / j`, at u / 2 in the
-mean. Adding b / j to the delays instead would be wrong on either side of that.
 """
 
 import math
@@ -27,8 +22,6 @@ _ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
 """Relative bound on the accumulated rounding of the formulas below."""
 _TINY = 1e-300
 """Absolute reserve for subnormal numbers, whose relative precision is lost."""
-_HALVINGS = 64
-"""Of an interval of times, down to its rounding."""
 _LONGEST = 1e300
 """s; largest finite lease, so that nothing overflows."""
 
@@ -42,7 +35,6 @@ def longest_lease(
     margin: ArrayLike = 0.0,
     acceleration: ArrayLike = 0.0,
     top_speed: ArrayLike = np.inf,
-    jerk: ArrayLike = np.inf,
 ) -> Array:
     """The longest T_lease, s, shape (...), after which a machine without renewal still stops inside the clearance.
 
@@ -50,9 +42,6 @@ def longest_lease(
     `v tau + a tau^2 / 2`, the stopping distance `(v + a tau)^2 / (2 b)`. inf for a machine that recedes or stands
     still, cannot accelerate and has room left; -inf where an input (but `top_speed`) is not finite, where the braking
     is not positive, and where a machine that does not approach has no room left. Never NaN.
-
-    With a finite `jerk` the stop is a profile of limited jerk from `v + a tau` and a (`jerk_limited_stop`), and the
-    lease is so long that one fits from every moment until its end; -inf where none fits that begins at once.
 
     Args:
         clearance: D_clear as measured `age` ago, m, shape (...).
@@ -64,16 +53,15 @@ def longest_lease(
         acceleration: Largest approach acceleration that any command may cause until the brakes hold, m/s^2.
         top_speed: Bound on the approach speed that this acceleration may lead to, m/s; a measured speed above it
             counts as the bound. inf: none.
-        jerk: Verified lower bound on how fast the brakes change the deceleration, m/s^3; inf: at once.
 
     Raises:
-        ConfigurationError: For a negative delay, localisation bound, margin, acceleration, top speed or jerk.
+        ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
     """
-    given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed, jerk)
+    given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
     # Scalar arithmetic: for the few leases of a control step it is faster than arrays.
     several = np.broadcast(*(np.asarray(x, dtype=np.float64) for x in given))
     _not_negative(delays_s=delays_s, localisation=localisation, margin=margin)
-    _not_negative(acceleration=acceleration, top_speed=top_speed, jerk=jerk)
+    _not_negative(acceleration=acceleration, top_speed=top_speed)
     return np.array([_lease_or_none(*map(float, one)) for one in several]).reshape(several.shape)
 
 
@@ -84,15 +72,11 @@ def _lease_or_none(*machine: float) -> float:
         return -math.inf
 
 
-def _lease(
-    d: float, v: float, b: float, late: float, loc: float, gap: float, a: float, top: float, jerk: float
-) -> float:
+def _lease(d: float, v: float, b: float, late: float, loc: float, gap: float, a: float, top: float) -> float:
     """`longest_lease` of one machine."""
-    if not (all(map(math.isfinite, (d, v, b, late, loc, gap, a))) and b > 0.0) or math.isnan(top + jerk):
+    if not (all(map(math.isfinite, (d, v, b, late, loc, gap, a))) and b > 0.0) or math.isnan(top):
         return -math.inf
     top = max(top, v)
-    if jerk < math.inf:
-        return _lease_by_jerk(d - loc - gap - _ROUNDING * (abs(d) + loc + gap), v, b, late, a, top, jerk)
     braking_way = max(v, 0.0) * max(v, 0.0) / (2.0 * b)
     room = d - loc - gap
     room -= _ROUNDING * (abs(d) + loc + gap + braking_way)
@@ -119,63 +103,6 @@ def _lease(
     return -math.inf if math.isnan(lease) else lease
 
 
-def _lease_by_jerk(room: float, v: float, b: float, late: float, a: float, top: float, jerk: float) -> float:
-    """`longest_lease` with limited jerk, by halving: what is used is convex in the time, and fits at its start."""
-    if jerk == 0.0:
-        return -math.inf
-
-    def fits(tau: float) -> bool:
-        rising = tau if a == 0.0 else min(tau, (top - v) / a)
-        onset = v if a == 0.0 else min(v + a * rising, top)
-        way = v * rising + 0.5 * a * rising * rising + (top * (tau - rising) if rising < tau else 0.0)
-        stop = jerk_limited_stop(onset, a, b, jerk, top)
-        sizes = abs(v) * rising + 0.5 * a * rising * rising + abs(stop)
-        return way + stop + 2.0 * _ROUNDING * sizes <= room
-
-    if not (room > 0.0 and fits(0.0)):
-        return -math.inf
-    if v <= 0.0 and (a == 0.0 or top == 0.0):
-        return math.inf
-    low, high = 0.0, 1.0
-    while high < _LONGEST and fits(high):
-        low, high = high, 2.0 * high
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low - late - _ROUNDING * (low + late) - _TINY
-
-
-def jerk_limited_stop(v: float, a: float, b: float, jerk: float, top: float = math.inf) -> float:
-    """The way of a stop with limited jerk, m, from a speed and an acceleration that is wound down first.
-
-    The shortest stop that ends without acceleration; below zero where the machine recedes by more than it comes
-    back, 0 where it does not come back at all.
-
-    Args:
-        v: Speed at the start, m/s, positive towards the obstacle.
-        a: Acceleration at the start, at least 0, m/s^2.
-        b: Largest deceleration, above 0, m/s^2.
-        jerk: Largest change of the acceleration, above 0, m/s^3; inf: none.
-        top: At this speed, at least v, the winding down no longer speeds up, m/s.
-    """
-    winding = a / jerk
-    highest = v + 0.5 * a * winding
-    if highest <= top:
-        rising = winding
-        way = winding * (v + a * winding / 3.0)
-    else:
-        # The top speed is reached before the acceleration is gone.
-        gain = top - v
-        rising = 2.0 * (gain / a) / (1.0 + math.sqrt(max(1.0 - 2.0 * (jerk / a) * (gain / a), 0.0)))
-        way = rising * (v + rising * (0.5 * a - jerk * rising / 6.0)) + top * (winding - rising)
-        highest = top
-    if highest <= 0.0:
-        return 0.0
-    time = 2.0 * math.sqrt(highest / jerk) if jerk * highest <= b * b else highest / b + b / jerk
-    total = way + 0.5 * highest * time
-    return math.inf if math.isnan(total) else total  # numbers that overflowed
-
-
 def round_trip_ceiling(
     clearance: ArrayLike,
     speed: ArrayLike,
@@ -185,9 +112,6 @@ def round_trip_ceiling(
     act_s: ArrayLike,
     localisation: ArrayLike = 0.0,
     margin: ArrayLike = 0.0,
-    acceleration: ArrayLike = 0.0,
-    top_speed: ArrayLike = np.inf,
-    jerk: ArrayLike = np.inf,
 ) -> Array:
     """The longest network round trip, s, shape (...), at which a remote operator can still stop the machine in time.
 
@@ -200,7 +124,7 @@ def round_trip_ceiling(
     video, human, act = (np.asarray(late, dtype=np.float64) for late in (video_s, human_s, act_s))
     with np.errstate(over="ignore"):
         late = video + human + act
-    return longest_lease(clearance, speed, braking, late, localisation, margin, acceleration, top_speed, jerk)
+    return longest_lease(clearance, speed, braking, late, localisation, margin)
 
 
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:

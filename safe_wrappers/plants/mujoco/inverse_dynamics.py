@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.handover.blend_curves import Motion
+from safe_wrappers.control.handover.curves import Motion
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
@@ -44,7 +44,7 @@ class InverseDynamics:
             if not (on_joint and gain > 0.0 and bias[1] == -gain and bias[0] == 0.0):
                 raise UnsupportedEnvError(
                     f"actuator {model.actuator(i).name or i!r} is no position servo of a hinge or slide, so its "
-                    'command tells no torque: limit velocity, acceleration and jerk, or say command="torque"'
+                    "command tells no torque: limit velocity, acceleration and jerk"
                 )
         joints = model.actuator_trnid[: model.nu, 0]
         self._at, self._dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]

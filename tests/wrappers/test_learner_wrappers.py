@@ -1,0 +1,325 @@
+"""Wrappers of a learner: repeated actions, penalties, what the filter shows, rewards of several objectives."""
+
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from worlds import Cart, SpeedRow, cart_plant
+
+import safe_wrappers as sw
+from safe_wrappers import info as keys
+
+sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
+from simulated_worlds import Cart as SimulatedCart
+
+
+def stack():
+    return sw.RecordInterventions(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=50)))
+
+
+def test_rewards_and_costs_are_summed_up_and_the_filter_checks_every_control_step():
+    repeated, single = sw.ActionRepeat(stack(), 4), stack()
+    layout = {"agent": [0, 0, 0], "hazards": [[0.4, 0.02]], "goal": [1.4, 0]}
+    for env in (repeated, single):
+        env.reset(seed=0, options={"layout": layout})
+    changed = 0
+    for decision in range(13):
+        action = np.array([1.0, 0.0], dtype=np.float32)
+        observation, reward, _, truncated, info = repeated.step(action)
+        steps = [single.step(action) for _ in range(4 if decision < 12 else 2)]
+        np.testing.assert_array_equal(observation, steps[-1][0])
+        assert reward == sum(step[1] for step in steps)
+        assert info[keys.CBF_INTERVENED] == any(step[4][keys.CBF_INTERVENED] for step in steps)
+        assert info[keys.CBF_CORRECTION] == max(step[4][keys.CBF_CORRECTION] for step in steps)
+        changed += info[keys.CBF_INTERVENED]
+        assert truncated == (decision == 12)
+    assert 0 < changed < 13
+    assert info[keys.EPISODE_SUMMARY] == steps[-1][4][keys.EPISODE_SUMMARY]
+    assert info[keys.EPISODE_SUMMARY]["length"] == 50
+
+
+def test_one_control_step_is_the_env_itself():
+    once, plain = sw.ActionRepeat(stack(), 1), stack()
+    once.reset(seed=2)
+    plain.reset(seed=2)
+    once.action_space.seed(2)
+    for _ in range(20):
+        action = once.action_space.sample()
+        here, there = once.step(action), plain.step(action)
+        np.testing.assert_array_equal(here[0], there[0])
+        assert here[1:4] == there[1:4]
+
+
+@pytest.mark.parametrize("repeat", [0, 2.5, "4"])
+def test_a_repeat_that_is_no_count_is_refused(repeat):
+    with pytest.raises(sw.SafeWrappersError, match="repeat"):
+        sw.ActionRepeat(stack(), repeat)
+
+
+LIMIT = 0.25
+"""The cart may not be faster; from rest at full throttle it gets there in 2.5 steps of 0.1 s."""
+
+
+class PaidCart(Cart):
+    """A cart that is paid its position, ten times over, less what its push costs."""
+
+    def step(self, action):
+        observation, _, terminated, truncated, info = super().step(action)
+        reward = 10.0 * self.state[0] - float(np.asarray(action)[0]) ** 2
+        return observation, reward, terminated, truncated, info
+
+
+def filtered(env=None):
+    return sw.CBFActionFilter(env or PaidCart(), [SpeedRow(LIMIT)], plant=cart_plant())
+
+
+def drive(env, steps=40, seed=0):
+    """Random pushes from rest: each push, the speed before it, and what the step returned."""
+    rng = np.random.default_rng(seed)
+    speed, seen = env.reset(seed=seed)[0][1], []
+    for push in rng.uniform(-0.2, 1.0, (steps, 1)).astype(np.float32):
+        step = env.step(push)
+        seen.append((push, speed, *step))
+        speed = step[0][1]
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("penalty", "per_correction"), [(0.5, 0.0), (0.0, 2.0), (0.5, 2.0), (np.float32(3), 0)]
+)
+def test_a_changed_step_costs_what_the_formula_says_and_no_other(penalty, per_correction):
+    penalised, plain = drive(sw.AdaptionPenalty(filtered(), penalty, per_correction)), drive(filtered())
+    changed = 0
+    for (push, speed, observation, reward, *_, info), (_, _, same, task, *_) in zip(
+        penalised, plain, strict=True
+    ):
+        # The filter in closed form: no push above the one that reaches the limit within this step.
+        correction = float(push[0]) - min(float(push[0]), (LIMIT - speed) / 0.1)
+        expected = penalty + per_correction * correction if correction > 0 else 0.0
+        changed += correction > 0
+        assert info[keys.ADAPTION_PENALTY] == pytest.approx(expected, abs=1e-6)
+        assert info[keys.ADAPTION_TASK_REWARD] == task
+        assert reward == task - info[keys.ADAPTION_PENALTY]
+        assert type(info[keys.ADAPTION_PENALTY]) is type(info[keys.ADAPTION_TASK_REWARD]) is float
+        np.testing.assert_array_equal(observation, same)
+    assert 5 < changed < 35
+
+
+def test_a_non_finite_action_costs_the_constant_and_a_finite_amount():
+    env = sw.AdaptionPenalty(filtered(), penalty=0.5, per_correction=2.0)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="not finite"):
+        _, reward, _, _, info = env.step(np.array([np.nan], np.float32))
+    assert info[keys.CBF_INTERVENED] and info[keys.CBF_NONFINITE]
+    assert info[keys.ADAPTION_PENALTY] == 0.5 + 2.0 * info[keys.CBF_CORRECTION]
+    assert np.isfinite(reward)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: sw.AdaptionPenalty(PaidCart(), 1.0), "needs a CBFActionFilter inside"),
+        (lambda: sw.AdaptionPenalty(sw.RecordInterventions(PaidCart()), 1.0), "needs a CBFActionFilter"),
+        (
+            lambda: sw.AdaptionPenalty(sw.RecordInterventions(sw.AdaptionPenalty(filtered(), 1.0)), 1.0),
+            "has an AdaptionPenalty already",
+        ),
+        (lambda: sw.AdaptionPenalty(filtered()), "give penalty .*, per_correction .*, or both"),
+        (lambda: sw.AdaptionPenalty(filtered(), -1.0), "penalty must be a finite number >= 0"),
+        (lambda: sw.AdaptionPenalty(filtered(), np.nan), "penalty must be a finite number >= 0"),
+        (lambda: sw.AdaptionPenalty(filtered(), 1.0, np.inf), "per_correction must be a finite number >= 0"),
+        (lambda: sw.AdaptionPenalty(filtered(), "much"), "penalty must be a number in the task's reward"),
+    ],
+)
+def test_what_it_refuses(build, message):
+    with pytest.raises(sw.SafeWrappersError, match=message):
+        build()
+
+
+class Two(gym.Wrapper):
+    """Two objectives, declared as mo-gymnasium's envs declare them: the task's reward, and time."""
+
+    def __init__(self, env, declared=True):
+        super().__init__(env)
+        if declared:
+            env.reward_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, np.array([reward, -1.0], np.float32), terminated, truncated, info
+
+
+def stopping(make):
+    """A filter that changes actions."""
+    slow = sw.constraints.PredictiveShield(lambda x: 0.25 - abs(x[1]), 4, backup=lambda x: [-np.sign(x[1])])
+    return sw.CBFActionFilter(make, [slow], plant=sw.SimulatorPlant(check_steps=50))
+
+
+def driven(env, steps=6):
+    """Rewards and the last info."""
+    env.reset(seed=0)
+    answers = [env.step(env.action_space.high) for _ in range(steps)]
+    return np.array([answer[1] for answer in answers]), answers[-1][4]
+
+
+def test_a_recorder_sums_up_each_component():
+    env = sw.RecordInterventions(stopping(gym.wrappers.TimeLimit(Two(SimulatedCart()), 6)))
+    rewards, info = driven(env)
+    assert rewards.shape == (6, 2)
+    np.testing.assert_allclose(info["interventions"]["return"], rewards.sum(axis=0))
+    assert info["interventions"]["intervention_rate"] > 0.0
+    scalar = sw.RecordInterventions(gym.wrappers.TimeLimit(SimulatedCart(), 6))
+    assert type(driven(scalar)[1]["interventions"]["return"]) is float
+
+
+def test_wrappers_that_add_up_rewards_add_up_each_component():
+    repeated = sw.ActionRepeat(Two(SimulatedCart()), 3)
+    chunked = sw.ChunkHandover(Two(SimulatedCart()), 3, 3, fallback="zero", rate_limit=100.0)
+    for env, action in ((repeated, np.ones(1)), (chunked, np.ones((3, 1)))):
+        env.reset(seed=0)
+        total = env.step(action)[1]
+        assert total.shape == (2,) and total[1] == -3.0
+        assert -1.0 < total[0] < 0.0
+
+
+LOOKED_AT = ("SafePointGoal1-v0", "SafeCarGoal2-v0", "InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5")
+
+
+def features_of(env, observation):
+    return np.asarray(observation[env.env.observation_space.shape[0] :])
+
+
+def expected_discs(env, count):
+    """The nearest hazards in the robot's frame by complex numbers, from what the env publishes."""
+    task = env.unwrapped
+    heading = np.exp(1j * task.agent_heading)
+    centres = task.hazard_positions @ [1, 1j]
+    offsets = (centres - task.agent_position @ [1, 1j]) / heading
+    velocity = (task.data.qvel[0] + 1j * task.data.qvel[1]) / heading
+    rows = []
+    for offset in offsets[np.argsort(np.abs(offsets))][:count]:
+        way = offset / abs(offset)
+        clearance = abs(offset) - task.hazard_radius - 0.004  # the recipe's margin
+        closing = (velocity * way.conjugate()).real
+        rows.append([way.real, way.imag, clearance / (1 + abs(clearance)), closing / (1 + abs(closing))])
+    return np.array(rows)
+
+
+def test_of_hazards_the_nearest_are_shown_in_the_robots_frame():
+    env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")), neighbours=3)
+    observation, _ = env.reset(seed=4)
+    env.action_space.seed(4)
+    for _ in range(200):
+        shown = features_of(env, observation)
+        np.testing.assert_allclose(shown[2:14].reshape(3, 4), expected_discs(env, 3), atol=1e-6)
+        action = env.action_space.sample()
+        observation, _, _, _, info = env.step(action)
+        share = (info[keys.EXECUTED_ACTION] - info[keys.PROPOSED_ACTION]) / 2.0
+        np.testing.assert_allclose(features_of(env, observation)[-2:], share, atol=1e-7)
+
+
+def test_a_detour_is_shown_with_the_time_that_is_left_of_it():
+    env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")))
+    layout = {"agent": [0, 0, 0], "hazards": [[0.6, 0.02]], "goal": [1.4, 0]}
+    observation, _ = env.reset(seed=0, options={"layout": layout})
+    shown = [features_of(env, observation)[1]]
+    for _ in range(60):
+        observation = env.step(np.array([1.0, 0.0], dtype=np.float32))[0]
+        shown.append(features_of(env, observation)[1])
+    began = next(i for i, side in enumerate(shown) if side)
+    assert shown[:began] == [0.0] * began
+    assert shown[began] == pytest.approx(-49 / 50, abs=1e-6)  # to the right of a disc that is on the left
+
+
+@pytest.mark.parametrize("acts", [True, False])
+@pytest.mark.parametrize("name", LOOKED_AT)
+def test_bounded_of_one_shape_and_without_any_effect(name, acts):
+    """Beside the same env without the wrapper: the same actions are executed, with the same results."""
+    plain, seen = gym.make(name), gym.make(name)
+    constraints = sw.protect(gym.make(name)).constraints
+    if acts:
+        plain = sw.protect(plain)
+        seen = sw.FilterObservation(sw.protect(seen))
+    else:
+        seen = sw.FilterObservation(seen, constraints)
+    observation, _ = seen.reset(seed=3)
+    plain.reset(seed=3)
+    seen.action_space.seed(3)
+    for _ in range(60):
+        assert seen.observation_space.contains(observation)
+        assert (np.abs(features_of(seen, observation)) <= 1.0).all()
+        action = seen.action_space.sample()
+        observation, reward, terminated, truncated, info = seen.step(action)
+        same, same_reward, *_, same_info = plain.step(action)
+        np.testing.assert_array_equal(observation[: len(same)], same.astype(observation.dtype))
+        assert reward == same_reward
+        if acts:
+            np.testing.assert_array_equal(info[keys.EXECUTED_ACTION], same_info[keys.EXECUTED_ACTION])
+        if terminated or truncated:
+            observation, _ = seen.reset(seed=5)
+            plain.reset(seed=5)
+
+
+def test_an_unfiltered_learner_sees_what_the_filtered_one_sees():
+    acting = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")))
+    watching = sw.FilterObservation(gym.make("SafePointGoal1-v0"), acting.get_wrapper_attr("constraints"))
+    one, other = acting.reset(seed=1)[0], watching.reset(seed=1)[0]
+    steps = 0
+    while True:
+        np.testing.assert_array_equal(one, other)
+        action = np.array([1.0, 0.3], dtype=np.float32)
+        one, *_, info = acting.step(action)
+        other = watching.step(action)[0]
+        if info[keys.CBF_INTERVENED]:
+            break
+        steps += 1
+    assert steps > 10
+
+
+def test_the_room_of_a_clearance_and_its_nearest_surfaces():
+    walls = [sw.constraints.Plane([-0.9], [1.0]), sw.constraints.Plane([0.9], [-1.0])]
+    limit = sw.constraints.Clearance(walls, bodies=["cart"], braking=8.0)
+    env = sw.FilterObservation(gym.make("InvertedPendulum-v5"), [limit], neighbours=1)
+    observation, _ = env.reset(seed=0)
+    for _ in range(8):
+        place, speed = env.unwrapped.data.qpos[0], env.unwrapped.data.qvel[0]
+        clearance, away = 0.9 - abs(place), -np.sign(place)
+        shown = features_of(env, observation)
+        assert shown[0] <= clearance / (1 + clearance) + 1e-6
+        wanted = [away, 0, 0, clearance / (1 + clearance), -away * speed / (1 + abs(speed))]
+        np.testing.assert_allclose(shown[1:6], wanted, atol=1e-6)
+        observation = env.step(np.array([3.0], dtype=np.float32))[0]
+
+
+class Pictured(gym.ObservationWrapper):
+    """An observation of another kind."""
+
+    def __init__(self, env, space, make):
+        super().__init__(env)
+        self.observation_space, self.observation = space, make
+
+
+@pytest.mark.parametrize("key", ["pixels", None])
+def test_dicts_get_a_key_and_images_become_dicts(key):
+    image = gym.spaces.Box(0, 255, (4, 4, 3), np.uint8)
+    space = image if key is None else gym.spaces.Dict({key: image})
+    picture = np.zeros((4, 4, 3), np.uint8)
+    task = Pictured(Cart(), space, lambda _: picture if key is None else {key: picture})
+    env = sw.FilterObservation(sw.CBFActionFilter(task, [SpeedRow(0.25)], plant=cart_plant()))
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert set(observation) == {key or "observation", "filter"}
+    assert observation["filter"].dtype == np.float32
+
+
+def test_what_was_not_judged_is_not_a_number():
+    env = sw.FilterObservation(sw.protect(gym.make("Reacher-v5")))
+    env.reset(seed=0)
+    env.unwrapped.data.qvel[:] = np.nan
+    observer = env.get_wrapper_attr("filter")
+    observer.observe()
+    shown = env._with_features(np.zeros(10), np.zeros(2))[10:]
+    assert np.isnan(shown[0])
+    assert shown[1:].tolist() == [0.0, 0.0]
