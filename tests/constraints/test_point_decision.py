@@ -83,6 +83,8 @@ def random_scenes(count):
             point_decision.is_admitted(scene, *asked),
             point_decision.candidates(scene, *asked),
         ]
+        away = np.linalg.norm(found[3] - control, axis=1)
+        assert (np.diff(away) >= -1e-9).all()  # the nearest candidate first
         found += [
             *point_decision.half_spaces(scene, *asked[:2]),
             point_decision.backup_pair(scene, *asked[:2]),
