@@ -96,5 +96,5 @@ def random_scenes(count):
 
 
 def test_the_random_scenes_have_everything_in_them():
-    _, stages = random_scenes(200)
+    _, stages = random_scenes(800)
     assert stages[point_decision.PROPOSAL] > 10 and stages[point_decision.CANDIDATE] > 10

@@ -116,6 +116,24 @@ def test_a_policy_acts_after_the_control_and_measures_stop_a_rollout():
     assert reached.reached and not reached.ended and len(reached.observations) < 10
 
 
+class Reused(Cart):
+    """Returns the same array at every step."""
+
+    seen = np.zeros(2)
+
+    def step(self, action):
+        self.seen[:], *rest = super().step(action)
+        return (self.seen, *rest)
+
+
+def test_the_first_observation_is_kept_when_the_env_overwrites_it():
+    env = Reused(start=(0.0, 1.0))
+    plant = bound(env, check_steps=0)
+    env.reset(seed=0)
+    first = plant.rollout(np.ones(1), 1).observations[0].copy()
+    np.testing.assert_array_equal(plant.rollout(np.ones(1), 5).observations[0], first)
+
+
 def restore_cart(raw, state):
     raw.x, raw.v = state
 
