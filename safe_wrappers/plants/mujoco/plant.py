@@ -2,13 +2,11 @@
 
 import copy
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, ClassVar, Final
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
@@ -50,13 +48,11 @@ class MujocoPlant(Plant):
         delay_s: Evidence age plus detection plus actuation delay in s, over which this plant's model predicts.
         data: A function of the unwrapped env that returns its data; None: they are its `.data`.
         control_dt: How long the env holds an action, s; needed where it has no `dt` or `frame_skip`.
-        action_map: (offset, scale), one number or one per action: the env sets the control `offset + scale * action`.
-            None: an action is a control, or, where the action space is not the control range, this is found by
-            stepping a copy of the env.
         loop: The `plants.ControlLoop` that your controller closes; `margin_left_deg` is what is left of its margin.
 
     Attributes:
-        action_map: The map, once bound; None where an action is a control.
+        action_map: By which the env makes controls of actions, where the action space is not the control range; found
+            by stepping a copy of the env at binding. None where an action is a control.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, a disabled actuator, one not affine, or actions that no map fits.
@@ -78,11 +74,10 @@ class MujocoPlant(Plant):
         *,
         data: binding.DataOf | None = None,
         control_dt: float | None = None,
-        action_map: Sequence[ArrayLike] | None = None,
         loop: ControlLoop | None = None,
     ) -> None:
         self._given, self._functions = binding.given_and_functions(model, data)
-        self._given_dt, self._given_map = control_dt, action_map
+        self._given_dt = control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._pending: deque[Array] = deque()
         self._factors, self.loop = (1.0, 1.0), checked_loop(loop)
@@ -153,10 +148,10 @@ class MujocoPlant(Plant):
         """Find the bounds of the action, and the map from it to the control."""
         self.action_map = None
         are_controls = binding.actions_are_controls(env.action_space, self.lower, self.upper)
-        if are_controls and np.isfinite(self.lower).all() and self._given_map is None:
+        if are_controls and np.isfinite(self.lower).all():
             return
         binding.refuse_other_actions(env, self.lower, self.upper)
-        found = find_action_map(env, self._source, self.substeps, self._given_map, are_controls)
+        found = find_action_map(env, self._source, self.substeps, are_controls)
         if are_controls and found.is_identity:
             return
         self.action_map = found

@@ -6,7 +6,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.identified.logs import checked_episodes
+from safe_wrappers.plants.identified import checked_episodes
 
 
 def test_a_log_can_be_replayed():
