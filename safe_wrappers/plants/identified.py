@@ -87,36 +87,27 @@ def checked_episodes(given: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[Episo
         raise ConfigurationError(
             f"episodes is a list of (observations, actions), as log_steps returns it; got {given!r}"
         )
-    found = [_checked(index, one) for index, one in enumerate(given)]
-    for index, one in enumerate(found):
-        for name, have, first in zip(Episode._fields, one, found[0], strict=True):
-            if have.shape[1] != first.shape[1]:
-                raise ConfigurationError(
-                    f"episode {index} has {name} of {have.shape[1]} numbers, episode 0 of {first.shape[1]}"
-                )
-    return found
-
-
-def _checked(index: int, given: Any) -> Episode:
-    if not isinstance(given, Sequence) or isinstance(given, str) or len(given) != 2:
-        raise ConfigurationError(f"episode {index} is no pair (observations, actions): {given!r}")
-    observations = float_array(f"observations of episode {index}", given[0])
-    actions = float_array(f"actions of episode {index}", given[1])
-    if actions.ndim == 1:
-        actions = actions[:, None]
-    steps = len(actions)
-    if observations.ndim != 2 or actions.ndim != 2 or not steps or len(observations) != steps + 1:
-        raise ConfigurationError(
-            f"episode {index}: expected observations of shape (T + 1, n) and actions of shape (T, m) with T of at "
-            f"least 1, got {observations.shape} and {actions.shape}"
+    found: list[Episode] = []
+    for index, one in enumerate(given):
+        if not isinstance(one, Sequence) or isinstance(one, str) or len(one) != 2:
+            raise ConfigurationError(f"episode {index} is no pair (observations, actions): {one!r}")
+        observations, actions = (
+            float_array(f"{name} of episode {index}", part)
+            for name, part in zip(Episode._fields, one, strict=True)
         )
-    for name, array in (("observations", observations), ("actions", actions)):
-        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-        if len(bad):
+        if actions.ndim == 1:
+            actions = actions[:, None]
+        have, first = Episode(observations, actions), found[0] if found else Episode(observations, actions)
+        widths = [(a.ndim, a.shape[1:]) == (2, b.shape[1:]) for a, b in zip(have, first, strict=True)]
+        if not (all(widths) and len(actions) and len(observations) == len(actions) + 1):
             raise ConfigurationError(
-                f"{name} of episode {index} are not finite at step {bad[0]}: {array[bad[0]]}; end the episode before"
+                f"episode {index}: expected observations of shape (T + 1, n) and actions of shape (T, m) with T of at"
+                f" least 1, and n and m as in episode 0, got {observations.shape} and {actions.shape}"
             )
-    return Episode(observations, actions)
+        if not (np.isfinite(observations).all() and np.isfinite(actions).all()):
+            raise ConfigurationError(f"episode {index} has numbers that are not finite; end it before them")
+        found.append(have)
+    return found
 
 
 Model = Callable[[Array, Array], Array]
@@ -160,15 +151,10 @@ def shortfalls(
             states[alive] = model(states[alive], controls)
         for i in alive:
             true = measured(measure, episodes[i].observations[at[i] + 1])
-            found[i, step] = _shortfall(measured(measure, states[i]), true)
+            predicted = measured(measure, states[i])
+            fall = predicted - true if predicted != true else 0.0  # infinite ones, too
+            found[i, step] = np.inf if np.isnan(fall) else fall
     return found
-
-
-def _shortfall(predicted: float, true: float) -> float:
-    if predicted == true:  # infinite ones, too
-        return 0.0
-    fall = predicted - true
-    return np.inf if np.isnan(fall) else fall
 
 
 class LinearModel:
@@ -263,7 +249,6 @@ class Coverage:
         self._alarm = max([_ALARM, *reached])
 
     def start(self) -> None:
-        """A new episode."""
         self.judged = self.missed = 0
         self.lost = False
 
@@ -309,7 +294,7 @@ class IdentifiedPlant(RolloutPlant):
     Info, at every step: ``plant/coverage``, ``plant/coverage_lost``.
 
     Attributes:
-        model: The fitted one: a function of states, shape (k, n), and controls, shape (k, m); affine, by least squares.
+        model: The fitted one, affine: a function of states, shape (k, n), and controls, shape (k, m).
         fit_episodes: Those that it was fitted to.
         held_out_episodes: Those that margins come from.
         coverage: What `plant/coverage` and `plant/coverage_lost` report.
@@ -373,7 +358,6 @@ class IdentifiedPlant(RolloutPlant):
         self._least: float | None = None  # of the watched measure after the step under way
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        """Attach to an env whose observations and actions are those of the episodes."""
         refuse_changed_actions(env)
         self._take_space(env.action_space)
         first = self.fit_episodes[0]
@@ -392,11 +376,9 @@ class IdentifiedPlant(RolloutPlant):
 
     @property
     def state(self) -> Array:
-        """The last observation, shape (n,)."""
         return np.asarray(self.view.observation, dtype=np.float64)
 
     def observe(self) -> None:
-        """The state is what was received last."""
         self.observation_id += 1
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:
@@ -471,7 +453,9 @@ class IdentifiedPlant(RolloutPlant):
 
     def _margins(self, measure: Measure, horizon: int) -> Array:
         fitted = shortfalls(self.model, self._scale_episodes, self._scale_places, horizon, measure)
-        scales = np.array([_size(column[np.isfinite(column)]) for column in fitted.T])
+        finite = np.isfinite(fitted)
+        squares = (np.where(finite, fitted, 0.0) ** 2).sum(axis=0)
+        scales = np.sqrt(squares / np.maximum(finite.sum(axis=0), 1))
         largest = scales.max()
         scales = np.maximum(scales, _LEAST_SCALE * largest) if largest > 0.0 else np.ones(horizon)
         held_out = shortfalls(self.model, self.held_out_episodes, self._places, horizon, measure)
@@ -484,15 +468,9 @@ class IdentifiedPlant(RolloutPlant):
         return max(factor, 0.0) * scales
 
     def info(self) -> dict[str, Any]:
-        """The info keys `plant/...` of the episode so far."""
         counted = self.coverage
         share = 1.0 - counted.missed / counted.judged if counted.judged else keys.NOT_JUDGED
         return {keys.PLANT_COVERAGE: share, keys.PLANT_COVERAGE_LOST: counted.lost}
-
-
-def _size(errors: Array) -> float:
-    """Root of the mean square, 0 of none."""
-    return float(np.sqrt((errors**2).mean())) if len(errors) else 0.0
 
 
 def _share(name: str, value: float) -> float:

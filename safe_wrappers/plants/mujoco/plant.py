@@ -87,7 +87,6 @@ class MujocoPlant(Plant):
         self._range: tuple[Array, Array] = self.lower, self.upper
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        """Attach to an env and its model."""
         raw: Any = env.unwrapped
         env_checks.refuse_second_env(self._raw, env)
         env_checks.refuse_changed_actions(env)
@@ -188,7 +187,6 @@ class MujocoPlant(Plant):
             self._predict_over_delay()
 
     def executed(self, control: Array | None) -> None:
-        """Remember a sent command; None begins an episode."""
         self._sent, self._sent_at = control, float(self._source.data.time)
         if control is None:
             self._pending.clear()
@@ -229,7 +227,6 @@ class MujocoPlant(Plant):
         return "" if same else f"the step ended {np.abs(state - end).max():.3g} from its forecast"
 
     def follow(self) -> None:
-        """Read the model anew if the env's has changed."""
         self._outdated |= self._source.model is not self._env_model or self._constants.changed()
         if self._outdated:
             self._take_model()
@@ -281,7 +278,6 @@ class MujocoPlant(Plant):
 
     @property
     def state(self) -> Array:
-        """(qpos, qvel), shape (nq + nv,)."""
         return self._snapshot[1 : 1 + self._nq + self._nv]
 
     @property
@@ -420,7 +416,6 @@ class MujocoPlant(Plant):
         return None if self._delay_steps else self._source.data
 
     def path(self, control: Array) -> list[Array]:
-        """The states (qpos, qvel) after each physics substep of a held control."""
         return list(self.forecast(control).path)
 
     def motion(self, kind: str, name: str) -> tuple[Array, Array]:
@@ -441,7 +436,6 @@ class MujocoPlant(Plant):
         return p.copy(), *point_motion(jacobian, self.frames.jacobian_rate(kind, name), self.qvel, *response)
 
     def attribute(self, name: str) -> Any:
-        """Read a published fact of the env."""
         found = getattr(self._raw, name, None)
         return found if found is not None else env_checks.read_attribute(self._env, name)
 
