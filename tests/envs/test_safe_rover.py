@@ -67,9 +67,6 @@ def test_a_tyre_opposes_its_sliding_with_no_more_than_the_curve_gives(rim, forwa
     assert along * sliding[1] == pytest.approx(across * sliding[0], abs=1e-6)  # along the sliding
 
 
-# The forces on the machine ---------------------------------------------------------------------------------
-
-
 def test_sliding_without_drive_only_loses_energy(env):
     """Kinetic and potential energy after every substep, motors off, thrown with spin on every ground."""
     env.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
@@ -87,9 +84,6 @@ def test_sliding_without_drive_only_loses_energy(env):
         assert energy[-1] < energy[0] - 1.0
         # 50 mJ: an unloaded corner's landing, which the contact's spring gives back.
         assert np.diff(energy).max() < 0.05
-
-
-# Drives with known results ---------------------------------------------------------------------------------
 
 
 def lock(env):
@@ -129,9 +123,6 @@ def test_it_comes_to_rest_and_stays_there(env):
         assert np.abs(rates).max() < 0.02  # it rolls freely; across and around it stands
         assert np.abs(np.diff(rates, axis=0)).max() < 1e-4
         assert np.hypot(*(env.agent_position - place)) < 0.02
-
-
-# The task ------------------------------------------------------------------------------------------------
 
 
 def test_observation_is_what_it_says(env):
@@ -308,9 +299,6 @@ def test_rolled_over_is_the_end(env):
     assert not env.data.xfrc_applied.any()
     assert env.step(throttle(1.0))[2]
     assert not env.data.xfrc_applied.any()
-
-
-# The grounds' curves ----------------------------------------------------------------------------------------------
 
 
 @given(st.floats(0.05, 1.5), st.floats(0.02, 0.3), st.floats(1.2, 1.9))

@@ -32,9 +32,6 @@ def start(env, tool=(0.0, 0.0), velocity=(0.0, 0.0), wanted=10.0):
     return env.reset(seed=0, options={"layout": layout})
 
 
-# Gymnasium ------------------------------------------------------------------------------------------------------
-
-
 def test_spaces_timing_and_truncation(env):
     assert env.action_space == gym.spaces.Box(-1, 1, (2,), np.float32)
     assert env.observation_space.shape == (9,) and env.unwrapped.dt == 0.001
@@ -68,9 +65,6 @@ def test_the_seed_draws_place_and_force(env):
 def test_layouts_that_cannot_be_are_refused(env, layout, error):
     with pytest.raises(error):
         env.reset(options={"layout": layout})
-
-
-# The coupling ---------------------------------------------------------------------------------------------------
 
 
 def test_free_motion_is_that_of_a_mass_on_a_spring_and_a_damper(env):
@@ -142,9 +136,6 @@ def test_the_port_generates_no_energy(env):
         assert missing < 1e-3 * through and through > 1.0
 
 
-# Wall and clamp -------------------------------------------------------------------------------------------------
-
-
 def test_a_pressed_wall_is_a_spring(env):
     start(env, (0.17, 0.0))
     for _ in range(600):
@@ -203,9 +194,6 @@ def test_pressing_and_sweeping_are_rewarded(env):
     assert sum(env.step(np.array([0.0, 0.5]))[1] for _ in range(200)) == 0.0
 
 
-# What a brake may count on --------------------------------------------------------------------------------------
-
-
 def test_full_reverse_brakes_and_nothing_accelerates_faster(env):
     # From every stretch of the spring up to where it slips, whether or not a driver gets there.
     raw = env.unwrapped
@@ -222,9 +210,6 @@ def test_full_reverse_brakes_and_nothing_accelerates_faster(env):
                     least = min(least, -rate)
     assert TELEOP_BRAKING <= least < TELEOP_BRAKING + 2.0
     assert TELEOP_ACCELERATION - 1.0 < most <= TELEOP_ACCELERATION + 1e-9
-
-
-# The operator -----------------------------------------------------------------------------------------------------
 
 
 def episode(operator, seed=0, steps=6000):
