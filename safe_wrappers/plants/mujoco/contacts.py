@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, name_list
-from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.plants.mujoco.forecast import RESETS
-from safe_wrappers.plants.mujoco.model import fixed_bodies
+from safe_wrappers.plants.mujoco.model import fixed_bodies, named
 
 Visit = Callable[[mujoco.MjData, float], None]
 """Takes data with the contacts and forces of one evaluation, and the time for which it counts, s."""
@@ -292,14 +291,8 @@ def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:
 
 def chosen_bodies(model: mujoco.MjModel, argument: str, names: Sequence[str] | None) -> NDArray[np.bool_]:
     """Which bodies are named, shape (nbody + 1,); the last entry stands for flexible parts, which have no name."""
-    if names is None:
-        return np.ones(model.nbody + 1, dtype=bool)
-    names = name_list(argument, names, "names of bodies", "None for all")
-    known = {model.body(i).name: i for i in range(model.nbody)}
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        there = ", ".join(name for name in known if name)
-        raise UnknownNameError(f"{argument}: the model has no body {unknown[0]!r}; it has: {there}")
-    chosen = np.zeros(model.nbody + 1, dtype=bool)
-    chosen[[known[name] for name in names]] = True
+    chosen = np.full(model.nbody + 1, names is None)
+    if names is not None:
+        names = name_list(argument, names, "names of bodies", "None for all")
+        chosen[[named(model, "body", name, argument) for name in names]] = True
     return chosen
