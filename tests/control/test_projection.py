@@ -266,6 +266,15 @@ def test_a_row_too_large_to_square_is_never_inactive(rows):
     assert (answer.control[:rows] < 0.0).all() or answer.status in ("failed", "infeasible")
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("bound", [1.0, math.inf])
+@pytest.mark.parametrize("rows", [1, 2])
+def test_an_answer_that_overflows_is_none(rows, bound):
+    answer = project([0.3, 0.3], np.eye(2)[:rows] * 1e-140, np.full(rows, -1e299), -bound, bound)
+    assert answer.status in ("infeasible", "failed")
+    assert np.isfinite(answer.control).all() and (np.abs(answer.control) <= bound).all()
+
+
 @pytest.mark.filterwarnings("ignore:overflow")
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_offsets_whose_sum_overflows(sign):

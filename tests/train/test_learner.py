@@ -40,6 +40,7 @@ class BoundBehindTheWall(BoundConstraint):
         return sw.HalfSpaces(np.array([[self.plant.control_dt, 0.0]]), np.array([WALL - self.plant.state[0]]))
 
     def backup(self):
+        """Away from the wall, as fast as the point goes."""
         return np.array([-1.0, 0.0])
 
 
@@ -129,7 +130,7 @@ def test_training_has_what_the_kind_says_and_the_rows_have_the_tasks_return(
     # What SB3 logs as rollout/ep_rew_mean is the same.
     ends = [info["episode"]["r"] for info in infos.ravel() if "episode" in info]
     assert sorted(ends) == pytest.approx(sorted(row["return"] for row in rows), abs=1e-5)
-    assert {"r", "l"} <= set(model.ep_info_buffer[0])
+    assert set(model.ep_info_buffer[0]) >= {"r", "l"}
 
     if algorithm == "SAC":
         buffer = model.replay_buffer
@@ -182,8 +183,9 @@ def test_a_map_is_in_training_and_wherever_the_filter_is_on_in_evaluation(
     monkeypatch.setattr(run_module, "InterventionCallback", lambda: watch)
     train_run(arm, 0, folder, Reports().progress)
     infos = np.array(watch.infos).ravel()
-    assert not any(info[keys.CBF_INTERVENED] for info in infos)
-    assert min(info[keys.MAP_SCALE] for info in infos) < 1.0
+    anchored = np.array([not np.isnan(info[keys.MAP_SCALE]) for info in infos])
+    assert anchored.any() and not any(info[keys.CBF_INTERVENED] for info in infos[anchored])
+    assert min(info[keys.MAP_SCALE] for info in infos[anchored]) < 1.0
     assert keys.ADAPTION_PENALTY not in infos[0]
 
     evaluate_run(arm, 0, folder, EvaluationConfig(episodes=3, seed=7), FilterConfig(), Reports().progress)

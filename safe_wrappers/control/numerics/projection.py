@@ -218,7 +218,7 @@ def _prepare(p: _Problem) -> tuple[int, float]:
         return _ADMITTED, unit
     size = widest
     if size > _ORDINARY:
-        size = _scale(size, 1.0, max(largest, away), size)
+        size = min(_scale(size, 1.0, max(largest, away), size), _LARGEST)
     if size > 0.0:
         while unit > size:
             unit *= 0.5
@@ -247,8 +247,9 @@ def _judge(p: _Problem, unit: float, found: Array, multipliers: Array) -> tuple[
     k, m = p.a.shape
     closest, within, violation, size, widest = True, True, 0.0, 0.0, 0.0
     for j in range(m):
-        closest = closest and math.isfinite(found[j])
-        p.control[j] = min(max(found[j] * unit, p.lo[j]), p.hi[j])
+        finite = math.isfinite(found[j] * unit)
+        closest = closest and finite
+        p.control[j] = min(max(found[j] * unit if finite else p.u[j], p.lo[j]), p.hi[j])
         size = max(size, abs(p.u[j]), abs(p.control[j]))
         widest = max(widest, _half_width(p.lo[j], p.hi[j]))
     for i in range(k):
