@@ -1,7 +1,7 @@
 """The first sentences of the report must not say more than the numbers do."""
 
 import pytest
-from made_up import SILENT, episode, fill, write_evaluation, write_training
+from made_up import SILENT, episode, fill, write_evaluation
 
 from safe_wrappers.train.evaluation.summary import summarize
 from safe_wrappers.train.report.verdict import verdict
