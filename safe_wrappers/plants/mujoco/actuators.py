@@ -92,7 +92,7 @@ def _gain(act: Actuators, i: int, length: Array, velocity: Array) -> float:
     gain = act.gain[i, 0]
     if act.gain_type[i] == _AFFINE_GAIN:
         gain += act.gain[i, 1] * length[i] + act.gain[i, 2] * velocity[i]
-    return gain
+    return float(gain)
 
 
 @compiled
