@@ -185,7 +185,7 @@ class OcclusionPenalty(LayerWrapper):
         self._time = float(self._raw.data.time)
         self._sight.read(self._raw.data)
         if self.ego_motion is not None:
-            self.ego_motion.fix()
+            self.ego_motion.fix_now()
         self._start()
         info.update(self._look())
         info[keys.OCCLUSION_PENALTY] = 0.0
@@ -198,7 +198,7 @@ class OcclusionPenalty(LayerWrapper):
         self.tracking.advance(elapsed)
         self._sight.read(self._raw.data)
         if self.ego_motion is not None:
-            self.ego_motion.advance(elapsed, self._random.draw.standard_normal(9))
+            self.ego_motion.read(elapsed, self._random.draw.standard_normal(9))
         info.update(self._look())
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
         info[keys.OCCLUSION_PENALTY] = penalty
