@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.control.estimation.covariance import checked_covariance, checked_noise
 from safe_wrappers.control.estimation.dead_reckoning import (
     DeadReckoning,
@@ -56,9 +56,7 @@ class Imu:
         check_fields(self, non_negative, ["accelerometer_std"], "m/s^2")
         check_fields(self, non_negative, ["gyro_std"], "rad/s")
         check_fields(self, positive, ["fix_every_s"], "s")
-        if not isinstance(self.lever_arm, bool | np.bool_):
-            raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
-        self.lever_arm = bool(self.lever_arm)
+        self.lever_arm = true_or_false("lever_arm", self.lever_arm)
 
 
 class EgoMotion(DeadReckoning):
@@ -187,9 +185,7 @@ class Sensor:
             self.occluder_groups = _groups(self.occluder_groups)
         if self.position_std is None and self.velocity_std is None:
             raise ConfigurationError("the sensor measures nothing: give position_std, velocity_std or both")
-        if not isinstance(self.lever_arm, bool | np.bool_):
-            raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
-        self.lever_arm = bool(self.lever_arm)
+        self.lever_arm = true_or_false("lever_arm", self.lever_arm)
         if self.imu is not None:
             self.imu = settings_from(Imu, self.imu, "imu")
         for name in ("position_std", "velocity_std"):

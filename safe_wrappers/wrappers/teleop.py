@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.faults import probability
 from safe_wrappers.wrappers.layer import Env, WrapperRng
@@ -46,8 +46,7 @@ class Link:
             most = f"at most {LONGEST_DELAY_S:g} s"
             raise ConfigurationError(f"delay_s + jitter_s is {most}; got {self.longest_s:g} s")
         object.__setattr__(self, "loss", probability("loss", self.loss))
-        if not isinstance(self.in_order, bool):
-            raise ConfigurationError(f"in_order is True or False, got {self.in_order!r}")
+        true_or_false("in_order", self.in_order)
 
     @property
     def longest_s(self) -> float:
