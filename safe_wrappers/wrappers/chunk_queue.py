@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.control.handover.curves import hermite_spline
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, Seam, drawn_out, join
+from safe_wrappers.control.handover.seams import BLENDS, LOOK_BACK, Seam, drawn_out, join
 from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE, shortest_latched_blend, smoothstep
 from safe_wrappers.control.handover.vibration import shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
@@ -147,7 +147,7 @@ class ChunkQueue:
             self._fade = (self._sent[-1], blend_steps, 0)
         self._acting = acting
         sent, held = self._sendable(self._faded(control))
-        self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], sent[None].astype(np.float64)])
+        self._sent = np.concatenate([self._sent[-LOOK_BACK + 1 :], sent[None].astype(np.float64)])
         self.now += 1
         took_over = self._observed > newest
         held |= limited
