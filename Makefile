@@ -129,7 +129,7 @@ figures: .venv/installed
 	$(RUN) kills --seeds 2 --workers 2 --name kills_together
 	for config in $(COMPARED); do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
 
-# The films of docs/gallery.md and the page: about ten minutes. MUJOCO_GL=osmesa or egl where there is no window.
+# The films of docs/gallery.md: about ten minutes. MUJOCO_GL=osmesa or egl where there is no window.
 gallery: .venv/installed
 	$(BIN)/python -m benchmarks gallery
 

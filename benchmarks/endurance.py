@@ -33,7 +33,7 @@ from benchmarks.cases import CASES
 from benchmarks.drivers import Maker
 from benchmarks.mujoco_drivers import corner_seeking
 from benchmarks.searching_drivers import SEARCHES, SearchingDriver
-from benchmarks.tables import keep, measured, options
+from benchmarks.tables import keep, markdown, measured, options, total
 from benchmarks.trained_adversary import FLAGS, Tally
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -182,7 +182,9 @@ def collected(rows: list[dict[str, Any]]) -> dict[str, Any]:
     ordered = sorted(groups, key=lambda pair: envs.index(pair[0]))  # drivers as they came
     return {
         "drivers": [_pooled(groups[pair]) for pair in ordered],
-        "memory": [m for m in map(memory, _processes(rows)) if m],
+        "memory": [
+            m for process in dict.fromkeys(row["process"] for row in rows) if (m := memory(rows, process))
+        ],
         "versions": sorted({row["versions"] for row in rows}),
     }
 
@@ -203,74 +205,57 @@ def _pooled(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {"env": rows[0]["env"], "driver": rows[0]["driver"], **asdict(tally), **extra}
 
 
-def _processes(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    found: dict[str, list[dict[str, Any]]] = {}
+def memory(rows: list[dict[str, Any]], process: str) -> dict[str, Any] | None:
+    """What the memory of one process did after its first round, from a line through the ends of its chunks.
+
+    Counted are chunks of a kind that it has made before, over the filtered steps that it had made by then.
+    """
+    seen, warm, made = set(), [], 0
     for row in rows:
-        found.setdefault(row["process"], []).append(row)
-    return list(found.values())
-
-
-def _warm(rows: list[dict[str, Any]]) -> list[tuple[int, dict[str, Any]]]:
-    """The chunks of a process whose kind it has made before, with the filtered steps that it had made by then."""
-    seen, found, steps = set(), [], 0
-    for row in rows:
-        steps += row["steps"] * row["filtered"]
-        kind = row["env"], row["driver"], row["filtered"]
-        if kind in seen:
-            found.append((steps, row))
-        seen.add(kind)
-    return found
-
-
-def memory(rows: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """What the memory of one process did after its first round, from a line through the ends of its chunks."""
-    warm = _warm(rows)
+        if row["process"] == process:
+            made += row["steps"] * row["filtered"]
+            kind = row["env"], row["driver"], row["filtered"]
+            if kind in seen:
+                warm.append((float(made), row["mb"]))
+            seen.add(kind)
     if len(warm) < 3:
         return None
-    steps, mb = np.array([at for at, _ in warm], float), np.array([row["mb"] for _, row in warm])
-    slope = float(np.polyfit(steps, mb, 1)[0])
+    steps, mb = np.array(warm).T
     span = steps[-1] - steps[0]
-    return {
-        "chunks": len(warm),
-        "steps": int(span),
-        "least_mb": float(mb.min()),
-        "most_mb": float(mb.max()),
-        "growth": slope * span / float(mb.mean()),
-    }
+    growth = float(np.polyfit(steps, mb, 1)[0]) * span / float(mb.mean())
+    ends = {"least_mb": float(mb.min()), "most_mb": float(mb.max())}
+    return {"chunks": len(warm), "steps": int(span), "growth": growth, **ends}
 
 
 def table(found: dict[str, Any]) -> str:
     """Markdown: a line per env and driver, one per env, and what memory did."""
-    lines = [
-        "| env | driver | steps | violations | without the filter, of 1,000 | changed | infeasible | fallback "
-        "| unsafe | lowest h (mm) | simulated steps |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
     rows = [row for row in found["drivers"] if row["steps"]]
+    lines, sums = [], []
     for r in rows:
         off = f"{1e3 * r['off_violations'] / r['off_steps']:.0f}" if r["off_steps"] else "-"
-        flags = " | ".join(f"{r[name]:,}" for name in FLAGS[1:])
-        lines.append(
-            f"| {r['env']} | {r['driver']} | {r['steps']:,} | {r['violations']:,} | {off} "
-            f"| {r['intervened'] / r['steps']:.1%} | {flags} | {1e3 * r['smallest']:.3f} "
-            f"| {r['simulated'] or '-'} |"
-        )
-    lines += ["", "| env | steps | violations | at most, at 95 % | lowest h (mm) |", "|---|---|---|---|---|"]
+        counts = [r["env"], r["driver"], f"{r['steps']:,}", f"{r['violations']:,}", off]
+        flags = [f"{r['intervened'] / r['steps']:.1%}", *(f"{r[name]:,}" for name in FLAGS[1:])]
+        lines.append([*counts, *flags, f"{1e3 * r['smallest']:.3f}", r["simulated"] or "-"])
     for env in [*dict.fromkeys(r["env"] for r in rows), ""]:
         part = [r for r in rows if env in ("", r["env"])]
-        steps, bad = (sum(r[name] for r in part) for name in ("steps", "violations"))
-        if steps:
-            bound = f"{3.0 / steps:.1e} a step" if not bad else "-"
-            least = 1e3 * min(r["smallest"] for r in part)
-            lines.append(f"| {env or 'all'} | {steps:,} | {bad:,} | {bound} | {least:.3f} |")
-    simulated, bad = (sum(r[name] for r in rows) for name in ("simulated", "simulated_violations"))
-    lines += ["", f"Of {simulated:,} steps that searches simulated, {bad:,} were in violation.", ""]
+        steps, bad = total(part, "steps"), total(part, "violations")
+        bound = f"{3.0 / steps:.1e} a step" if not bad else "-"
+        sums.append(
+            [env or "all", f"{steps:,}", f"{bad:,}", bound, f"{1e3 * min(r['smallest'] for r in part):.3f}"]
+        )
+    head = (
+        "env | driver | steps | violations | without the filter, of 1,000 | changed | infeasible | fallback"
+    )
+    by_driver = markdown(f"{head} | unsafe | lowest h (mm) | simulated steps", lines)
+    by_env = markdown("env | steps | violations | at most, at 95 % | lowest h (mm)", sums)
+    simulated, bad = total(rows, "simulated"), total(rows, "simulated_violations")
+    said = [f"Of {simulated:,} steps that searches simulated, {bad:,} were in violation.", ""]
     for m in found["memory"]:
-        lines.append(
+        said.append(
             f"Memory of a process after its first round, over {m['steps']:,} steps in {m['chunks']} chunks: "
             f"{m['least_mb']:.0f} to {m['most_mb']:.0f} MB; a line through them grows by {m['growth']:.2%}."
         )
-    return "\n".join([*lines, "", *found["versions"]])
+    return "\n".join([by_driver, "", by_env, "", *said, "", *found["versions"]])
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The films of docs/gallery.md, a task each, without and with the filter side by side; and the page itself.
+"""The films of docs/gallery.md, a task each, without and with the filter side by side, and what happened in them.
 
     MUJOCO_GL=osmesa python -m benchmarks gallery [--only NAME ...]
 
@@ -6,8 +6,7 @@ Nothing is trained: the filters, the judges and the seeded drivers are those of 
 sides begin with the same reset and have the same driver, which reads its own side's state.
 """
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +18,11 @@ import safe_wrappers as sw
 from benchmarks.cases import PROTECTED, Case
 from benchmarks.drivers import Maker
 from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, encode, font
-from benchmarks.tables import RESULTS, options
+from benchmarks.tables import options
 from safe_wrappers.drawing.scene import find_renderer, set_size
 
 ROOT = Path(__file__).parents[1]
-PAGE, FILMS = ROOT / "docs" / "gallery.md", ROOT / "docs" / "static" / "gallery"
-COUNTS = RESULTS / "gallery.json"
+FILMS = ROOT / "docs" / "static" / "gallery"
 PANEL, HEAD, FOOT = 320, 24, 24
 QUALITIES, MOST_BYTES = (40, 20, 8, 2), 170_000
 """Of WebP: the first that is small enough."""
@@ -39,8 +37,6 @@ class Scene:
     Attributes:
         case: Of `benchmarks.cases.PROTECTED`: env, filter and judge.
         driver: Of the case's drivers.
-        does: What the driver does, in words.
-        keeps: What the filter keeps, in words.
         stride: Control steps per frame.
         seed: Of the first reset, and of the driver.
         strength: Times the driver's action.
@@ -50,8 +46,6 @@ class Scene:
 
     case: str
     driver: str
-    does: str
-    keeps: str
     stride: int
     seed: int = 0
     strength: float = 1.0
@@ -65,52 +59,31 @@ class Scene:
 
 
 _FIELD = {"distance": 4.3, "elevation": -68.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.3, 0.0])}
-_STRAIGHT = "straight into one hazard after another"
+_RUNNER = {"distance": 4.4, "elevation": -42.0, "azimuth": 90.0}
+_ARM = {"distance": 1.9, "elevation": -20.0, "azimuth": 140.0, "lookat": np.array([1.3, 0.75, 0.55])}
 SCENES = {
-    "point-goal-1": Scene(
-        "SafePointGoal1-v0", "hazard-seeking", _STRAIGHT, "out of the hazards", 10, camera=_FIELD
-    ),
+    "point-goal-1": Scene("SafePointGoal1-v0", "hazard-seeking", 10, camera=_FIELD),
     "point-goal-2": Scene(
-        "SafePointGoal2-v0", "goal-seeking", "straight to the goal, whatever is in between",
-        "out of the hazards and off the vases",
-        14, camera=_FIELD | {"distance": 5.6, "lookat": np.array([0.0, -0.5, 0.0])},
+        "SafePointGoal2-v0", "goal-seeking", 14,
+        camera=_FIELD | {"distance": 5.6, "lookat": np.array([0.0, -0.5, 0.0])},
     ),
-    "car-goal-1": Scene(
-        "SafeCarGoal1-v0", "hazard-seeking", _STRAIGHT, "out of the hazards", 8, strength=50.0, camera=_FIELD
-    ),
-    "crossing": Scene(
-        "OccludedCrossing-v0", "goal-seeking", "straight across the road, looking ahead",
-        "clear of cars that pillars hide", 6,
-    ),
-    "patrols": Scene(
-        "PatrolledPointMaze-v0", "patrol-seeking", "straight at the nearest patrol",
-        "clear of patrols that walls hide, and of the walls", 6,
-    ),
+    "car-goal-1": Scene("SafeCarGoal1-v0", "hazard-seeking", 8, strength=50.0, camera=_FIELD),
+    "crossing": Scene("OccludedCrossing-v0", "goal-seeking", 6),
+    "patrols": Scene("PatrolledPointMaze-v0", "patrol-seeking", 6),
     "rover": Scene(
-        "SafeRover-v0", "full throttle and reverse", "full throttle, then full reverse",
-        "the wheels' slip below 0.2", 4, camera={"distance": 5.0}, follows="rover",
+        "SafeRover-v0", "full throttle and reverse", 4, camera={"distance": 5.0}, follows="rover"
     ),
-    "teleop": Scene(
-        "TeleopContact-v0", "clamp-seeking", "towards the clamp, now and then a little back",
-        "the tool off the clamp", 30,
-    ),
+    "teleop": Scene("TeleopContact-v0", "clamp-seeking", 30),
     "flex-joint": Scene(
-        "FlexJointReach-v0", "speed-seeking", "every motor pushes its joint the way that it moves",
-        "both joints below 8 rad/s", 3, camera={"distance": 1.9, "lookat": np.array([0.0, -0.12, 0.0])},
+        "FlexJointReach-v0", "speed-seeking", 3,
+        camera={"distance": 1.9, "lookat": np.array([0.0, -0.12, 0.0])},
     ),
-    "fetch": Scene(
-        "FetchReach-v4", "table-seeking", "the gripper down into the table, and about",
-        "the gripper in its box and off the table", 2,
-        camera={"distance": 1.9, "elevation": -20.0, "azimuth": 140.0, "lookat": np.array([1.3, 0.75, 0.55])},
-    ),
+    "fetch": Scene("FetchReach-v4", "table-seeking", 2, camera=_ARM),
     "cheetah": Scene(
-        "SafeHalfCheetahVelocity-v0", "sprinting", "of random plans the fastest, by the env's own model",
-        "the speed below 3.21 m/s", 4, seed=3,
-        camera={"distance": 4.4, "elevation": -42.0, "azimuth": 90.0}, follows="torso",
+        "SafeHalfCheetahVelocity-v0", "sprinting", 4, seed=3, camera=_RUNNER, follows="torso"
     ),
     "reacher": Scene(
-        "Reacher-v5", "speed-seeking", "every motor pushes its joint the way that it moves",
-        "both joints below 5 rad/s", 2,
+        "Reacher-v5", "speed-seeking", 2,
         camera={"distance": 0.8, "elevation": -70.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.04, 0.0])},
     ),
 }  # fmt: skip
@@ -218,53 +191,8 @@ def film(scene: Scene) -> tuple[list[Image.Image], float, dict[str, Count]]:
     return frames, 1000 * scene.stride * task.dt / FRAME_MS, {"off": sides[0].count, "on": sides[1].count}
 
 
-def page(counts: dict[str, dict[str, Any]]) -> str:
-    """The gallery in Markdown.
-
-    Args:
-        counts: Of every film, as `COUNTS` holds them.
-    """
-    return _HEAD + "\n".join(_section(name, SCENES[name], counts[name]) for name in SCENES)
-
-
-_HEAD = """# Gallery
-
-Every task twice: without the filter at the left, with it at the right. Both sides begin with the same reset, and the
-same seeded driver acts on both; nothing is trained. A film is five seconds long and goes round. Who judges, and what
-else was tried: [standard envs](results/standard-envs.md). What the marks and the strip mean:
-[`SafetyOverlay`](wrappers/recording.md#safetyoverlay). All of it, this page too, is made by `make gallery`.
-
-"""
-
-
-def _section(name: str, scene: Scene, counted: dict[str, Any]) -> str:
-    off, on = Count(**counted["off"]), Count(**counted["on"])
-    times = counted["times"]
-    speed = f"{times:.2g} times faster than real" if times > 1 else f"{1 / times:.2g} times slower than real"
-    said = (
-        f"Driver: {scene.does} (`{scene.driver}`). The filter keeps {scene.keeps}. In violation:"
-        f" {_of(off)} without it, {_of(on)} with it, which changed {on.changed / on.steps:.0%} of the actions."
-        f" Shown {speed}."
-    )
-    return f"""## {scene.case.removesuffix("-v0")}
-
-```{{image}} static/gallery/{name}.webp
-:alt: {scene.case}, filter off at the left and on at the right. {said.replace("`", "")}
-:width: {2 * PANEL + GAP}px
-```
-
-{said.replace("%", " %")}
-"""
-
-
-def _of(count: Count) -> str:
-    return (
-        f"{count.violations} of {count.steps} steps" if count.violations else f"none of {count.steps} steps"
-    )
-
-
 def main() -> None:
-    """Film all tasks, or some, and write the page."""
+    """Film all tasks, or some, and say what happened in each."""
     for name in options(__doc__, only=list(SCENES)).only:
         frames, times, counts = film(SCENES[name])
         for quality in QUALITIES:
@@ -272,12 +200,4 @@ def main() -> None:
             if len(data) <= MOST_BYTES:
                 break
         (FILMS / f"{name}.webp").write_bytes(data)
-        known = json.loads(COUNTS.read_text()) if COUNTS.exists() else {}
-        known[name] = {"times": round(times, 3)} | {side: asdict(count) for side, count in counts.items()}
-        COUNTS.write_text(
-            json.dumps({name: known[name] for name in SCENES if name in known}, indent=1) + "\n"
-        )
-        print(f"{name}: {len(data) / 1e3:.0f} kB, {known[name]}", flush=True)
-    if known.keys() == SCENES.keys():
-        PAGE.write_text(page(known), encoding="utf-8")
-        print(PAGE)
+        print(f"{name}: {len(data) / 1e3:.0f} kB, {times:.2g} times real time, {counts}", flush=True)

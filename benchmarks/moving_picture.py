@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.tables import RESULTS, options
-from safe_wrappers.envs.markers import MarkingRenderer
+from safe_wrappers.envs.patrolled_maze import MarkingRenderer
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack
@@ -220,7 +220,7 @@ def whole_episodes() -> dict[str, Any]:
         env, total = make(trained), Count()
         for seed in COUNTED:
             observation, _ = env.reset(seed=seed)
-            trained.begin(env)
+            trained.begin()
             truncated = False
             while not truncated:
                 observation, reward, _, truncated, info = env.step(trained(observation))

@@ -5,14 +5,13 @@
     python -m benchmarks mutants --drawn 400 --seed 1   # more of them, and others
 
 A mistake is made in the syntax tree: a comparison turned round, + for -, another constant, `not` before a condition,
-min for max, a return too early, a statement left out. The tests of a module are the files that mention most of its
+min for max, a statement left out. The tests of a module are the files that mention most of its
 names. A mutant is killed if a test fails or is more than three times as late as without. Exit status 1 if one of
 those that matter survives, or is gone with its function.
 """
 
 import ast
 import importlib
-import itertools
 import multiprocessing
 import os
 import random
@@ -31,20 +30,12 @@ from benchmarks.tables import markdown, options
 ROOT = Path(__file__).parents[1]
 PRELOADED = ("numba", "gymnasium", "hypothesis", "mujoco", "scipy.optimize", "pytest")
 """Imported once for all the processes that run tests."""
-AREAS = (
-    "filter",
-    "constraints",
-    "control/backup",
-    "control/handover",
-    "control/watchdog",
-    "plants",
-    "wrappers",
-)
+AREAS = "filter", "constraints", "control", "plants", "wrappers"
 MOST_TESTS = 5
 VERDICTS = ("killed", "survived", "gone", "untested")
 """Gone: with its function; untested: its tests fail without a mistake, or there are none."""
-NO_WARNINGS = "-W", "ignore::RuntimeWarning"
-"""Of NumPy, which compiled code does not give."""
+PYTEST = "-x", "-q", "-p", "no:cacheprovider", "-W", "ignore::RuntimeWarning"
+"""NumPy warns where compiled code does not."""
 TURNED: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -109,36 +100,28 @@ def _mistakes(node: Any) -> Iterator[tuple[str, Callable[[], None]]]:
     for i, one in enumerate(body):
         if isinstance(one, _LEFT_OUT) and not isinstance(getattr(one, "value", None), ast.Constant):
             yield "statement", lambda i=i: body.__setitem__(i, ast.Pass())  # type: ignore[misc]
-        if isinstance(node, ast.FunctionDef) and i and not isinstance(one, ast.Return):
-            yield "return", lambda i=i: body.insert(i, ast.Return())  # type: ignore[misc]
 
 
-def mistakes(tree: ast.Module) -> Iterator[tuple[str, str, Callable[[], None]]]:
+def mistakes(node: ast.AST, name: str = "") -> Iterator[tuple[str, str, Callable[[], None]]]:
     """Of a module: in which function, of which kind, and what makes it; nothing in docstrings or annotations."""
-
-    def walk(node: ast.AST, name: str) -> Iterator[tuple[str, str, Callable[[], None]]]:
-        yield from ((name, kind, make) for kind, make in _mistakes(node))
-        for field, value in ast.iter_fields(node):
-            for child in value if isinstance(value, list) else [value]:
-                if not isinstance(child, ast.AST) or field in ("annotation", "returns", "decorator_list"):
-                    continue
+    yield from ((name, kind, make) for kind, make in _mistakes(node))
+    for field, value in ast.iter_fields(node):
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST) and field not in ("annotation", "returns", "decorator_list"):
                 own = getattr(child, "name", "") if isinstance(child, ast.FunctionDef | ast.ClassDef) else ""
-                yield from walk(child, ".".join(filter(None, (name, own))))
-
-    yield from walk(tree, "")
+                yield from mistakes(child, ".".join(filter(None, (name, own))))
 
 
 def every(package: Path, only: list[str]) -> list[Mutant]:
     """All mutants of the areas."""
+    counts: Counter[tuple[str, str, str]] = Counter()
     found = []
     for path in sorted(path for area in AREAS for path in (package / area).rglob("*.py")):
         file = str(path.relative_to(package))
-        if only and not any(word in file for word in only):
-            continue
-        counts: Counter[tuple[str, str]] = Counter()
-        for function, kind, _ in mistakes(ast.parse(path.read_text())):
-            found.append(Mutant(file, function, kind, counts[function, kind]))
-            counts[function, kind] += 1
+        if not only or any(word in file for word in only):
+            for function, kind, _ in mistakes(ast.parse(path.read_text())):
+                found.append(Mutant(file, function, kind, counts[file, function, kind]))
+                counts[file, function, kind] += 1
     return found
 
 
@@ -191,13 +174,7 @@ def _tests(where: Path, files: list[str]) -> None:
     import safe_wrappers
 
     assert Path(str(safe_wrappers.__file__)).is_relative_to(where), "the tests import another package"
-    os._exit(
-        int(
-            importlib.import_module("pytest").main(
-                ["-x", "-q", "-p", "no:cacheprovider", *NO_WARNINGS, *files]
-            )
-        )
-    )
+    os._exit(int(importlib.import_module("pytest").main([*PYTEST, *files])))
 
 
 def fails(where: Path, files: list[str], longest_s: float | None) -> bool:
@@ -240,22 +217,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         where = Path(folder).resolve()
         copied(where)
-        kinds: dict[str, list[Mutant]] = {}
-        for mutant in every(where / "safe_wrappers", given.only):
-            kinds.setdefault(mutant.kind, []).append(mutant)
-        rng = random.Random(given.seed)
-        drawn = [
-            rng.choice(found)
-            for _, found in zip(range(given.drawn), itertools.cycle(kinds.values()), strict=False)
-        ]
+        found = every(where / "safe_wrappers", given.only)
+        drawn = random.Random(given.seed).sample(found, min(given.drawn, len(found)))
         matter = [m for m in MATTER if not given.only or any(word in m.file for word in given.only)]
         counts: dict[str, Counter[str]] = {}
         bad = 0
-        for mutant, verdict, line in verdicts(where, [*matter, *sorted(set(drawn))]):
-            print(
-                f"{verdict:9} {mutant.file}: {mutant.function}, {mutant.kind} {mutant.number}: {line}",
-                flush=True,
-            )
+        for mutant, verdict, line in verdicts(where, [*matter, *sorted(drawn)]):
+            print(f"{verdict:9} {' '.join(map(str, mutant))}: {line}", flush=True)
             counts.setdefault(mutant.file.partition("/")[0], Counter())[verdict] += 1
             bad += mutant in matter and verdict != "killed"
     counts["all"] = sum(counts.values(), Counter())

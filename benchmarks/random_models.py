@@ -43,19 +43,7 @@ LONGEST_S = 120.0
 """Of one model, the first one's imports and compilation included."""
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _HINGE_OR_SLIDE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-_READ = (
-    "qpos",
-    "qvel",
-    "act",
-    "qacc",
-    "ctrl",
-    "xpos",
-    "xipos",
-    "sensordata",
-    "qfrc_actuator",
-    "cfrc_ext",
-    "mocap_pos",
-)
+_READ = ("qpos", "qvel", "act", "qacc", "ctrl", "xpos", "xipos", "qfrc_actuator", "cfrc_ext", "mocap_pos")
 
 
 class Machine(MujocoEnv):
@@ -159,9 +147,8 @@ def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random)
         proposed = _proposal(machine.action_space, rng)
         *_, info = env.step(proposed)
         executed = info["executed_action"]
-        if not (
-            np.isfinite(executed).all() and machine.action_space.contains(executed.astype(proposed.dtype))
-        ):
+        inside = machine.action_space.contains(executed.astype(proposed.dtype))
+        if not (inside and np.isfinite(executed).all()):
             raise DefectError(f"executed {executed} of {machine.action_space}")
         _check_forecast(onlooker, machine, executed)
         twin.step(executed.astype(proposed.dtype))
@@ -175,9 +162,8 @@ def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random)
 def _filtered(machine: Machine, plants: dict[str, Any], rng: random.Random) -> gym.Env[Any, Any]:
     """The machine with a filter of the first constraint that fits."""
     model, limits, unfit = machine.model, sw.constraints, []
-    scalar = [
-        n for j in range(model.njnt) if model.jnt_type[j] in _HINGE_OR_SLIDE and (n := model.joint(j).name)
-    ]
+    joints = [model.joint(j) for j in range(model.njnt) if model.jnt_type[j] in _HINGE_OR_SLIDE]
+    scalar = [joint.name for joint in joints if joint.name]
     body = model.body(model.nbody - 1).name
     some = rng.sample(scalar, min(2, len(scalar)))
     options = [
@@ -322,10 +308,8 @@ def main() -> None:
     path = RESULTS / "random_models.json"
     new = {"next_seed": 0, "mujoco": 0, "supported": 0, "refused": {}, "defects": []}
     counts: dict[str, Any] = json.loads(path.read_text()) if path.exists() else new
-    again, counts["defects"] = (
-        [defect["seed"] for defect in counts["defects"]],
-        [],
-    )  # they may have been mended
+    again = [defect["seed"] for defect in counts["defects"]]  # they may have been mended
+    counts["defects"] = []
     for seed, outcome, why in outcomes(itertools.chain(again, itertools.count(counts["next_seed"]))):
         if outcome == "defect":
             counts["defects"].append({"seed": seed, "why": why})

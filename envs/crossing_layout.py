@@ -1,7 +1,6 @@
 """Where everything stands when a crossing starts, and how a user asks for it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -9,11 +8,9 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
-from .goal_layout import Given, known, layout_option, numbers
+from .layout import PLACE, POSE, Form, Given, parse_layout
 from .traffic import CAR_MEAN_SPEED, CAR_SPEED_STD
 
-CROSSING_LAYOUT_KEYS: Final = ("agent", "goal", "cars", "pillars")
-"""What the crossing's ``reset(options={"layout": {...}})`` understands."""
 FIELD: Final = (4.0, 3.5)
 """The field is ``|x| <= 4``, ``|y| <= 3.5``, m: rails keep the robot in it."""
 LANE_CENTRES: Final = (-0.8, 0.8)
@@ -39,63 +36,43 @@ _SPARE: Final = 0.05  # m between the robot and a pillar, at least
 _TRIES: Final = 1000
 
 
-@dataclass(frozen=True)
-class CrossingLayout:
-    """A whole layout.
-
-    Attributes:
-        agent: Position and heading, shape (3,), m and rad.
-        goal: Centre, shape (2,), m.
-        cars: Position and velocity along x, shape (6, 2), m and m/s; the first three in the first lane.
-        pillars: Centres, shape (4, 2), m.
-    """
-
-    agent: Array
-    goal: Array
-    cars: Array
-    pillars: Array
+_FORMS: Final[dict[str, Form]] = {
+    "agent": POSE,
+    "goal": PLACE,
+    "cars": (f"[[x, v], ...] of {CARS} cars", (CARS, 2)),
+    "pillars": (f"[[x, y], ...] of {PILLARS} pillars", (PILLARS, 2)),
+}
 
 
 def parse_crossing_layout(options: Mapping[str, Any] | None) -> Given:
-    """Read the layout out of `reset`'s options.
-
-    Given positions are taken as they are, but for a robot that would stand outside the field or in a given pillar:
-    it would be thrown out. Options other than ``"layout"`` belong to wrappers and are left alone.
-
-    Args:
-        options: `reset`'s options; never changed.
+    """Read the layout out of `reset`'s options, as `parse_layout` does.
 
     Raises:
         UnknownNameError: An unknown layout key, or what looks like a misspelt ``"layout"``.
-        ConfigurationError: A wrong shape, a number that is not finite, or a robot where it cannot stand.
+        ConfigurationError: A wrong shape, a number that is not finite, or a robot that would stand outside the field
+            or in a given pillar: it would be thrown out.
     """
-    given = layout_option(options, CROSSING_LAYOUT_KEYS)
-    parsed = known(
-        agent=numbers(given, "agent", "[x, y, heading]", (3,)),
-        goal=numbers(given, "goal", "[x, y]", (2,)),
-        cars=numbers(given, "cars", f"[[x, v], ...] of {CARS} cars", (CARS, 2)),
-        pillars=numbers(given, "pillars", f"[[x, y], ...] of {PILLARS} pillars", (PILLARS, 2)),
-    )
+    parsed = parse_layout(options, _FORMS)
     if "agent" in parsed:
-        _check_agent(parsed["agent"], parsed.get("pillars"))
+        _check_agent(parsed["agent"][:2], parsed.get("pillars", np.zeros((0, 2))))
     return parsed
 
 
-def _check_agent(agent: Array, pillars: Array | None) -> None:
+def _check_agent(place: Array, pillars: Array) -> None:
     room = np.array(FIELD) - ROBOT_RADIUS
-    if (np.abs(agent[:2]) > room).any():
+    if (np.abs(place) > room).any():
         raise ConfigurationError(
             f"layout 'agent' must stand inside the rails, |x| <= {room[0]:g} and |y| <= {room[1]:g};"
-            f" got {agent[:2].tolist()}"
+            f" got {place.tolist()}"
         )
-    if pillars is not None and _slack(agent[:2], pillars) < 0.0:
+    if _slack(place, pillars) < 0.0:
         raise ConfigurationError(
             f"layout 'agent' stands in a pillar: its centre must be {ROBOT_RADIUS + PILLAR_RADIUS:g} m or more"
-            f" from each pillar's; got {agent[:2].tolist()} and pillars {pillars.tolist()}"
+            f" from each pillar's; got {place.tolist()} and pillars {pillars.tolist()}"
         )
 
 
-def sample_crossing_layout(rng: np.random.Generator, given: Given) -> CrossingLayout:
+def sample_crossing_layout(rng: np.random.Generator, given: Given) -> dict[str, Array]:
     """Sample what is missing of a layout; given parts are kept as they are.
 
     The robot starts on the lower pavement and faces the road; the goal lies on the other side. In each lane the first
@@ -111,14 +88,15 @@ def sample_crossing_layout(rng: np.random.Generator, given: Given) -> CrossingLa
     """
     parts = dict(given)
     if "agent" not in parts:
-        parts["agent"] = _sample_agent(rng, given.get("pillars"))
+        place = _sample_clear(rng, _AGENT_REACH, -_PAVEMENT, given.get("pillars", np.zeros((0, 2))))
+        parts["agent"] = np.append(place, 0.5 * np.pi)
     if "pillars" not in parts:
         parts["pillars"] = _sample_pillars(rng, parts["agent"], given.get("goal"))
     if "goal" not in parts:
         parts["goal"] = sample_crossing_goal(rng, parts["agent"][:2], parts["pillars"])
     if "cars" not in parts:
         parts["cars"] = _sample_cars(rng)
-    return CrossingLayout(**parts)
+    return parts
 
 
 def sample_crossing_goal(rng: np.random.Generator, agent: Array, pillars: Array) -> Array:
@@ -146,14 +124,6 @@ def _sample_clear(rng: np.random.Generator, reach: float, y: float, pillars: Arr
     )
 
 
-def _sample_agent(rng: np.random.Generator, pillars: Array | None) -> Array:
-    if pillars is None:
-        place = np.array([rng.uniform(-_AGENT_REACH, _AGENT_REACH), -_PAVEMENT])
-    else:
-        place = _sample_clear(rng, _AGENT_REACH, -_PAVEMENT, pillars)
-    return np.append(place, 0.5 * np.pi)
-
-
 def _sample_pillars(rng: np.random.Generator, agent: Array, goal: Array | None) -> Array:
     """Pillars beside the robot, and beside the goal if that stands already."""
     taken = agent[None, :2] if goal is None else np.stack([agent[:2], goal])
@@ -177,4 +147,4 @@ def _sample_cars(rng: np.random.Generator) -> Array:
 
 def _slack(point: Array, pillars: Array) -> float:
     """Room between the robot at a point and the nearest pillar, m; negative inside."""
-    return float(np.hypot(*(pillars - point).T).min()) - ROBOT_RADIUS - PILLAR_RADIUS
+    return float(np.hypot(*(pillars - point).T).min(initial=np.inf)) - ROBOT_RADIUS - PILLAR_RADIUS

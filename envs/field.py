@@ -1,12 +1,14 @@
-"""What the tasks with goals on a field have in common: layouts, what a step earns, and goals that move on."""
+"""What the package's own tasks have in common: how a step goes, layouts, goals that move on."""
 
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
@@ -14,39 +16,44 @@ from safe_wrappers.checks import Array, finite_action
 from safe_wrappers.errors import SafeWrappersError
 from safe_wrappers.info import GOALS_REACHED
 
-from .goal_layout import Given
+from .layout import Given
 
 GOAL_MET: Final = "goal_met"
 """bool: this step reached the goal (a new one stands already)."""
 
+ASSETS: Final = Path(__file__).parent / "assets"
+"""Where the models are."""
+METADATA: Final[dict[str, Any]] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}
 
-class FieldEnv(MujocoEnv, EzPickle):
-    """Base of tasks in which a robot, whose first two coordinates are its x and y in m, drives to goals.
 
-    **Reward**: distance to the goal gained in a control step (m), plus 1 on coming within `goal_radius` of it; then a
-    new goal is sampled and the episode goes on.
+class TaskEnv(MujocoEnv, EzPickle):
+    """Base of the tasks: an action is held for a control step, which is judged and observed at its end.
+
+    Args:
+        asset: File of the model.
+        frame_skip: Physics substeps per control step.
+        space: Of the observations, float64; or how many numbers they have, without bounds.
+        camera: Where a free camera stands, if the user does not say.
+        kwargs: Passed to `gymnasium.envs.mujoco.MujocoEnv`.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
-        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
-        "render_fps": 50,
-    }
-
-    goal_radius: ClassVar[float]
-    """Distance from the goal's centre at which it counts as reached, m."""
     _given: Given = {}  # noqa: RUF012 (never changed)
-    _targets: Array
-    """Centres in the plane, the goal's first, shape (n, 2), m."""
-    _goal_met = False
-    _goals_reached = 0
 
-    @abstractmethod
+    def __init__(
+        self, asset: str, frame_skip: int, space: Box | int, camera: dict[str, Any], **kwargs: Any
+    ) -> None:
+        if isinstance(space, int):
+            space = Box(-np.inf, np.inf, (space,), dtype=np.float64)
+        kwargs.setdefault("default_camera_config", camera)
+        super().__init__(str(ASSETS / asset), frame_skip, space, **kwargs)
+
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
         """The layout among `reset`'s options."""
+        return {}
 
     @abstractmethod
-    def _next_goal(self) -> Array:
-        """A new goal's centre, shape (2,), m."""
+    def _reward(self) -> float:
+        """Of the control step that was just made."""
 
     @abstractmethod
     def observe(self) -> Array:
@@ -59,16 +66,6 @@ class FieldEnv(MujocoEnv, EzPickle):
     def _is_over(self) -> bool:
         """Whether the episode terminates."""
         return False
-
-    @property
-    def agent_position(self) -> Array:
-        """The robot's centre, shape (2,), m; from qpos, never a substep behind as xpos is after mj_step."""
-        return np.array(self.data.qpos[:2])
-
-    @property
-    def goal_position(self) -> Array:
-        """Goal's centre, shape (2,), m."""
-        return np.array(self._targets[0])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -93,16 +90,8 @@ class FieldEnv(MujocoEnv, EzPickle):
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
             SafeWrappersError: The physics left finite numbers.
         """
-        control = finite_action(action, self.model.nu)
-        before = self._goal_distance()
-        self._step_mujoco_simulation(control, self.frame_skip)  # type: ignore[no-untyped-call]
-        distance = self._goal_distance()
-        reward = before - distance
-        self._goal_met = distance <= self.goal_radius
-        if self._goal_met:
-            reward += 1.0
-            self._goals_reached += 1
-            self.place_goal(self._next_goal())
+        self._step_mujoco_simulation(finite_action(action, self.model.nu), self.frame_skip)  # type: ignore[no-untyped-call]
+        reward = self._reward()
         observation = self.observe()
         if not self._is_finite(observation):
             raise SafeWrappersError("the state is not finite: one that was set, or a changed model, broke it")
@@ -110,8 +99,62 @@ class FieldEnv(MujocoEnv, EzPickle):
             self.render()  # type: ignore[no-untyped-call]
         return observation, reward, self._is_over(), False, self._get_reset_info()
 
+
+class FieldEnv(TaskEnv):
+    """Base of tasks in which a robot, whose first two coordinates are its x and y in m, drives to goals.
+
+    **Reward**: distance to the goal gained in a control step (m), plus 1 on coming within `goal_radius` of it; then a
+    new goal is sampled and the episode goes on.
+    """
+
+    metadata: dict[str, Any] = {**METADATA, "render_fps": 50}  # noqa: RUF012 (Gymnasium's)
+
+    goal_radius: ClassVar[float]
+    """Distance from the goal's centre at which it counts as reached, m."""
+    _targets: Array
+    """Centres in the plane, the goal's first, shape (n, 2), m."""
+    _goal_met = False
+    _goals_reached = 0
+
+    @abstractmethod
+    def _next_goal(self) -> Array:
+        """A new goal's centre, shape (2,), m."""
+
+    @property
+    def agent_position(self) -> Array:
+        """The robot's centre, shape (2,), m; from qpos, never a substep behind as xpos is after mj_step."""
+        return np.array(self.data.qpos[:2])
+
+    @property
+    def goal_position(self) -> Array:
+        """Goal's centre, shape (2,), m."""
+        return np.array(self._targets[0])
+
+    def step(  # type: ignore[override]
+        self, action: NDArray[np.floating[Any]]
+    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """As `TaskEnv.step`."""
+        self._before = self._goal_distance()
+        return super().step(action)
+
+    def _reward(self) -> float:
+        distance = self._goal_distance()
+        reward = self._before - distance
+        self._goal_met = distance <= self.goal_radius
+        if self._goal_met:
+            reward += 1.0
+            self._goals_reached += 1
+            self.place_goal(self._next_goal())
+        return reward
+
     def _get_reset_info(self) -> dict[str, Any]:
         return {GOAL_MET: self._goal_met, GOALS_REACHED: self._goals_reached}
+
+    def _begin(self, goal: Array, *objects: Array) -> None:
+        """A new episode: no goal reached, and what the lidars see stands at these centres, shapes (n, 2), m."""
+        self._goals_reached, self._goal_met = 0, False
+        self._targets = np.concatenate([goal[None], *objects])
+        self.place_goal(goal)
 
     def place_goal(self, goal: Array) -> None:
         """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""

@@ -2,18 +2,16 @@
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_action
+from safe_wrappers.checks import Array
 from safe_wrappers.info import COST, COST_SUBSTEP, IS_SUCCESS
+
+from .field import METADATA, TaskEnv
 
 VIBRATION_ENERGY: Final = "vibration_energy"
 """float64, J: the largest boundary-layer energy at the ends of this control step's physics substeps."""
@@ -37,7 +35,6 @@ _TORQUE_PRICE: Final = 0.01  # of the reward, per squared share of the full torq
 _START: Final = (0.0, 1.5)  # rad, the motors: the elbow bent
 _START_SPREAD: Final = 0.1  # rad
 _TARGET_RADII: Final = (0.2, 0.55)  # m from the base; the arm reaches 0.6
-_ASSET: Final = Path(__file__).parent / "assets" / "flex_joint_reach.xml"
 _CAMERA: Final = {"distance": 1.6, "elevation": -60.0, "azimuth": 90.0, "lookat": np.zeros(3)}
 
 
@@ -127,9 +124,8 @@ class FlexibleArm:
         f0 = u0 + sin * speed1 * (2.0 * speed0 + speed1)
         f1 = u1 - sin * speed0 * speed0
         share = 1.0 / (n00 * n11 - n01 * n01)
-        x0 = (
-            k0 * p0 + u0 - j0 * share * (n11 * f0 - n01 * f1)
-        )  # z0 - z, as the springs' angles are link - motor
+        # z0 - z, as the springs' angles are link - motor.
+        x0 = k0 * p0 + u0 - j0 * share * (n11 * f0 - n01 * f1)
         x1 = k1 * p1 + u1 - j1 * share * (n00 * f1 - n01 * f0)
         w0, w1 = j0 * r0, j1 * r1
         stored = x0 * x0 / k0 + x1 * x1 / k1
@@ -138,7 +134,7 @@ class FlexibleArm:
         return energy.T  # the first transpose turned all leading axes round
 
 
-class FlexJointReachEnv(MujocoEnv, EzPickle):
+class FlexJointReachEnv(TaskEnv):
     """A level two-link arm with elastic joints reaches for a target: Reacher with real torques and gears that ring.
 
     Each joint is a motor and a link with a spring between them (Spong 1987): two inertias per joint, resonances
@@ -176,22 +172,14 @@ class FlexJointReachEnv(MujocoEnv, EzPickle):
         True
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
-        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
-        "render_fps": 100,
-    }
+    metadata: dict[str, Any] = {**METADATA, "render_fps": 100}  # noqa: RUF012 (Gymnasium's)
 
     def __init__(self, **kwargs: Any) -> None:
         EzPickle.__init__(self, **kwargs)
-        kwargs.setdefault("default_camera_config", _CAMERA)
-        MujocoEnv.__init__(
-            self, str(_ASSET), _FRAME_SKIP, Box(-np.inf, np.inf, (14,), dtype=np.float64), **kwargs
-        )
+        super().__init__("flex_joint_reach.xml", _FRAME_SKIP, 14, _CAMERA, **kwargs)
         self.arm = FlexibleArm.of_model(self.model)
         self._rating = np.array(TORQUE_RATING)
         self._full_torque = self.model.actuator_ctrlrange[:, 1].copy()
-        self._qpos_path = np.zeros((_FRAME_SKIP, self.model.nq))
-        self._qvel_path = np.zeros((_FRAME_SKIP, self.model.nv))
         self._target = np.array(self.data.mocap_pos[0, :2])
         self._judge_now()
 
@@ -203,7 +191,8 @@ class FlexJointReachEnv(MujocoEnv, EzPickle):
     @property
     def fingertip_position(self) -> Array:
         """Fingertip in the plane, shape (2,), m; from qpos, so never a substep behind."""
-        return self.arm.fingertip(self._link_angles())
+        qpos = self.data.qpos
+        return self.arm.fingertip(qpos[MOTORS] + qpos[SPRINGS])
 
     def place_target(self, target: Array) -> None:
         """Move the target to x, y, shape (2,), m."""
@@ -212,7 +201,10 @@ class FlexJointReachEnv(MujocoEnv, EzPickle):
 
     def reset_model(self) -> Array:
         """Draw a start and a target, return the observation."""
-        self.place_target(self._draw_target())
+        inner, outer = _TARGET_RADII
+        radius = math.sqrt(self.np_random.uniform(inner**2, outer**2))
+        angle = self.np_random.uniform(-math.pi, math.pi)
+        self.place_target(np.array([radius * math.cos(angle), radius * math.sin(angle)]))
         qpos = self.init_qpos.copy()
         qpos[MOTORS] = _START + self.np_random.uniform(-_START_SPREAD, _START_SPREAD, 2)
         self.set_state(qpos, np.zeros(self.model.nv))
@@ -223,40 +215,18 @@ class FlexJointReachEnv(MujocoEnv, EzPickle):
         super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         self._judge_now()
 
-    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
-    def step(  # type: ignore[override]
-        self, action: NDArray[np.floating[Any]]
-    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold the torques for one control step.
-
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
-        """
-        control = finite_action(action, self.model.nu)
-        self._step_mujoco_simulation(control, self.frame_skip)
+    def _reward(self) -> float:
         share = self.data.actuator_force / self._full_torque
         self._reward_dist = -self._distance
         self._reward_ctrl = -_TORQUE_PRICE * float(share @ share)
-        info = self._get_reset_info()
-        if self.render_mode == "human":
-            self.render()  # type: ignore[no-untyped-call]
-        return self.observe(), self._reward_dist + self._reward_ctrl, False, False, info
+        return self._reward_dist + self._reward_ctrl
 
     def observe(self) -> Array:
         """Observation of the state as it is now: also right after `set_state` or `place_target`."""
         qpos, qvel = self.data.qpos, self.data.qvel
         motors = qpos[MOTORS]
-        return np.concatenate(
-            [
-                np.cos(motors),
-                np.sin(motors),
-                qvel[MOTORS],
-                -qpos[SPRINGS],
-                -qvel[SPRINGS],
-                self._target,
-                self.fingertip_position - self._target,
-            ]
-        )
+        angles = [np.cos(motors), np.sin(motors), qvel[MOTORS], -qpos[SPRINGS], -qvel[SPRINGS]]
+        return np.concatenate([*angles, self._target, self.fingertip_position - self._target])
 
     def _get_reset_info(self) -> dict[str, Any]:
         cost = float(self._overloaded)
@@ -275,10 +245,7 @@ class FlexJointReachEnv(MujocoEnv, EzPickle):
         """Step substep by substep, keep every state, judge them together at the end."""
         model, data = self.model, self.data
         data.ctrl[:] = ctrl
-        if len(self._qpos_path) != n_frames:
-            self._qpos_path = np.zeros((n_frames, model.nq))
-            self._qvel_path = np.zeros((n_frames, model.nv))
-        qpos, qvel = self._qpos_path, self._qvel_path
+        qpos, qvel = np.zeros((n_frames, model.nq)), np.zeros((n_frames, model.nv))
         for k in range(n_frames):
             mujoco.mj_step(model, data)
             qpos[k], qvel[k] = data.qpos, data.qvel
@@ -295,13 +262,3 @@ class FlexJointReachEnv(MujocoEnv, EzPickle):
         self._overloaded = not bool((deflection * self.arm.stiffness <= self._rating).all())
         self._energy = float(self.arm.vibration_energy(qpos, qvel, self.data.actuator_force).max())
         self._distance = math.dist(self.fingertip_position, self._target)
-
-    def _link_angles(self) -> Array:
-        qpos = self.data.qpos
-        return np.asarray(qpos[MOTORS] + qpos[SPRINGS])
-
-    def _draw_target(self) -> Array:
-        inner, outer = _TARGET_RADII
-        radius = math.sqrt(self.np_random.uniform(inner**2, outer**2))
-        angle = self.np_random.uniform(-math.pi, math.pi)
-        return np.array([radius * math.cos(angle), radius * math.sin(angle)])

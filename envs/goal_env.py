@@ -1,12 +1,11 @@
 """The goal tasks: reach goals, keep out of hazards, leave vases alone, with a point or a car."""
 
 from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
@@ -15,25 +14,25 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP
 
-from .field import FieldEnv
-from .goal_layout import (
-    GOAL_RADIUS,
-    HAZARD_RADIUS,
-    LEVELS,
-    VASE_HALF_SIZE,
-    VASE_SPEED_LIMIT,
-    Given,
-    Layout,
-    parse_layout,
-    sample_goal,
-    sample_layout,
-)
+from .field import ASSETS, FieldEnv
 from .goal_robots import CAR, LIDAR_BINS, POINT, Robot, pseudo_lidar
+from .layout import PLACE, POSE, Given, parse_layout, place_goal_beside, place_objects, places
 
 COST_HAZARDS: Final = "cost_hazards"
 """float: 1 if the robot's centre is inside a hazard's disc at the end of the step, else 0."""
 COST_VASES: Final = "cost_vases"
 """float: 1 if a vase is touched or moves at the end of the step, else 0 (always 0 below level 2)."""
+
+GOAL_RADIUS: Final = 0.3
+"""Distance from the goal's centre at which it counts as reached, m."""
+HAZARD_RADIUS: Final = 0.2
+"""Radius of a hazard's disc, m: the robot's centre must stay outside."""
+VASE_HALF_SIZE: Final = 0.1
+"""Half of a vase cube's edge, m."""
+VASE_SPEED_LIMIT: Final = 1e-4
+"""Speed above which a vase counts as moved, m/s (level 2)."""
+KEEPOUTS: Final = {"agent": 0.4, "goal": 0.305, "hazards": 0.18, "vases": 0.15}
+"""m; like the levels' numbers measured from Safety-Gymnasium 1.2's compiled models, but for level 0."""
 
 _FRAME_SKIP: Final = 10
 _REWARD_LIMIT: Final = 10.0
@@ -42,10 +41,33 @@ _GOAL_Z: Final = 0.16
 _HAZARD_Z: Final = 0.02
 _PARKED: Final = 1000.0  # m: objects outside the scenario, farther than a robot gets in an episode
 _SLEEP_TOLERANCE: Final = 1e-7  # m/s: a thousandth of the speed that costs
-_ASSETS: Final = Path(__file__).parent / "assets"
 _CAMERA: Final = {"elevation": -65.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.25, 0.0])}
-_CAMERA_DISTANCE: Final = 2.8
-"""Of the camera, in half extents of the field."""
+_CAMERA_DISTANCE: Final = 2.8  # in half extents of the field
+
+
+@dataclass(frozen=True)
+class Level:
+    """One difficulty of the goal task.
+
+    Attributes:
+        hazards: Number of hazard discs in the model; a layout may use fewer.
+        vases: Number of vases in the model; a layout may use fewer.
+        half_extent: The field is the square [-half_extent, half_extent]^2, m; objects are sampled in it.
+        vases_cost: Whether touching or moving a vase costs.
+    """
+
+    hazards: int
+    vases: int
+    half_extent: float
+    vases_cost: bool
+
+
+LEVELS: Final = (
+    Level(hazards=0, vases=0, half_extent=1.0, vases_cost=False),
+    Level(hazards=8, vases=1, half_extent=1.5, vases_cost=False),
+    Level(hazards=10, vases=10, half_extent=2.0, vases_cost=True),
+)
+"""Levels 0, 1 and 2."""
 
 
 class SafeGoalEnv(FieldEnv):
@@ -92,24 +114,17 @@ class SafeGoalEnv(FieldEnv):
             raise ConfigurationError(f"level must be one of 0, 1, 2; got {level!r}")
         self.robot = robot
         self.level = LEVELS[level]
-        seen = {**_CAMERA, "distance": _CAMERA_DISTANCE * self.level.half_extent}
-        kwargs.setdefault("default_camera_config", seen)
-        kinds = 1 + (self.level.hazards > 0) + (self.level.vases > 0)
-        low = np.concatenate([np.full(robot.n_sensors, -np.inf), np.zeros(kinds * LIDAR_BINS)])
-        high = np.concatenate([np.full(robot.n_sensors, np.inf), np.ones(kinds * LIDAR_BINS)])
-        MujocoEnv.__init__(
-            self,
-            str(_ASSETS / f"{robot.name}_goal{level}.xml"),
-            _FRAME_SKIP,
-            Box(low, high, dtype=np.float64),
-            **kwargs,
-        )
-        self._kinds = kinds
-        self._hazard_group = 1
-        self._vase_group = 1 + (self.level.hazards > 0)
-        first = int(self.model.joint("vase0").qposadr[0]) if self.level.vases else self.model.nq
+        camera = {**_CAMERA, "distance": _CAMERA_DISTANCE * self.level.half_extent}
+        self._kinds = 1 + (self.level.hazards > 0) + (self.level.vases > 0)
+        bins = self._kinds * LIDAR_BINS
+        low = np.concatenate([np.full(robot.n_sensors, -np.inf), np.zeros(bins)])
+        high = np.concatenate([np.full(robot.n_sensors, np.inf), np.ones(bins)])
+        space = Box(low, high, dtype=np.float64)
+        super().__init__(f"{robot.name}_goal{level}.xml", _FRAME_SKIP, space, camera, **kwargs)
+        joint = self.model.joint("vase0") if self.level.vases else None
+        first = int(joint.qposadr[0]) if joint else self.model.nq
         self._vases_qpos = slice(first, first + 7 * self.level.vases)
-        first = int(self.model.joint("vase0").dofadr[0]) if self.level.vases else self.model.nv
+        first = int(joint.dofadr[0]) if joint else self.model.nv
         self._vases_qvel = slice(first, first + 6 * self.level.vases)
         self._touch_side = self._sides_of_geoms()
         if hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP"):
@@ -117,10 +132,7 @@ class SafeGoalEnv(FieldEnv):
             self.model.opt.sleep_tolerance = _SLEEP_TOLERANCE
             # With sleeping on, MuJoCo computes the poses of what never moves here alone (3.13 and later).
             mujoco.mj_resetData(self.model, self.data)
-        self._path = np.zeros((_FRAME_SKIP, 2))
-        self._apply(Layout(np.zeros(3), np.zeros(2), np.zeros((0, 2)), np.zeros((0, 2))))
-
-    # What a constraint may read: from qpos, never a substep behind as xpos is after mj_step ----------------
+        self._apply(np.zeros(3), np.zeros(2), np.zeros((0, 2)), np.zeros((0, 2)))
 
     @property
     def agent_heading(self) -> float:
@@ -140,16 +152,17 @@ class SafeGoalEnv(FieldEnv):
     @property
     def robot_model(self) -> mujoco.MjModel:
         """The robot alone on the floor, with nothing to hit: for a plant that has only its motion to forecast."""
-        return mujoco.MjModel.from_xml_path(str(_ASSETS / f"{self.robot.name}_goal0.xml"))
-
-    # Gymnasium ---------------------------------------------------------------------------------------------
+        return mujoco.MjModel.from_xml_path(str(ASSETS / f"{self.robot.name}_goal0.xml"))
 
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
-        return parse_layout(options, self.level)
+        hazards, vases = places(self.level.hazards), places(self.level.vases)
+        return parse_layout(options, {"agent": POSE, "goal": PLACE, "hazards": hazards, "vases": vases})
 
     def reset_model(self) -> Array:
         """Sample what the options left open, place everything, return the observation."""
-        self._apply(sample_layout(self.np_random, self.level, self._given))
+        level = self.level
+        counts = {"hazards": level.hazards, "vases": level.vases}
+        self._apply(**place_objects(self.np_random, level.half_extent, KEEPOUTS, counts, self._given))
         return self.observe()
 
     def set_state(self, qpos: Array, qvel: Array) -> None:
@@ -157,21 +170,16 @@ class SafeGoalEnv(FieldEnv):
         super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         self._judge_now()
 
-    def step(  # type: ignore[override]
-        self, action: NDArray[np.floating[Any]]
-    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold an action for one control step (`dt` seconds, ten physics substeps).
-
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
-        """
-        observation, reward, terminated, truncated, info = super().step(action)
-        return observation, max(-_REWARD_LIMIT, min(_REWARD_LIMIT, reward)), terminated, truncated, info
+    def _reward(self) -> float:
+        return max(-_REWARD_LIMIT, min(_REWARD_LIMIT, super()._reward()))
 
     def _next_goal(self) -> Array:
-        return sample_goal(
-            self.np_random, self.level, self.agent_position, self._hazards, self.vase_positions
-        )
+        standing = {
+            "agent": self.agent_position[None],
+            "hazards": self._hazards,
+            "vases": self.vase_positions,
+        }
+        return place_goal_beside(self.np_random, self.level.half_extent, KEEPOUTS, standing)
 
     def _get_reset_info(self) -> dict[str, Any]:
         return {
@@ -182,16 +190,12 @@ class SafeGoalEnv(FieldEnv):
             **super()._get_reset_info(),
         }
 
-    # Physics and judging -----------------------------------------------------------------------------------
-
     def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:
         """Step substep by substep, keeping what the judge needs of each; judge them together at the end."""
         model, data, qpos = self.model, self.data, self.data.qpos
         data.ctrl[:] = ctrl
         judge_vases = self.level.vases_cost and self._n_vases > 0
-        if len(self._path) != n_frames:
-            self._path = np.zeros((n_frames, 2))
-        path = self._path
+        self._path = path = np.zeros((n_frames, 2))
         touched = moved = moving = False
         for k in range(n_frames):
             mujoco.mj_step(model, data)
@@ -238,35 +242,28 @@ class SafeGoalEnv(FieldEnv):
         """+1 for the robot's geoms, -1 for vases, 2 for all else: only a robot-vase pair sums to 0."""
         roots = self.model.body_rootid[self.model.geom_bodyid]
         sides = np.full(self.model.ngeom, 2, dtype=np.int8)
-        sides[roots == self.model.body(self.robot.body).id] = 1
+        sides[roots == self.model.body("agent").id] = 1
         for i in range(self.level.vases):
             sides[roots == self.model.body(f"vase{i}").id] = -1
         return sides
 
-    # Scenario ----------------------------------------------------------------------------------------------
-
-    def _apply(self, layout: Layout) -> None:
+    def _apply(self, agent: Array, goal: Array, hazards: Array, vases: Array) -> None:
         """Start an episode from a layout, at rest."""
-        self._goals_reached = 0
-        self._goal_met = False
-        self._hazards = layout.hazards
-        self._n_vases = len(layout.vases)
-        n_hazards = len(layout.hazards)
-        sizes = [1, n_hazards, self._n_vases]
-        self._groups = np.repeat([0, self._hazard_group, self._vase_group], sizes)
-        self._targets = np.concatenate([layout.goal[None], layout.hazards, layout.vases])
+        self._hazards, self._n_vases = hazards, len(vases)
+        # Of the lidars: without hazards, vases are the second.
+        self._groups = np.repeat([0, 1, 1 + (self.level.hazards > 0)], [1, len(hazards), len(vases)])
         mocap = self.data.mocap_pos
         mocap[1:, :2] = _PARKED
-        mocap[1 : 1 + n_hazards, :2] = layout.hazards
+        mocap[1 : 1 + len(hazards), :2] = hazards
         mocap[1:, 2] = _HAZARD_Z
-        self.place_goal(layout.goal)
+        self._begin(goal, hazards, vases)
         qpos = self.init_qpos.copy()
-        self.robot.place(qpos, layout.agent)
-        vases = qpos[self._vases_qpos].reshape(-1, 7)
-        vases[:, 0] = _PARKED
-        vases[:, 1] = np.arange(self.level.vases)  # a metre apart, so that parked vases do not touch
-        vases[:, 2] = _VASE_Z
-        vases[: self._n_vases, :2] = layout.vases
+        self.robot.place(qpos, agent)
+        poses = qpos[self._vases_qpos].reshape(-1, 7)
+        poses[:, 0] = _PARKED
+        poses[:, 1] = np.arange(self.level.vases)  # a metre apart, so that parked vases do not touch
+        poses[:, 2] = _VASE_Z
+        poses[: self._n_vases, :2] = vases
         self.set_state(qpos, np.zeros(self.model.nv))
 
     def place_goal(self, goal: Array) -> None:
@@ -333,10 +330,7 @@ class SafeCarGoalEnv(SafeGoalEnv):
         kwargs: Passed to `SafeGoalEnv` (``render_mode``, ``width``, ``height``, ``camera_name``, ...).
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
-        **SafeGoalEnv.metadata,
-        "render_fps": 25,
-    }
+    metadata: dict[str, Any] = {**SafeGoalEnv.metadata, "render_fps": 25}  # noqa: RUF012 (Gymnasium's)
 
     def __init__(self, level: int = 1, **kwargs: Any) -> None:
         # EzPickle rebuilds the class from these arguments, so it must see this class's signature.

@@ -25,30 +25,32 @@ _QUARTER_TURN: Final = math.pi / 2.0
 
 
 @dataclass(frozen=True)
-class PlanarRobot:
-    """A robot whose first three joints are world x, world y and heading.
+class Hull:
+    """A robot whose root body is called "agent"; every geom in its subtree counts as the robot.
 
     Attributes:
         name: Prefix of its assets: ``<name>_goal<level>.xml``.
-        body: Name of its root body; every geom in its subtree counts as the robot.
         n_sensors: Length of its sensors' readings, which open the observation.
-        hull_radius: Radius of its main body around the turning axis, m.
-        hull_corners: Points of its outline beyond that radius, in its frame, m.
+        hull_corners: Points of its outline, in the body's frame seen from above, m.
+        hull_radius: Of a disc around its centre that belongs to the outline, too, m.
     """
 
     name: str
-    body: str
     n_sensors: int
-    hull_radius: float
     hull_corners: tuple[tuple[float, float], ...]
+    hull_radius: float = 0.0
 
     @property
     def radius(self) -> float:
-        """Largest distance of any point of the robot from its turning axis, m."""
+        """Largest horizontal distance of any point of the upright robot from its centre, m."""
         return max(self.hull_radius, *(math.hypot(x, y) for x, y in self.hull_corners))
 
+
+class PlanarRobot(Hull):
+    """A robot whose first three joints are world x, world y and heading."""
+
     def place(self, qpos: Array, pose: Array) -> None:
-        """The pose is the first three coordinates."""
+        """Stand at a pose: x, y, heading, shape (3,), m and rad."""
         qpos[:3] = pose
 
     def heading(self, qpos: Array) -> float:
@@ -70,37 +72,19 @@ class PlanarRobot:
 
 POINT: Final = PlanarRobot(
     name="point",
-    body="agent",
     n_sensors=12,  # accelerometer, velocimeter, gyro, magnetometer
-    hull_radius=0.1,
     hull_corners=((0.15, 0.05), (0.15, -0.05)),
+    hull_radius=0.1,
 )
 """A sphere that pushes along its heading and turns, with a box for a nose."""
 
 
-@dataclass(frozen=True)
-class WheeledCar:
+class WheeledCar(Hull):
     """A car on a free joint, which opens the configuration: x, y, z, quaternion.
 
     Its wheels' axle is the x axis of its body, and positive controls drive it along -y: `heading` is that
     direction. Its lidar counts from the x axis, as the original's does: bin 0 looks to the heading's left.
-
-    Attributes:
-        name: Prefix of its assets: ``<name>_goal<level>.xml``.
-        body: Name of its root body; every geom in its subtree counts as the robot.
-        n_sensors: 15 sensors, then the caster's orientation as a rotation matrix, by rows.
-        corners: Corners of its outline in its body's frame, m: chassis with wheels, bumpers.
     """
-
-    name: str
-    body: str
-    n_sensors: int
-    corners: tuple[tuple[float, float], ...]
-
-    @property
-    def radius(self) -> float:
-        """Largest horizontal distance of any point of the upright car from its centre, m."""
-        return max(math.hypot(x, y) for x, y in self.corners)
 
     def place(self, qpos: Array, pose: Array) -> None:
         """Stand upright on the floor with the driving direction along the pose's heading."""
@@ -136,10 +120,9 @@ def _rotation(quaternion: Array) -> Array:
 
 CAR: Final = WheeledCar(
     name="car",
-    body="agent",
     n_sensors=24,  # accelerometer, velocimeter, gyro, magnetometer, caster's turning, its 3 x 3 orientation
     # The chassis, the back bumper, the front bumper, the wheels' outer rims.
-    corners=((0.1, -0.1), (0.1, 0.16), (0.05, -0.175), (0.155, 0.15), (0.155, 0.05)),
+    hull_corners=((0.1, -0.1), (0.1, 0.16), (0.05, -0.175), (0.155, 0.15), (0.155, 0.05)),
 )
 """Safety-Gymnasium's car."""
 

@@ -2,13 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
 from safe_wrappers.checks import Array
@@ -23,13 +20,12 @@ from .crossing_layout import (
     PILLAR_RADIUS,
     PILLARS,
     ROBOT_RADIUS,
-    CrossingLayout,
     parse_crossing_layout,
     sample_crossing_goal,
     sample_crossing_layout,
 )
 from .field import FieldEnv
-from .goal_layout import Given
+from .layout import Given
 from .traffic import CAR_ACCELERATION_NOISE, CAR_MEAN_SPEED, CAR_TIME_CONSTANT_S, Traffic
 
 CAR_BODIES: Final = tuple(f"car{i}" for i in range(CARS))
@@ -40,7 +36,6 @@ CAR_RADIUS: Final = 0.4
 _FRAME_SKIP: Final = 4
 _CARS: Final = slice(3, 3 + CARS)  # coordinates: robot x, y, heading, then the cars' x
 _CONTACT_SQUARED: Final = (CAR_RADIUS + ROBOT_RADIUS) ** 2
-_ASSET: Final = Path(__file__).parent / "assets" / "occluded_crossing.xml"
 _CAMERA: Final = {"distance": 10.0, "elevation": -60.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
 
 
@@ -103,9 +98,7 @@ class OccludedCrossingEnv(FieldEnv):
 
     def __init__(self, **kwargs: Any) -> None:
         EzPickle.__init__(self, **kwargs)
-        kwargs.setdefault("default_camera_config", _CAMERA)
-        space = Box(-np.inf, np.inf, (9 + 2 * PILLARS,), dtype=np.float64)
-        MujocoEnv.__init__(self, str(_ASSET), _FRAME_SKIP, space, **kwargs)
+        super().__init__("occluded_crossing.xml", _FRAME_SKIP, 9 + 2 * PILLARS, _CAMERA, **kwargs)
         self._lanes = np.repeat(LANE_CENTRES, CARS_PER_LANE)
         self._mean_velocities = CAR_MEAN_SPEED * np.repeat([1.0, -1.0], CARS_PER_LANE)
         self._traffic = Traffic(self._mean_velocities, self.model.opt.timestep, _FRAME_SKIP)
@@ -114,9 +107,7 @@ class OccludedCrossingEnv(FieldEnv):
         ways = [Motion(along, CAR_TIME_CONSTANT_S, np.array([v * CAR_MEAN_SPEED, 0.0])) for v in (1.0, -1.0)]
         self._tracks = Tracks([motion for motion in ways for _ in range(CARS_PER_LANE)])
         cars = np.stack([np.zeros(CARS), self._mean_velocities], axis=1)
-        self._apply(CrossingLayout(np.array([0.0, -2.9, 0.0]), np.zeros(2), cars, np.zeros((PILLARS, 2))))
-
-    # What a constraint or a judge may read: from qpos, never a substep behind ------------------------------
+        self._apply(np.array([0.0, -2.9, 0.0]), np.zeros(2), cars, np.zeros((PILLARS, 2)))
 
     @property
     def agent_velocity(self) -> Array:
@@ -151,8 +142,6 @@ class OccludedCrossingEnv(FieldEnv):
         self._tracks.start(states, np.zeros((CARS, 4, 4)))
         return self._tracks
 
-    # Gymnasium ---------------------------------------------------------------------------------------------
-
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
         return parse_crossing_layout(options)
 
@@ -161,7 +150,7 @@ class OccludedCrossingEnv(FieldEnv):
         layout = sample_crossing_layout(self.np_random, self._given)
         # A stream of the cars' own: a goal reached, and so the next one drawn, must not change their way.
         self._cars_random = np.random.default_rng(self.np_random.integers(2**63))
-        self._apply(layout)
+        self._apply(**layout)
         return self.observe()
 
     def set_state(self, qpos: Array, qvel: Array) -> None:
@@ -196,8 +185,6 @@ class OccludedCrossingEnv(FieldEnv):
             **super()._get_reset_info(),
         }
 
-    # Physics and judging -----------------------------------------------------------------------------------
-
     def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:
         """Step substep by substep: MuJoCo moves the robot, the traffic's law the cars. Judge them all at the end."""
         model, data = self.model, self.data
@@ -226,17 +213,12 @@ class OccludedCrossingEnv(FieldEnv):
             self._cost, self._collisions = 1.0, int((touching & ~before).sum())
         self._touching = touching[-1]
 
-    # Scenario ----------------------------------------------------------------------------------------------
-
-    def _apply(self, layout: CrossingLayout) -> None:
+    def _apply(self, agent: Array, goal: Array, cars: Array, pillars: Array) -> None:
         """Start an episode from a layout, the robot at rest."""
-        self._goals_reached = 0
-        self._goal_met = False
-        self._pillars = layout.pillars
-        self.data.mocap_pos[1:, :2] = layout.pillars
-        self._targets = np.zeros((1, 2))
-        self.place_goal(layout.goal)
+        self._pillars = pillars
+        self.data.mocap_pos[1:, :2] = pillars
+        self._begin(goal)
         qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
-        qpos[:3] = layout.agent
-        qpos[_CARS], qvel[_CARS] = layout.cars.T
+        qpos[:3] = agent
+        qpos[_CARS], qvel[_CARS] = cars.T
         self.set_state(qpos, qvel)

@@ -1,17 +1,18 @@
 """PointMaze with patrols: discs that go up and down its corridors, hidden by its walls."""
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import mujoco
 import numpy as np
+from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
-from .markers import MarkingRenderer
 from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
 
 try:
@@ -44,6 +45,37 @@ U_MAZE_PATROLS: Final = (((1, 1), (1, 3)), ((3, 1), (3, 3)))
 """The two long corridors of the U maze, each from its first cell to its last (row, column)."""
 
 
+class MarkingRenderer(MujocoRenderer):
+    """Draws what another renderer draws, and markers on top: in frames and in the window alike.
+
+    Markers lie in the renderer's scene alone. Model and data stay bit for bit as they are.
+
+    Args:
+        renderer: The env's own, of which no frame has been asked yet.
+        markers: Asked at every frame for what `mujoco.mjv_initGeom` takes: ``type``, ``size``, ``pos``, ``rgba``.
+    """
+
+    def __init__(self, renderer: MujocoRenderer, markers: Callable[[], Sequence[dict[str, Any]]]) -> None:
+        super().__init__(
+            renderer.model,
+            renderer.data,
+            renderer.default_cam_config,
+            renderer.width,
+            renderer.height,
+            renderer.max_geom,
+            renderer.camera_id,
+            visual_options=renderer._vopt,
+        )
+        self._markers = markers
+
+    def render(self, render_mode: str | None) -> Any:
+        """A frame, as `MujocoRenderer.render`."""
+        viewer = self._get_viewer(render_mode)
+        for marker in self._markers():
+            viewer.add_marker(**marker)
+        return super().render(render_mode)
+
+
 class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     """gymnasium-robotics' PointMaze with discs that patrol; the ball's physics, observations and rewards stay.
 
@@ -52,7 +84,7 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     (standard deviation 0.15 m/s, time constant 2 s; `safe_wrappers.envs.traffic`), drawn without a discretisation
     error; at an end they turn about, as a ball off a wall. Patrols are no bodies of the model: they pass through the
     ball, and walls hide them from whoever looks along the floor. The observation has nothing of them. Frames show
-    them in orange, which the renderer adds (`safe_wrappers.envs.markers`).
+    them in orange, which the renderer adds (`MarkingRenderer`).
 
     **Attributes**: `patrol_positions` and `patrol_velocities`, shape (2, 2), m and m/s; `patrol_tracks` (a
     `control.estimation.tracks.Tracks`): the same as tracks that are known exactly now. `agent_position`,
@@ -86,19 +118,16 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
         self._starts, offsets = np.array(ends, dtype=np.float64)[:, 0], np.diff(ends, axis=1)[:, 0]
         self._lengths = np.hypot(*offsets.T)
         self._directions = offsets / self._lengths[:, None]
-        self._traffic = Traffic(np.full(len(U_MAZE_PATROLS), PATROL_MEAN_SPEED), self.dt, 1)
+        self._traffic = Traffic(np.full(len(ends), PATROL_MEAN_SPEED), self.dt, 1)
         # Where each would be on a way without turns, and its speed along it.
-        self._gone, self._speeds = (
-            np.zeros(len(U_MAZE_PATROLS)),
-            np.full(len(U_MAZE_PATROLS), PATROL_MEAN_SPEED),
-        )
+        self._gone, self._speeds = np.zeros(len(ends)), np.full(len(ends), PATROL_MEAN_SPEED)
         self._patrols_random = np.random.default_rng(0)  # until the first reset
         motions = [
             Motion(PATROL_ACCELERATION_NOISE * np.outer(along, along), PATROL_REVERSION_S, np.zeros(2))
             for along in self._directions
         ]
         self._tracks = Tracks(motions)
-        self._touching = np.zeros(len(U_MAZE_PATROLS), dtype=bool)
+        self._touching = np.zeros(len(ends), dtype=bool)
         renderer = self.point_env.mujoco_renderer
         renderer.default_cam_config = {**renderer.default_cam_config, **_CAMERA}
         self.point_env.mujoco_renderer = MarkingRenderer(renderer, self._markers)
@@ -111,8 +140,6 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
             {"type": kind, "size": size, "pos": np.array([x, y, 0.0]), "rgba": np.array(_COLOUR)}
             for x, y in self.patrol_positions
         ]
-
-    # What a constraint, a sensor or a judge may read ---------------------------------------------------------
 
     @property
     def dt(self) -> float:
@@ -151,8 +178,6 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
         around = np.mod(self._gone, 2.0 * self._lengths)
         back = around > self._lengths
         return np.where(back, 2.0 * self._lengths - around, around), np.where(back, -1.0, 1.0) * self._speeds
-
-    # Gymnasium -----------------------------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -2,12 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
@@ -16,17 +14,10 @@ from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP, SPIN_OUT
 
 from .field import FieldEnv
-from .goal_layout import Given
 from .goal_robots import LIDAR_BINS, pseudo_lidar
-from .ground import Ground, MagicFormula, Tyres, rolled_over
-from .rover_layout import (
-    RoverLayout,
-    Scene,
-    parse_rover_layout,
-    sample_rover_goal,
-    sample_rover_layout,
-    start_state,
-)
+from .ground import Ground, Patch, Tyres, rolled_over
+from .layout import Given, place_goal_beside
+from .rover_layout import HALF_EXTENT, KEEPOUTS, parse_rover_layout, sample_rover_layout
 
 WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
 """The wheels' joints, bodies and geoms, in the order of every array of four."""
@@ -49,7 +40,15 @@ WHEELBASE: Final = 0.5
 _FRAME_SKIP: Final = 5
 _LIDAR_RANGE: Final = 12.0  # m: across the field
 _SETTLING: Final = 12  # rounds until loads and tyre forces agree: each leaves a quarter of the difference
-_ASSET: Final = Path(__file__).parent / "assets" / "safe_rover.xml"
+_PARKED: Final = (
+    1000.0  # m: hazards and patches that are not there, farther than the rover gets in an episode
+)
+_COLOURS: Final = {
+    "dry": (0.55, 0.5, 0.45, 0.6),
+    "wet": (0.25, 0.35, 0.45, 0.6),
+    "snow": (1.0, 1.0, 1.0, 0.9),
+    "ice": (0.65, 0.9, 1.0, 0.9),
+}
 _CAMERA: Final = {"distance": 11.0, "elevation": -55.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
 
 
@@ -108,21 +107,18 @@ class SafeRoverEnv(FieldEnv):
 
     def __init__(self, **kwargs: Any) -> None:
         EzPickle.__init__(self, **kwargs)
-        kwargs.setdefault("default_camera_config", _CAMERA)
-        lidars = 2 * LIDAR_BINS
-        low = np.concatenate([np.full(10, -np.inf), np.zeros(lidars)])
-        high = np.concatenate([np.full(10, np.inf), np.ones(lidars)])
-        MujocoEnv.__init__(self, str(_ASSET), _FRAME_SKIP, Box(low, high, dtype=np.float64), **kwargs)
+        low = np.concatenate([np.full(10, -np.inf), np.zeros(2 * LIDAR_BINS)])
+        high = np.concatenate([np.full(10, np.inf), np.ones(2 * LIDAR_BINS)])
+        super().__init__("safe_rover.xml", _FRAME_SKIP, Box(low, high, dtype=np.float64), _CAMERA, **kwargs)
         model = self.model
         self.wheel_radius = float(model.geom(WHEELS[0]).size[0])
         self._tyres = Tyres(model, WHEELS)
         self.wheel_dofs: list[int] = [int(model.joint(wheel).dofadr[0]) for wheel in WHEELS]
         self._steer = [int(model.joint(f"steer_{side}").qposadr[0]) for side in ("left", "right")]
-        self._scene = Scene(model)
-        self._grounds = Ground("dry", ())
-        self._apply(RoverLayout(np.zeros(3), np.zeros(2), np.zeros((0, 2)), (), "dry", 0.0))
-
-    # What a constraint or a judge may read: from qpos, never a substep behind ------------------------------
+        self._floor = int(model.geom("floor").id)
+        self._floor_colour = model.geom_rgba[self._floor].copy()
+        self._patch_geoms = [g for g in range(model.ngeom) if model.geom(g).name.startswith("patch")]
+        self._apply(np.zeros(3), np.zeros(2), np.zeros((0, 2)), (), "dry", 0.0)
 
     @property
     def agent_heading(self) -> float:
@@ -158,30 +154,16 @@ class SafeRoverEnv(FieldEnv):
         Raises:
             UnknownNameError: There is no such wheel.
         """
-        return self._grounds.at(*self._contact(wheel))
-
-    def curve_under(self, wheel: str) -> MagicFormula:
-        """Traction curve of the ground under a wheel now.
-
-        Raises:
-            UnknownNameError: There is no such wheel.
-        """
-        return self._grounds.curve_at(*self._contact(wheel))
-
-    def _contact(self, wheel: str) -> list[float]:
         if wheel not in WHEELS:
             raise UnknownNameError(f"unknown wheel {wheel!r}: valid wheels are {', '.join(WHEELS)}")
-        position: list[float] = self.data.xpos[self._tyres.bodies[WHEELS.index(wheel)], :2].tolist()
-        return position
-
-    # Gymnasium ---------------------------------------------------------------------------------------------
+        return self._grounds.at(*self.data.xpos[self._tyres.bodies[WHEELS.index(wheel)], :2].tolist())
 
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
         return parse_rover_layout(options)
 
     def reset_model(self) -> Array:
         """Sample what the options left open, place everything, return the observation."""
-        self._apply(sample_rover_layout(self.np_random, self._given))
+        self._apply(**sample_rover_layout(self.np_random, self._given))
         return self.observe()
 
     def set_state(self, qpos: Array, qvel: Array) -> None:
@@ -202,7 +184,8 @@ class SafeRoverEnv(FieldEnv):
         self._judge()
 
     def _next_goal(self) -> Array:
-        return sample_rover_goal(self.np_random, self.agent_position, self._targets[1:])
+        standing = {"agent": self.agent_position[None], "hazards": self._targets[1:]}
+        return place_goal_beside(self.np_random, HALF_EXTENT, KEEPOUTS, standing)
 
     def _is_finite(self, observation: Array) -> bool:
         return bool(np.isfinite(observation).all())
@@ -233,8 +216,6 @@ class SafeRoverEnv(FieldEnv):
             **super()._get_reset_info(),
         }
 
-    # Physics and judging -----------------------------------------------------------------------------------
-
     def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:
         """Step substep by substep: the state's kinematics, the tyres' forces on it, then dynamics and integration."""
         model, data = self.model, self.data
@@ -261,36 +242,53 @@ class SafeRoverEnv(FieldEnv):
 
     def _judge(self) -> None:
         """Judge the present state, whose slips were kept, on top of what was judged before."""
-        x, y, _, w, qx, qy, z = self.data.qpos[:7].tolist()
+        x, y = self.data.qpos[:2].tolist()
         for hx, hy in self._hazards:
             if (x - hx) ** 2 + (y - hy) ** 2 <= ROVER_HAZARD_RADIUS**2:
                 self._violated = True
         for slip, load in zip(self._tyres.slips, self.data.userdata.tolist(), strict=True):
             if load > 0.0:
                 self._slip_max = max(self._slip_max, abs(slip))
-        vx, vy, _, _, _, yaw_rate = self.data.qvel[:6].tolist()
-        heading = math.atan2(2.0 * (w * z + qx * qy), 1.0 - 2.0 * (qy * qy + z * z))
-        speed = vx * math.cos(heading) + vy * math.sin(heading)
-        asked = speed * math.tan(self._steering_angle()) / WHEELBASE
-        self._yaw_rate_error = max(self._yaw_rate_error, abs(yaw_rate - asked))
+        asked = self.forward_speed * math.tan(self._steering_angle()) / WHEELBASE
+        self._yaw_rate_error = max(self._yaw_rate_error, abs(float(self.data.qvel[5]) - asked))
 
     def _steering_angle(self) -> float:
         left, right = self._steer
         qpos = self.data.qpos
         return 0.5 * float(qpos[left] + qpos[right])
 
-    # Scenario ----------------------------------------------------------------------------------------------
-
-    def _apply(self, layout: RoverLayout) -> None:
-        """Start an episode from a layout."""
-        self._goals_reached = 0
-        self._goal_met = False
-        self._targets = np.concatenate([layout.goal[None], layout.hazards])
-        self._groups = np.repeat([0, 1], [1, len(layout.hazards)])
-        self._hazards = layout.hazards.tolist()
-        self._grounds = Ground(layout.ground, layout.patches)
-        self.place_goal(layout.goal)
-        self._scene.show(self.model, self.data, layout)
-        qpos, qvel = start_state(layout, self.init_qpos, self.model.nv)
-        qvel[self.wheel_dofs] = layout.speed / self.wheel_radius
+    def _apply(
+        self,
+        agent: Array,
+        goal: Array,
+        hazards: Array,
+        patches: tuple[Patch, ...],
+        ground: str,
+        speed: float,
+    ) -> None:
+        """Start an episode from a layout, the wheels rolling along."""
+        self._groups = np.repeat([0, 1], [1, len(hazards)])
+        self._hazards = hazards.tolist()
+        self._grounds = Ground(ground, patches)
+        self._begin(goal, hazards)
+        self._show(hazards)
+        x, y, heading = agent.tolist()
+        qpos, qvel = self.init_qpos.copy(), np.zeros(self.model.nv)
+        qpos[:2] = x, y
+        qpos[3:7] = math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading)
+        qvel[:2] = speed * math.cos(heading), speed * math.sin(heading)
+        qvel[self.wheel_dofs] = speed / self.wheel_radius
         self.set_state(qpos, qvel)
+
+    def _show(self, hazards: Array) -> None:
+        """Move what is drawn of hazards and patches where they are; none of it touches anything."""
+        mocap, model, ground = self.data.mocap_pos, self.model, self._grounds
+        mocap[1:, :2] = _PARKED
+        mocap[1 : 1 + len(hazards), :2] = hazards
+        first = len(mocap) - len(self._patch_geoms)
+        for i, (patch, geom) in enumerate(zip(ground.patches, self._patch_geoms, strict=False)):
+            mocap[first + i, :2] = patch.center
+            model.geom_size[geom, 0] = model.geom_rbound[geom] = patch.radius
+            model.geom_rgba[geom] = _COLOURS[patch.ground]
+        colour = self._floor_colour if ground.base == "dry" else (*_COLOURS[ground.base][:3], 1.0)
+        model.geom_rgba[self._floor] = colour

@@ -2,21 +2,18 @@
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_action
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError
+from safe_wrappers.checks import Array
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP
 
-from .goal_layout import known, layout_option, numbers
+from .field import METADATA, TaskEnv
+from .layout import PLACE, Form, Given, parse_layout
 
 COST_FORCE: Final = "cost_force"
 """float64: 1 if the wall or the clamp pushed with more than `FORCE_LIMIT` in this step, else 0."""
@@ -53,11 +50,15 @@ _SWEEP_REWARD: Final = 10.0  # per m
 _START_X: Final = (0.0, 0.1)  # m
 _START_Y: Final = (-0.05, 0.0)
 _WANTED: Final = (6.0, 12.0)  # N
-_ASSET: Final = Path(__file__).parent / "assets" / "teleop_contact.xml"
+_FORMS: Final[dict[str, Form]] = {
+    "tool": PLACE,
+    "velocity": ("[vx, vy]", (2,)),
+    "wanted_force": ("a number of N", ()),
+}
 _CAMERA: Final = {"distance": 0.9, "elevation": -90.0, "azimuth": 90.0, "lookat": np.array([0.1, 0.08, 0.0])}
 
 
-class TeleopContactEnv(MujocoEnv, EzPickle):
+class TeleopContactEnv(TaskEnv):
     """Press a tool against a wall with a wanted force, sweep it along the wall, stop before the clamp.
 
     The remote machine of a bilateral teleoperation, in the horizontal plane: a tool of 1 kg, a wall of 20 kN/m at
@@ -104,10 +105,7 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
         19.0
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
-        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
-        "render_fps": 1000,
-    }
+    metadata: dict[str, Any] = {**METADATA, "render_fps": 1000}  # noqa: RUF012 (Gymnasium's)
 
     port_flow: Final = (0, 1)
     """Entries of the action that are the port's flow."""
@@ -116,18 +114,14 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
 
     def __init__(self, **kwargs: Any) -> None:
         EzPickle.__init__(self, **kwargs)
-        kwargs.setdefault("default_camera_config", _CAMERA)
-        MujocoEnv.__init__(self, str(_ASSET), 1, Box(-np.inf, np.inf, (9,), dtype=np.float64), **kwargs)
+        super().__init__("teleop_contact.xml", 1, 9, _CAMERA, **kwargs)
         model = self.model
         self._stiffness = float(model.tendon_stiffness.flat[0])
         self.port_feedthrough = float(model.actuator_gainprm[0, 0])
         self._damper_limit = float(model.actuator_forcerange[0, 1])
         self._wall, self._clamp = (int(model.geom(name).id) for name in ("wall", "clamp"))
-        self._given: dict[str, Any] = {}
         self._wanted = float(np.mean(_WANTED))
         self._begin()
-
-    # What a channel, a constraint or a judge may read: from qpos, never a substep behind ---------------------
 
     @property
     def tool_position(self) -> Array:
@@ -176,28 +170,27 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
         moving = float(self.model.body("tool").mass[0]) * (vx * vx + vy * vy)
         return float(0.5 * (moving + self._stiffness * stretched + wall * pressed))
 
-    # Gymnasium ---------------------------------------------------------------------------------------------
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode; ``options["layout"]`` fixes parts of it.
-
-        Raises:
-            UnknownNameError: An unknown layout key.
-            ConfigurationError: A layout that cannot be used.
-        """
-        self._given = _layout(options)
-        observation, info = super().reset(seed=seed, options=options)
-        return observation, info
+    def _parse(self, options: Mapping[str, Any] | None) -> Given:
+        given = parse_layout(options, _FORMS)
+        if "wanted_force" in given and not 0.0 < given["wanted_force"] < _SPRING_LIMIT:
+            raise ConfigurationError(
+                f"wanted_force must be above 0 and below the spring's limit of {_SPRING_LIMIT} N; got "
+                f"{float(given['wanted_force'])}"
+            )
+        if "tool" in given:
+            x, y = given["tool"]
+            if x + TOOL_RADIUS > WALL_X or y + TOOL_RADIUS > CLAMP_Y:
+                raise ConfigurationError(
+                    f"tool at {given['tool'].tolist()} m is inside the wall (x > {WALL_X - TOOL_RADIUS}) or "
+                    f"the clamp (y > {CLAMP_Y - TOOL_RADIUS})"
+                )
+        return given
 
     def reset_model(self) -> Array:
         """Draw what the options left open."""
         drawn = self.np_random.uniform(*np.transpose([_START_X, _START_Y, _WANTED]))
         self._wanted = float(self._given.get("wanted_force", drawn[2]))
-        self.set_state(
-            np.array(self._given.get("tool", drawn[:2])), np.array(self._given.get("velocity", (0.0, 0.0)))
-        )
+        self.set_state(self._given.get("tool", drawn[:2]), self._given.get("velocity", np.zeros(2)))
         return self.observe()
 
     def set_state(self, qpos: Array, qvel: Array) -> None:
@@ -207,39 +200,14 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
         super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         self._begin()
 
-    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
-    def step(  # type: ignore[override]
-        self, action: NDArray[np.floating[Any]]
-    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Command a velocity for one step of 1 ms; beyond the action space it is clipped.
-
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
-            SafeWrappersError: The physics left finite numbers.
-        """
-        command = finite_action(action, 2)
-        self._step_mujoco_simulation(np.clip(command, -1.0, 1.0), self.frame_skip)
-        reward = self._pressing_reward() + self._sweep_reward()
-        observation = self.observe()
-        if not np.isfinite(observation).all():
-            raise SafeWrappersError("the tool's state is not finite: a state that was set broke it")
-        if self.render_mode == "human":
-            self.render()  # type: ignore[no-untyped-call]
-        return observation, reward, False, False, self._get_reset_info()
+    def _is_finite(self, observation: Array) -> bool:
+        return bool(np.isfinite(observation).all())
 
     def observe(self) -> Array:
         """Observation of the state as it is now."""
         data = self.data
-        return np.array(
-            [
-                *data.qpos.tolist(),
-                *data.qvel.tolist(),
-                *self._coupling(data.ctrl),
-                self._force,
-                self.clearance,
-                self._wanted,
-            ]
-        )
+        tool = [*data.qpos.tolist(), *data.qvel.tolist(), *self._coupling(data.ctrl)]
+        return np.array([*tool, self._force, self.clearance, self._wanted])
 
     def _get_reset_info(self) -> dict[str, Any]:
         cost = float(self.clearance <= 0.0)
@@ -252,10 +220,8 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
             SWEPT: self._swept,
         }
 
-    # Physics -----------------------------------------------------------------------------------------------
-
     def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:
-        model, data = self.model, self.data
+        model, data, ctrl = self.model, self.data, np.clip(ctrl, -1.0, 1.0)
         data.ctrl[:] = ctrl
         self._acted = self._coupling(ctrl)
         mujoco.mj_step(model, data, n_frames)
@@ -300,35 +266,12 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
         self._swept = 0.0
         self._farthest = float(self.data.qpos[1])
 
-    def _pressing_reward(self) -> float:
+    def _reward(self) -> float:
         error = abs(self._force - self._wanted) / self._wanted
-        self._pressed = error <= _PRESSING
-        return self.dt * max(1.0 - error, 0.0)
-
-    def _sweep_reward(self) -> float:
         place = min(float(self.data.qpos[1]), CLAMP_Y - TOOL_RADIUS - CLOSE_TO_CLAMP)
-        gained = place - self._farthest
-        if gained <= 0.0 or not self._pressed:
-            return 0.0
+        gained = place - self._farthest if error <= _PRESSING else 0.0
+        if gained <= 0.0:
+            return self.dt * max(1.0 - error, 0.0)
         self._farthest = place
         self._swept += gained
-        return _SWEEP_REWARD * gained
-
-
-def _layout(options: Mapping[str, Any] | None) -> dict[str, Any]:
-    shapes = {"tool": ("[x, y]", (2,)), "velocity": ("[vx, vy]", (2,)), "wanted_force": ("a number of N", ())}
-    found = layout_option(options, tuple(shapes))
-    given = dict(known(**{key: numbers(found, key, form, shape) for key, (form, shape) in shapes.items()}))
-    if "wanted_force" in given and not 0.0 < given["wanted_force"] < _SPRING_LIMIT:
-        raise ConfigurationError(
-            f"wanted_force must be above 0 and below the spring's limit of {_SPRING_LIMIT} N; got "
-            f"{float(given['wanted_force'])}"
-        )
-    if "tool" in given:
-        x, y = given["tool"]
-        if x + TOOL_RADIUS > WALL_X or y + TOOL_RADIUS > CLAMP_Y:
-            raise ConfigurationError(
-                f"tool at {given['tool'].tolist()} m is inside the wall (x > {WALL_X - TOOL_RADIUS}) or the clamp "
-                f"(y > {CLAMP_Y - TOOL_RADIUS})"
-            )
-    return given
+        return self.dt * max(1.0 - error, 0.0) + _SWEEP_REWARD * gained

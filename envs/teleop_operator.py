@@ -73,8 +73,10 @@ class TeleopOperator:
         Args:
             observation: As the channel shows it now, shape (9,).
         """
-        seen = self._perceived(observation)
-        intended, force = self._intention(seen)
+        self._on_its_way.append(observation.tolist())
+        if len(self._on_its_way) > 1 + round(self.reaction_s / _STEP_S):
+            self._on_its_way.popleft()
+        intended, force = self._intention(self._on_its_way[0])
         shake = self._tremor * self._random.standard_normal(2)
         for i in range(2):
             push = _DAMPING * (intended[i] - self._velocity[i]) + force[i] + shake[i]
@@ -83,16 +85,8 @@ class TeleopOperator:
         self._steps += 1
         return np.array(self._velocity)
 
-    def _perceived(self, observation: Array) -> list[float]:
-        """What was shown one reaction time ago."""
-        self._on_its_way.append(observation.tolist())
-        if len(self._on_its_way) > 1 + round(self.reaction_s / _STEP_S):
-            self._on_its_way.popleft()
-        seen: list[float] = self._on_its_way[0]
-        return seen
-
     def _intention(self, seen: list[float]) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Intended velocity and force."""
+        """Intended velocity and force, from what was shown one reaction time ago."""
         touching, clearance, wanted = seen[6:9]
         now = self._steps * _STEP_S
         if self.phase == "approach":
@@ -106,10 +100,6 @@ class TeleopOperator:
             self.phase = "sweep"
         along = self._sweep_speed
         if self._stops:
-            along = min(along, max(clearance - _GAP, 0.0) / self._caution_s)
+            # It comes to a stop over a longer time than what it sees is late by its own reaction.
+            along = min(along, max(clearance - _GAP, 0.0) / (4.0 * max(self.reaction_s, 0.1)))
         return (0.0, along), (wanted, 0.0)
-
-    @property
-    def _caution_s(self) -> float:
-        """Time constant of coming to a stop: longer than what is seen is late by one's own reaction."""
-        return 4.0 * max(self.reaction_s, 0.1)

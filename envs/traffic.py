@@ -46,7 +46,6 @@ class Traffic:
         times = step_s * np.arange(1, steps + 1)
         fixed = np.stack([times, np.ones(steps)], axis=1) - self._from_state[:, 1].reshape(steps, 2)
         self._from_means = fixed.reshape(-1, 1) * mean_velocities
-        self._state = np.zeros((2, len(mean_velocities)))
         self.step_s = step_s
         self.steps = steps
 
@@ -61,9 +60,8 @@ class Traffic:
         Returns:
             Positions and velocities at the ends of the steps, shape (steps, 2, n).
         """
-        self._state[0], self._state[1] = positions, velocities
         noise = rng.standard_normal((2 * self.steps, len(positions)))
-        states = self._from_state @ self._state
+        states = self._from_state @ np.stack([positions, velocities])
         states += self._from_noise @ noise
         states += self._from_means
         drawn: Array = states.reshape(self.steps, 2, -1)

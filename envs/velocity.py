@@ -49,10 +49,11 @@ class SafeVelocityEnv(MujocoEnv):
         observation, reward, terminated, truncated, info = super().step(action)
         speed = self._judged_speed(info)
         cost = float(not speed <= self.speed_limit)  # so that a speed that is not a number costs
-        return observation, reward, terminated, truncated, {**info, **_judgement(speed, cost)}
+        judged = {SPEED: speed, COST: cost, COST_SUBSTEP: cost}
+        return observation, reward, terminated, truncated, {**info, **judged}
 
     def _get_reset_info(self) -> dict[str, Any]:
-        return {**super()._get_reset_info(), **_judgement(speed=0.0, cost=0.0)}
+        return {**super()._get_reset_info(), SPEED: 0.0, COST: 0.0, COST_SUBSTEP: 0.0}
 
     def _judged_speed(self, info: dict[str, Any]) -> float:
         return float(info["x_velocity"])
@@ -121,7 +122,3 @@ def __getattr__(name: str) -> Any:
 make_velocity_env.metadata = {  # type: ignore[attr-defined]
     "render_modes": HalfCheetahEnv.metadata["render_modes"]
 }
-
-
-def _judgement(speed: float, cost: float) -> dict[str, float]:
-    return {SPEED: speed, COST: cost, COST_SUBSTEP: cost}

@@ -158,7 +158,7 @@ def test_the_cars_outline_encloses_every_geom():
 
 
 def test_hulls_are_as_large_as_the_geoms():
-    from safe_wrappers.envs.goal_layout import HAZARD_RADIUS, VASE_HALF_SIZE
+    from safe_wrappers.envs.goal_env import HAZARD_RADIUS, VASE_HALF_SIZE
     from safe_wrappers.envs.goal_robots import POINT
     from safe_wrappers.recipes import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
 

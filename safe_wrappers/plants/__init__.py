@@ -3,8 +3,7 @@
 from safe_wrappers.plants.analytic import AnalyticPlant
 from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.displacement import DisplacementPlant
-from safe_wrappers.plants.identified.logs import log_steps
-from safe_wrappers.plants.identified.plant import IdentifiedPlant
+from safe_wrappers.plants.identified import IdentifiedPlant, log_steps
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check

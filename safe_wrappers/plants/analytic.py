@@ -73,7 +73,6 @@ class AnalyticPlant(Plant):
         self._pending: deque[Array] = deque()
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        """Attach to an env; checks the control interval and the bounds."""
         refuse_second_env(self._env, env)
         self.control_dt = check_timing(env, self._given_control_dt)
         self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.control_dt - 1e-9))))
@@ -93,7 +92,6 @@ class AnalyticPlant(Plant):
         self._env = env
 
     def observe(self) -> None:
-        """Read the state and predict it over the delay."""
         self.observation_id += 1
         x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
         if self.delay_s > 0.0:
@@ -101,7 +99,6 @@ class AnalyticPlant(Plant):
         self.state, self._drift, self._effect = x, None, None
 
     def executed(self, control: Array | None) -> None:
-        """Remember a sent command for the delay."""
         if control is None:
             self._pending.clear()
         elif self.delay_s > 0.0:
@@ -139,16 +136,12 @@ class AnalyticPlant(Plant):
         return [x + half * k3, end, x + hold * k1]
 
     def _rate(self, x: Array, control: Array) -> Array:
-        drift, effect = self._f(x), self._g(x)
-        if type(drift) is not np.ndarray or type(effect) is not np.ndarray:
-            drift, effect = self.drift(x), self.effect(x)
-        return np.asarray(drift + effect @ control)
+        return np.asarray(self._f(x), dtype=np.float64) + np.asarray(self._g(x), dtype=np.float64) @ control
 
     @property
     def f(self) -> Array:
-        """Drift at the state, shape (n,)."""
         if self._drift is None:
-            self._drift, expected = self.drift(self.state), self.state.shape
+            self._drift, expected = np.asarray(self._f(self.state), dtype=np.float64), self.state.shape
             if self._drift.shape != expected:
                 found = self._drift.shape
                 raise ConfigurationError(f"f must return the shape of the state {expected}, got {found}")
@@ -156,22 +149,15 @@ class AnalyticPlant(Plant):
 
     @property
     def g(self) -> Array:
-        """Control matrix at the state, shape (n, m)."""
         if self._effect is None:
-            self._effect, expected = self.effect(self.state), (self.state.size, self.lower.size)
+            self._effect, expected = (
+                np.asarray(self._g(self.state), dtype=np.float64),
+                (self.state.size, self.lower.size),
+            )
             found = self._effect.shape
             if found != expected:
                 raise ConfigurationError(f"g must return shape (states, controls) = {expected}, got {found}")
         return self._effect
 
-    def drift(self, x: Array) -> Array:
-        """The drift at any state, shape (n,)."""
-        return np.asarray(self._f(x), dtype=np.float64)
-
-    def effect(self, x: Array) -> Array:
-        """The control matrix at any state, shape (n, m)."""
-        return np.asarray(self._g(x), dtype=np.float64)
-
     def attribute(self, name: str) -> Any:
-        """Read a published fact of the env."""
         return read_attribute(self._env, name)

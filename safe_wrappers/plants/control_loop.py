@@ -53,10 +53,6 @@ class ControlLoop:
                 f"{self.warn_below_deg:g}: hold and delays only take away; design for more, or ask for less"
             )
 
-    def late_by_s(self, control_dt: float, delay_s: float = 0.0) -> float:
-        """All that makes the loop late, s: both delays, the plant's, and half its hold."""
-        return self.compute_s + self.bus_s + delay_s + float(hold_lag_s(control_dt))
-
     def margin_left_deg(self, control_dt: float, delay_s: float = 0.0) -> float:
         """What hold and delays leave of the phase margin, degrees; at 0 or below nothing is left.
 
@@ -82,7 +78,7 @@ class ControlLoop:
             return
         spare = math.radians(self.phase_margin_deg - self.warn_below_deg)
         parts = f"plant {delay_s:g} + compute {self.compute_s:g} + bus {self.bus_s:g} + half a hold"
-        late = self.late_by_s(control_dt, delay_s)
+        late = self.compute_s + self.bus_s + delay_s + float(hold_lag_s(control_dt))
         message = (
             f"{left:.1f} degrees of phase margin are left of {self.phase_margin_deg:g}, which is less than "
             f"{self.warn_below_deg:g}: a loop that crosses over at {self.crossover:g} rad/s is {late:.4g} s late "

@@ -63,7 +63,6 @@ class DisplacementRecorder(Recorder):
             mujoco.mj_kinematics(self._model, data)
 
     def brake(self, data: mujoco.MjData) -> None:
-        """Leave the gripper where it is."""
         self.act(data, np.zeros(4))
 
     def braking(self, data: mujoco.MjData) -> Array:
@@ -105,7 +104,6 @@ class DisplacementPlant(MujocoPlant):
         self.metres_per_unit = positive("metres_per_unit", metres_per_unit, "m per unit of action")
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        """Attach to an env and its model."""
         raw: Any = env.unwrapped
         if not moves_by_displacement(raw):
             raise UnsupportedEnvError(
@@ -142,7 +140,6 @@ class DisplacementPlant(MujocoPlant):
         return DisplacementRecorder(self.model, self.data, self.substeps, *action)
 
     def observe(self) -> None:
-        """Take the env's present state, and the gripper's pose as MuJoCo last evaluated it."""
         data: mujoco.MjData = self._raw.data
         self._pose[:3], self._pose[3:] = data.xpos[self._body], data.xquat[self._body]
         super().observe()

@@ -122,23 +122,8 @@ def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
         raise ConfigurationError(
             f"{expected}: use ActionShield(env, [PredictiveShield(...)]), which tries every action"
         )
-    for part in _parts(space):
-        if not (isinstance(part, gym.spaces.Box) and np.issubdtype(part.dtype, np.floating)):
-            raise ConfigurationError(
-                f"{expected}: for {part} there is no closest safe action to project to. Give the env a floating Box, "
-                "or one MultiDiscrete of discrete parts alone for ActionShield, and translate in its step"
-            )
     raise ConfigurationError(
-        f"{expected}. Give the env one flat Box of its own, from this space: "
-        "`action_space = gymnasium.spaces.flatten_space(space)`, and in its step "
-        "`action = gymnasium.spaces.unflatten(space, action)`"
+        f"{expected}. Give the env one flat Box of floats, from gymnasium.spaces.flatten_space where all its "
+        "parts are such, and translate in its step (gymnasium.spaces.unflatten); discrete parts alone may be one "
+        "MultiDiscrete for ActionShield"
     )
-
-
-def _parts(space: gym.Space[Any]) -> Iterator[gym.Space[Any]]:
-    """The parts of a Dict or Tuple, recursively; any other space is its only part."""
-    if not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        yield space
-        return
-    for part in space.values() if isinstance(space, gym.spaces.Dict) else space:
-        yield from _parts(part)

@@ -83,6 +83,8 @@ def random_scenes(count):
             point_decision.is_admitted(scene, *asked),
             point_decision.candidates(scene, *asked),
         ]
+        away = np.linalg.norm(found[3] - control, axis=1)
+        assert (np.diff(away) >= -1e-9).all()  # the nearest candidate first
         found += [
             *point_decision.half_spaces(scene, *asked[:2]),
             point_decision.backup_pair(scene, *asked[:2]),
@@ -94,5 +96,5 @@ def random_scenes(count):
 
 
 def test_the_random_scenes_have_everything_in_them():
-    _, stages = random_scenes(200)
+    _, stages = random_scenes(800)
     assert stages[point_decision.PROPOSAL] > 10 and stages[point_decision.CANDIDATE] > 10

@@ -128,6 +128,12 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
         assert sum(i["cbf/intervened"] for i in infos) > 20
     np.testing.assert_array_equal(seen[None], seen[0.5])
     assert spent[0.5] < spent[None] - 50
+    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=4, max_decrease=0.01)
+    filtered = sw.CBFActionFilter(sliders(range_="-10 10"), [limit])
+    filtered.reset(seed=0)
+    with pytest.warns(UserWarning, match="farther than the declared max_decrease of 0.01"):
+        for _ in range(12):
+            filtered.step(np.ones(1))
 
 
 # Numbers that are none, and machines that cannot be forecast --------------------------------------------------

@@ -12,6 +12,7 @@ from vehicles import FULL, MOTORS, OPEN, Trolley, rover
 
 import safe_wrappers as sw
 from safe_wrappers.control.vehicle.slip import slip_ratio
+from safe_wrappers.envs.ground import MAGIC_FORMULA
 from safe_wrappers.errors import UnsupportedEnvError
 
 
@@ -46,7 +47,7 @@ def test_the_truth_lies_within_the_estimates_standard_deviations(steering):
     for ground in ("dry", "wet", "snow", "ice"):
         env = rover()
         raw = start(env, ground=ground, speed=2.0)
-        truth = raw.curve_under("front_left").peak_friction
+        truth = MAGIC_FORMULA[raw.ground_under("front_left")].peak_friction
         for k, action in enumerate(pulses(steering)):
             info = env.step(action)[4]
             if k > 20:

@@ -18,7 +18,7 @@ from safe_wrappers.control.legged.whole_body import (
     solve_cone,
     solve_pyramid,
 )
-from safe_wrappers.control.legged.whole_body_problem import Task, WholeBodyProblem
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.control.legged.whole_body_program import Candidate
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -73,11 +73,10 @@ def in_full(problem, edges=4):
     stacked = problem.jacobians.reshape(3 * k, nv)
     hessian, linear, constant = np.zeros((n, n)), np.zeros(n), 0.0
     u, a, f = slice(0, nu), slice(nu, nu + nv), slice(nu + nv, n)
-    hessian[u, u] = np.diag(problem.weights)
-    linear[u] = -problem.weights * problem.nominal
-    constant += problem.weights @ problem.nominal**2
+    hessian[u, u] = np.eye(nu)
+    linear[u] = -problem.nominal
+    constant += problem.nominal @ problem.nominal
     hessian[f, f] = problem.force_weight * np.eye(3 * k)
-    squares = [(t.weight, t.jacobian, t.target - t.drift) for t in problem.tasks]
     dynamics = np.hstack([-problem.actuation, problem.inertia, -stacked.T])
     equal, value = [dynamics], [-problem.bias]
     stay = problem.stance
@@ -87,10 +86,6 @@ def in_full(problem, edges=4):
     rows[:, a] = held
     equal.append(rows)
     value.append(wanted)
-    for weight, jacobian, target in squares:
-        hessian[a, a] += weight * jacobian.T @ jacobian
-        linear[a] -= weight * jacobian.T @ target
-        constant += weight * float(target @ target)
     rows, limits = [np.zeros((0, n))], []
     sides = friction_pyramid(problem.normals, problem.friction, edges)
     for i in range(k):
@@ -130,20 +125,18 @@ def in_full(problem, edges=4):
 @given(
     seed=st.integers(0, 10_000),
     k=st.integers(0, 5),
-    extra=st.sampled_from(["nothing", "task", "rows", "forces", "weights"]),
+    extra=st.sampled_from(["nothing", "rows", "forces"]),
 )
 def test_elimination_changes_nothing(seed, k, extra):
     # Five contacts of three axes on eight degrees of freedom: seven inner forces.
     problem, rng = robot(seed, k=k), np.random.default_rng(seed + 1)
     more = {
         "nothing": {},
-        "task": {"tasks": [Task(rng.normal(size=(2, 8)), rng.normal(size=2), rng.normal(size=2), 0.3)]},
         "rows": {
             "acceleration_rows": (rows := rng.normal(size=(2, 8))),
             "acceleration_limits": rows @ rigid_forces(problem, np.zeros(5))[1] + 5.0,
         },
         "forces": {"force_rows": rng.normal(size=(1, 3 * k)), "force_limits": np.array([40.0])},
-        "weights": {"control_weight": rng.uniform(0.2, 5.0, 5)},
     }[extra]
     problem = dataclasses.replace(problem, **more)
     expected = in_full(problem)
@@ -155,12 +148,17 @@ def test_elimination_changes_nothing(seed, k, extra):
         assert found.status in ("solved", "inactive")
         if found.status == "solved":
             # No worse, and better by no more than what the large program leaves inexact.
-            assert -1e-5 <= found.objective - expected[1] <= 1e-7 * (1.0 + abs(expected[1]))
+            assert -1e-5 <= cost(problem, found) - expected[1] <= 1e-7 * (1.0 + abs(expected[1]))
             assert found.control == pytest.approx(expected[0], abs=3e-3)
         else:
             assert found.control is problem.nominal
-            assert found.objective >= expected[1] - 1e-6
+            assert cost(problem, found) >= expected[1] - 1e-6
         assert_says_the_truth(problem, found)
+
+
+def cost(problem, found):
+    away = found.control - problem.nominal
+    return 0.5 * (away @ away + problem.force_weight * (found.forces**2).sum())
 
 
 def assert_says_the_truth(problem, found):
@@ -170,8 +168,7 @@ def assert_says_the_truth(problem, found):
     miss = problem.inertia @ a + problem.bias - problem.actuation @ u - pushed
     scale = 1.0 + np.abs(f).max(initial=0.0) + np.abs(a).max()
     assert np.abs(miss).max() < 1e-8 * scale
-    assert found.residuals.dynamics == pytest.approx(np.abs(miss).max(), abs=1e-9 * scale)
-    assert (u >= problem.lower).all() and (u <= problem.upper).all() and found.residuals.bounds == 0.0
+    assert (u >= problem.lower).all() and (u <= problem.upper).all()
     assert in_cone(f, problem.normals, problem.friction, 1e-6 * scale).all()
     grips = problem.stance[problem.friction[problem.stance] > 0.0]
     missed = (problem.jacobians @ a - problem.wanted)[grips]
@@ -231,7 +228,7 @@ def test_the_cone_by_a_solver_that_knows_no_cones():
     found = solve_cone(problem)
     assert found.status == "solved"
     assert other.success
-    assert found.objective == pytest.approx(other.fun, rel=1e-5)
+    assert cost(problem, found) == pytest.approx(other.fun, rel=1e-5)
     assert found.control == pytest.approx(other.x, abs=1e-3)
 
 
@@ -357,27 +354,11 @@ def test_a_limit_on_accelerations_holds():
     found = solve_pyramid(problem)
     assert found.status == "solved"
     assert found.acceleration == pytest.approx([-2.0, 0.0, 0.0], abs=1e-6)
-    assert found.residuals.rows <= 1e-6
     lower = dataclasses.replace(problem, acceleration_limits=np.array([-3.0, 0.0]))
     against = solve_pyramid(lower)  # up by the opening contact, down by the limit
     assert against.status == "infeasible"
-    assert against.residuals.rows == pytest.approx(1.5, abs=1e-3)  # half each, in squares
+    assert against.acceleration[2] + 3.0 == pytest.approx(1.5, abs=1e-3)  # half each, in squares
     assert against.residuals.contact == pytest.approx(1.5, abs=1e-3)
-
-
-def test_a_task_is_followed_as_far_as_friction_goes():
-    pull = Task(np.array([[1.0, 0.0, 0.0]]), np.zeros(1), np.array([2.0]), weight=1e6)
-    free = foot([0.0, 0.0, 0.0], tasks=[pull], friction=0.0)
-    found = solve_pyramid(free)
-    assert found.status == "solved"
-    assert found.acceleration[0] == pytest.approx(2.0, abs=1e-4)
-    assert found.control[0] == pytest.approx(4.0, abs=1e-3)
-    # A gripping foot that is to stay does not move for any task.
-    held = solve_pyramid(foot([0.0, 0.0, 0.0], tasks=[pull]))
-    assert held.acceleration[0] == pytest.approx(0.0, abs=1e-6)
-    # With no wish but the nominal, a task that is met already still makes the answer an optimum, not "inactive".
-    idle = Task(np.array([[1.0, 0.0, 0.0]]), np.zeros(1), np.zeros(1), weight=0.0)
-    assert solve_pyramid(foot([1.0, 0.0, 0.0], tasks=[idle])).status == "solved"
 
 
 @pytest.mark.parametrize("lie", ["zeros", "huge", "nothing", "claims infeasible"])

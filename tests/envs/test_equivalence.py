@@ -1,21 +1,9 @@
 """One-step equivalence with Safety-Gymnasium: every step of four recorded episodes, from its state.
 
-The recordings are of Safety-Gymnasium 1.2 on MuJoCo 2.3.3; ours runs on a MuJoCo of today. Measured with
-3.11, worst absolute errors over the 1200 steps (m, rad, m/s, rad/s, m/s^2):
+The recordings are of Safety-Gymnasium 1.2 on MuJoCo 2.3.3; ours runs on a MuJoCo of today. The tables
+of the worst errors are in docs/tasks/equivalence.md. What is left, and why:
 
-======================================  =====  ========  ========  =======  =======  =======  ====
-steps                                   count  position  velocity  sensors  lidar    reward   cost
-======================================  =====  ========  ========  =======  =======  =======  ====
-nose touches no vase                    1144   1.3e-9    1.9e-7    2.0e-8   1.3e-9   9.5e-14  0
-nose touches a vase                     54     1.8e-3    8.6e-1    9.8      2.7e-3   1.8e-5   0
-the same with 2.3.3's penetration       54     1.0e-13   7.4e-12   5.1e-10  1.2e-13  8.9e-16  0
-two singular steps, below               2      4.7e-4    3.2e-2    8.1e-3   6.1e-4   2.3e-6   0
-======================================  =====  ========  ========  =======  =======  =======  ====
-
-What is left, and why:
-
-* Nose touches no vase: vases slower than 1e-7 m/s are asleep here, and creep on there. With sleeping off, the
-  velocities agree to 5e-11.
+* Vases slower than 1e-7 m/s are asleep here, and creep on there. With sleeping off, the velocities agree to 5e-11.
 * Nose (a box) touches a vase (a box): MuJoCo 2.3.3 reported half of the true penetration wherever the touched
   face belongs to the second box, the vase; versions from 3.4 on report all of it. Putting the half back makes these
   steps agree to 1e-11. We keep the right depth: a pushed vase moves differently, the robot hardly (a vase has
@@ -124,29 +112,8 @@ def test_robot_alone_agrees_to_rounding(make_env):
         np.testing.assert_allclose(observation[:12], recording.obs[t + 1, :12], rtol=0, atol=1e-8)
 
 
-# The car
+# The car: what is left there, and why.
 #
-# One-step equivalence of the car with Safety-Gymnasium's: every step of four recorded episodes, from its state.
-#
-# The recordings are of Safety-Gymnasium 1.2 on MuJoCo 2.3.3; ours runs on a MuJoCo of today. Measured with
-# 3.11, worst absolute errors over the 1200 steps (m, rad, m/s, rad/s, m/s^2):
-#
-# ==========================================  =====  ========  ========  =======  =======  =======  ====
-# steps                                       count  position  velocity  sensors  lidar    reward   cost
-# ==========================================  =====  ========  ========  =======  =======  =======  ====
-# no vase touched                             919    1.0e-9    9.6e-8    4.4e-12  9.4e-10  8.9e-16  0
-# no vase touched, 2.3.3 stopped early        6      3.4e-6    6.3e-4    4.6e-7   1.0e-6   3.8e-11  0
-# a vase touched                              274    1.4e-2    2.4       6.2e-2   2.5e-2   2.1e-5   0
-# the same with 2.3.3's contacts              251    1.1e-9    1.3e-7    4.8e-10  1.8e-9   6.7e-13  0
-# the same, 2.3.3 stopped early               5      1.1e-6    3.6e-4    3.8e-6   8.3e-7   6.1e-11  0
-# the same, two vases against each other      18     5.2e-4    1.5e-1    2.5e-5   4.9e-4   7.3e-9   0
-# one singular start, below                   1      4.0e-2    5.6       6.0      1.0e-2   2.0e-4   0
-# ==========================================  =====  ========  ========  =======  =======  =======  ====
-#
-# What is left, and why:
-#
-# * No vase touched: vases slower than 1e-7 m/s are asleep here, and creep on there. With sleeping off, the velocities
-#   agree to 1e-12.
 # * 2.3.3 stopped early: its solver, given a tolerance of 1e-12 instead of 1e-8, gives what we give (tried by
 #   hand, on the vases' contacts with the floor).
 # * A vase touched: 2.3.3 reported one contact where later versions report up to four (a wheel's rim on a box),
@@ -157,14 +124,11 @@ def test_robot_alone_agrees_to_rounding(make_env):
 #   not by its solver's tolerance (tried by hand), all others agree.
 # * From MuJoCo 3.12 on another algorithm finds where two boxes touch. In 84 of the steps that touch a vase it reports
 #   other points than 2.3.3, which moves vases by up to 16 mm a step, and the car's accelerometer by 10 m/s^2
-# in one of
-#   them. The cost is the same in every step.
+#   in one of them. The cost is the same in every step.
 # * Two vases against each other, level 2, episode 2, steps 218 to 236: their edges and faces meet nearly parallel,
 #   and the rule by which 2.3.3 halved a penetration is not ours to guess there.
 # * A singular start, level 2, episode 1, step 0: all three wheels stand on the floor at a distance of exactly 0.
 #   On 2.3.3, too, the result changes by 5 rad/s when the car is lifted by 1e-16 m (tried by hand).
-#
-# (Our own MJCF run on 2.3.3 repeats all the other 1199 steps to 3e-11; tried by hand.)
 
 AGREE = {"position": 5e-9, "velocity": 5e-7, "sensors": 2e-9, "lidar": 5e-9, "reward": 1e-12, "cost": 0.0}
 """Equivalence: some three times the worst measured."""

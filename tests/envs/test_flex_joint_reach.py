@@ -56,9 +56,6 @@ def independent_energy(bare, qpos, qvel, torque):
     return 0.5 * (arm.stiffness @ away**2 + rate @ np.linalg.solve(mobility, rate))
 
 
-# The machine: Spong's model ------------------------------------------------------------------------------
-
-
 def test_mujoco_moves_as_the_two_mass_model(bare):
     arm, rng = bare.arm, np.random.default_rng(1)
     for _ in range(20):
@@ -121,9 +118,6 @@ def test_the_integrator_damps_nothing(bare):
     assert abs(ratio) < 1e-6
 
 
-# Vibration energy ----------------------------------------------------------------------------------------
-
-
 def test_vibration_energy_is_the_boundary_layers(bare):
     rng = np.random.default_rng(2)
     states = [random_state(rng) for _ in range(50)]
@@ -165,9 +159,6 @@ def test_a_torque_step_injects_what_the_formula_says(bare, elbow, torque):
     m = pose(bare, elbow)
     info = bare.step(np.array(torque))[4]
     assert info["vibration_energy"] == pytest.approx(step_energies(torque, *machine(bare, m)).sum(), rel=0.01)
-
-
-# The task ------------------------------------------------------------------------------------------------
 
 
 def test_observation_and_reward(bare):

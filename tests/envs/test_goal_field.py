@@ -9,16 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.envs.goal_layout import (
-    AGENT_KEEPOUT,
-    GOAL_KEEPOUT,
-    HAZARD_KEEPOUT,
-    LEVELS,
-    VASE_KEEPOUT,
-    sample_goal,
-    sample_layout,
-)
+from safe_wrappers.envs.goal_env import KEEPOUTS, LEVELS
 from safe_wrappers.envs.goal_robots import LIDAR_BINS, LIDAR_RANGE, pseudo_lidar
+from safe_wrappers.envs.layout import place_goal_beside, place_objects
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 LAYOUT = {
@@ -92,13 +85,15 @@ def test_misspelt_option_is_refused_and_others_pass(make_env):
     env.reset(options={"somebody_elses": 1})
 
 
-KEEPOUTS = {"agent": AGENT_KEEPOUT, "goal": GOAL_KEEPOUT, "hazards": HAZARD_KEEPOUT, "vases": VASE_KEEPOUT}
+def sampled(rng, level, **given):
+    counts = {"hazards": level.hazards, "vases": level.vases}
+    return place_objects(rng, level.half_extent, KEEPOUTS, counts, given)
 
 
 def objects(layout):
     """(position, keepout) of every object."""
     for name, keepout in KEEPOUTS.items():
-        points = np.atleast_2d(getattr(layout, name))[:, :2]
+        points = np.atleast_2d(layout[name])[:, :2]
         yield from ((point, keepout) for point in points)
 
 
@@ -106,45 +101,35 @@ def objects(layout):
 def test_keepouts_and_field_hold_for_every_seed(level):
     headings = []
     for seed in range(60):
-        layout = sample_layout(np.random.default_rng(seed), level, {})
-        assert len(layout.hazards) == level.hazards
-        assert len(layout.vases) == level.vases
+        layout = sampled(np.random.default_rng(seed), level)
+        assert len(layout["hazards"]) == level.hazards and len(layout["vases"]) == level.vases
         for point, keepout in objects(layout):
             assert np.abs(point).max() <= level.half_extent - keepout
         for (p, keep_p), (q, keep_q) in itertools.combinations(objects(layout), 2):
             assert np.linalg.norm(p - q) >= keep_p + keep_q
-        headings.append(layout.agent[2])
-    assert min(headings) < -2
-    assert max(headings) > 2
-    assert np.abs(headings).max() <= np.pi
+        headings.append(layout["agent"][2])
+    assert min(headings) < -2 and max(headings) > 2 and np.abs(headings).max() <= np.pi
 
 
-def test_given_parts_are_kept_and_kept_clear_of():
+def test_given_parts_are_kept_and_kept_clear_of_also_by_later_goals():
     given = {"agent": np.array([0.3, -0.2, 1.0]), "hazards": np.array([[1.0, 1.0]])}
     for seed in range(30):
-        layout = sample_layout(np.random.default_rng(seed), LEVELS[2], given)
-        np.testing.assert_array_equal(layout.agent, given["agent"])
-        np.testing.assert_array_equal(layout.hazards, given["hazards"])
-        assert np.linalg.norm(layout.goal - given["agent"][:2]) >= GOAL_KEEPOUT + AGENT_KEEPOUT
-        assert np.linalg.norm(layout.goal - given["hazards"][0]) >= GOAL_KEEPOUT + HAZARD_KEEPOUT
-
-
-def test_new_goal_is_clear_of_everything():
-    rng = np.random.default_rng(0)
-    layout = sample_layout(rng, LEVELS[2], {})
-    for _ in range(50):
-        goal = sample_goal(rng, LEVELS[2], layout.agent[:2], layout.hazards, layout.vases)
-        assert np.linalg.norm(goal - layout.agent[:2]) >= GOAL_KEEPOUT + AGENT_KEEPOUT
-        assert np.linalg.norm(goal - layout.hazards, axis=1).min() >= GOAL_KEEPOUT + HAZARD_KEEPOUT
-        assert np.linalg.norm(goal - layout.vases, axis=1).min() >= GOAL_KEEPOUT + VASE_KEEPOUT
+        rng = np.random.default_rng(seed)
+        layout = sampled(rng, LEVELS[2], **given)
+        np.testing.assert_array_equal(layout["agent"], given["agent"])
+        np.testing.assert_array_equal(layout["hazards"], given["hazards"])
+        standing = {name: np.atleast_2d(layout[name])[:, :2] for name in ("agent", "hazards", "vases")}
+        for goal in (layout["goal"], place_goal_beside(rng, LEVELS[2].half_extent, KEEPOUTS, standing)):
+            for name, centres in standing.items():
+                gaps = np.linalg.norm(goal - centres, axis=1)
+                assert gaps.min() >= KEEPOUTS["goal"] + KEEPOUTS[name]
 
 
 def test_no_room_is_said():
     grid = np.linspace(-0.6, 0.6, 3)
-    level = LEVELS[0]
-    blocked = {"hazards": np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)}
+    blocked = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     with pytest.raises(ConfigurationError, match=r"no room .* \[-1\.0, 1\.0\]\^2"):
-        sample_layout(np.random.default_rng(0), level, blocked)
+        sampled(np.random.default_rng(0), LEVELS[0], hazards=blocked)
 
 
 def by_loop(targets):
@@ -168,10 +153,3 @@ def test_equals_the_loop(targets):
     relative = np.array([t[:2] for t in targets], dtype=np.float64).reshape(-1, 2)
     kinds = np.array([t[2] for t in targets], dtype=np.intp)
     np.testing.assert_allclose(pseudo_lidar(relative, kinds, 3), by_loop(targets), atol=1e-9)
-
-
-def test_object_ahead_reads_in_the_first_bin_and_the_last():
-    readings = pseudo_lidar(np.array([[1.5, 0.0]]), np.array([0]), 1)
-    assert readings[0] == pytest.approx(0.5)
-    assert readings[-1] == pytest.approx(0.5)  # on the border: all of it aliases backwards
-    assert readings[1:-1].max() == 0.0

@@ -46,9 +46,6 @@ def towards_goal(env, rng, noise=0.3):
     return np.clip(np.append(2.0 * to_goal, 0.0) + rng.normal(0.0, noise, 3), -1.0, 1.0)
 
 
-# The robot ---------------------------------------------------------------------------------------------------
-
-
 @given(speed=st.floats(0.05, 2.0), heading=st.floats(-3.0, 3.0))
 def test_it_brakes_with_four_metres_per_second_squared_at_any_speed(speed, heading):
     env = _open_field()
@@ -75,9 +72,6 @@ def _open_field():
     env = _KEPT["env"]
     start(env, pillars=[[FAR, FAR]] * 4)
     return env
-
-
-# What stops it -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("angle", np.linspace(0.0, 2.0 * np.pi, 9)[:-1] + 0.2)
@@ -107,9 +101,6 @@ def test_pillars_are_solid_and_frictionless(env, angle):
         env.frame_skip = 4
 
 
-# The eye -----------------------------------------------------------------------------------------------------
-
-
 def test_camera_and_site_look_ahead_from_their_place_on_the_turning_robot(env):
     rng = np.random.default_rng(1)
     env.reset(seed=1)
@@ -132,9 +123,6 @@ def test_camera_and_site_look_ahead_from_their_place_on_the_turning_robot(env):
             expected = [*env.pillar_positions[i], 0.3]
             np.testing.assert_array_equal(env.data.body(f"pillar{i}").xpos, expected)
     assert env.model.cam("eye").fovy[0] == 100.0
-
-
-# Collisions --------------------------------------------------------------------------------------------------
 
 
 def replayed(env, seed, actions, layout):
@@ -192,9 +180,6 @@ def test_a_contact_that_lasts_is_one_collision_and_a_start_in_one_counts(env):
     for _ in range(60):
         info = env.step(push())[4]
     assert info["cost"] == 0.0
-
-
-# The traffic -------------------------------------------------------------------------------------------------
 
 
 def test_the_seed_alone_decides_the_cars_way(env):
@@ -260,9 +245,6 @@ def test_the_cars_tracks_are_their_true_states_and_their_true_law(env):
         np.testing.assert_array_equal(positions[i, :, 1], env.car_positions[:, 1])
         np.testing.assert_allclose(covariances[i, :, 0, 0], noise_covariance(time)[0, 0], rtol=1e-6)
         np.testing.assert_array_equal(covariances[i, :, 1], 0.0)
-
-
-# The task ----------------------------------------------------------------------------------------------------
 
 
 def test_observation_is_what_it_says_and_knows_no_cars(env):
@@ -352,17 +334,12 @@ def test_a_given_layout_is_kept_and_the_rest_is_sampled_beside_it(env):
     ("layout", "error", "match"),
     [
         ({"hazards": []}, UnknownNameError, "agent, goal, cars, pillars"),
-        ({"agent": [0, 0]}, ConfigurationError, "x, y, heading"),
         ({"agent": [0, 3.4, 0]}, ConfigurationError, r"\|y\| <= 3.3"),
         ({"agent": [-3.9, 0, 0]}, ConfigurationError, r"\|x\| <= 3.8"),
         ({"agent": [-2.2, -1.9, 0], "pillars": PILLARS}, ConfigurationError, "in a pillar"),
-        ({"agent": [math.nan, 0, 0]}, ConfigurationError, "finite"),
-        ({"goal": "there"}, ConfigurationError, "goal"),
         ({"cars": [[0, 1]] * 5}, ConfigurationError, "6 cars"),
-        ({"cars": [[0, math.inf]] * 6}, ConfigurationError, "finite"),
         ({"pillars": PILLARS[:3]}, ConfigurationError, "4 pillars"),
         ({"pillars": [[x, -2.9] for x in (-1.5, -0.5, 0.5, 1.5)]}, ConfigurationError, "no room"),
-        ([0, 1], ConfigurationError, "mapping"),
     ],
 )
 def test_bad_layouts_are_refused_with_the_reason(env, layout, error, match):

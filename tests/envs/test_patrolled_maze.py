@@ -1,13 +1,10 @@
 """The patrolled maze: its physics is PointMaze's, its patrols keep to their law, its judge misses nothing."""
 
 import functools
-import pickle
-import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -36,9 +33,6 @@ def place(env, ball, velocity, along, speeds):
     env._touching = np.zeros(len(along), dtype=bool)
 
 
-# What stays ----------------------------------------------------------------------------------------------------
-
-
 def test_physics_observations_rewards_and_goals_are_point_mazes():
     ours = gym.make(PATROLLED_MAZE_ID, reset_target=True)
     theirs = gym.make("PointMaze_UMaze-v3", reset_target=True, max_episode_steps=1000)
@@ -56,26 +50,6 @@ def test_physics_observations_rewards_and_goals_are_point_mazes():
             other, expected, *others, _ = theirs.step(action.astype(np.float32))
             assert (reward, ends) == (expected, others)
     assert len(goals) > 2
-
-
-def test_the_contract():
-    env = shared()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*(infinity|Box observation|Overriding).*")
-        check_env(env, skip_render_check=True)
-    copy = pickle.loads(pickle.dumps(gym.make(PATROLLED_MAZE_ID, reward_type="dense").unwrapped))
-    assert copy.patrol_positions.shape == (2, 2) and copy.reward_type == "dense"
-    info = env.reset(seed=0)[1]
-    for found in (info, env.step(np.zeros(2))[4]):
-        assert {k: type(found[k]) for k in ("cost", "cost_substep", "collisions")} == {
-            "cost": float,
-            "cost_substep": float,
-            "collisions": int,
-        }
-
-
-# How patrols move ----------------------------------------------------------------------------------------------
 
 
 def patrol_path(seed, steps=400, action=(0.0, 0.0)):
@@ -108,9 +82,6 @@ def test_a_patrol_keeps_to_its_way_turns_at_its_ends_and_its_velocity_is_that_of
 def test_the_seed_alone_decides_the_way_whatever_the_ball_does():
     first, pushed, other = (next(patrol_path(*a)) for a in ((5,), (5, 400, (1.0, -1.0)), (6,)))
     assert np.array_equal(first, pushed) and not np.array_equal(first, other)
-
-
-# Judging -------------------------------------------------------------------------------------------------------
 
 
 @given(arrays(float, (5, 2), elements=st.floats(-2, 2)), arrays(float, (5, 2), elements=st.floats(-2, 2)))
@@ -158,12 +129,6 @@ def test_no_patrol_starts_at_the_ball():
         assert info["cost"] == 0.0 and info["collisions"] == 0
         gaps.append(np.linalg.norm(env.patrol_positions - env.agent_position, axis=1).min())
     assert CONTACT + 0.3 <= min(gaps) < CONTACT + 0.4
-
-
-# Ways ----------------------------------------------------------------------------------------------------------
-
-
-# Hidden, and kept clear of ---------------------------------------------------------------------------------------
 
 
 def blocked(a, b):

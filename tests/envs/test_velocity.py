@@ -62,9 +62,6 @@ def no_warnings():
         yield
 
 
-# The standard env --------------------------------------------------------------------------------------------
-
-
 @versions
 @robots
 def test_all_but_the_cost_is_the_standard_env_bit_for_bit(robot, version):
@@ -101,9 +98,6 @@ def test_all_but_the_cost_is_the_standard_env_bit_for_bit(robot, version):
         assert all(type(info[key]) is float for key in ADDED)
     assert resets >= 2
     assert env.unwrapped.np_random.bit_generator.state == theirs.np_random.bit_generator.state
-
-
-# The cost ----------------------------------------------------------------------------------------------------
 
 
 def test_the_limits_are_the_published_ones():
@@ -219,9 +213,6 @@ def test_a_speed_that_is_not_a_number_costs(monkeypatch):
     assert env.step(np.zeros(6))[4]["cost"] == 1.0
 
 
-# What is refused ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("version", ["v3", "V5", "", 4, None])
 def test_an_unknown_version_is_refused_with_the_options(version):
     with pytest.raises(UnknownNameError, match="version must be one of 'v5', 'v4'; got"):
@@ -231,6 +222,3 @@ def test_an_unknown_version_is_refused_with_the_options(version):
 def test_an_unknown_robot_is_refused_with_the_options():
     with pytest.raises(UnknownNameError, match=r"'HalfCheetah', .*'Humanoid'; got 'Reacher'"):
         make_velocity_env("Reacher")
-
-
-# Frames ------------------------------------------------------------------------------------------------------

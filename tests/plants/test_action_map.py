@@ -10,7 +10,7 @@ import pytest
 from asking import bound
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import UnsupportedEnvError
 
 HANDS = ["HandReach-v3", *(f"AdroitHand{task}-v1" for task in ("Door", "Hammer", "Pen", "Relocate"))]
 MACHINE = """
@@ -207,22 +207,10 @@ class Frozen(Machine):
         (Ramp(), r"does not hold one control for 4 physics steps: its state was up to \d"),
         (
             Frozen(),
-            r"no copy of it can be stepped to find out how \(RuntimeError: no robot is connected\).*action_map=",
+            r"no copy of it can be stepped to find out how \(RuntimeError: no robot is connected\).*AnalyticPlant\(",
         ),
     ],
 )
 def test_what_is_no_map_is_refused(env, says):
     with pytest.raises(UnsupportedEnvError, match=says):
         bound(env)
-
-
-def test_a_map_may_be_given_and_is_tried_where_that_can_be_done():
-    assert np.array_equal(bound(Machine(), action_map=(OFFSET, SCALE)).action_map.scale, SCALE)
-    assert np.array_equal(bound(Frozen(), action_map=(OFFSET, -2)).action_map.scale, [-2.0, -2.0])
-    with pytest.raises(
-        ConfigurationError, match=r"action_map is not what .* does with its actions.* up to 6"
-    ):
-        bound(Machine(), action_map=(OFFSET, -SCALE))
-    for wrong in (3.0, (1.0,), "ab", (0.0, [1.0, 2.0, 3.0]), (np.nan, 1.0)):
-        with pytest.raises(ConfigurationError, match=r"action_map is \(offset, scale\)"):
-            bound(Machine(), action_map=wrong)

@@ -273,7 +273,7 @@ def test_bad_sizes(sizes, words):
 
 
 FLEX_HOLD = 0.1
-RINGS = RigidModelCheck(("spring",), (12.0,), (0.01,), 0.1, 8.3, FLEX_HOLD)
+RINGS = RigidModelCheck(("spring",), (12.0,), (0.01,), 8.3, FLEX_HOLD)
 SHARE = 0.01
 
 

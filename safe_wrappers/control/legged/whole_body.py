@@ -41,7 +41,7 @@ class WholeBodyStatus(StrEnum):
     """Outcome of a solution."""
 
     INACTIVE = "inactive"
-    """The nominal control satisfies everything and there are no tasks: `control` equals it, bit for bit."""
+    """The nominal control satisfies everything: `control` equals it, bit for bit."""
     SOLVED = "solved"
     """The best control that satisfies everything, residuals checked."""
     INFEASIBLE = "infeasible"
@@ -54,18 +54,12 @@ class Residuals(NamedTuple):
     """Constraint violations of an answer, each at least 0, evaluated from the answer itself.
 
     Attributes:
-        dynamics: Largest entry of `M qacc + h - B u - J' f`, N or N m.
         contact: Largest error of a contact's acceleration, m/s^2 (of an opening one: its shortfall).
         cone: Largest violation of an exact friction cone, N, also where a pyramid was used.
-        bounds: Largest distance of the control from the box.
-        rows: Largest excess over a limit of `acceleration_rows` or `force_rows`, in their units.
     """
 
-    dynamics: float
     contact: float
     cone: float
-    bounds: float
-    rows: float
 
 
 class WholeBodySolution(NamedTuple):
@@ -77,7 +71,6 @@ class WholeBodySolution(NamedTuple):
         forces: At the contacts, shape (k, 3), N, each inside its cone (and pyramid).
         status: Compares equal to its string.
         residuals: See `Residuals`.
-        objective: Half the weighted squares that were minimised; infinite where there is none.
     """
 
     control: Array
@@ -85,7 +78,6 @@ class WholeBodySolution(NamedTuple):
     forces: Array
     status: WholeBodyStatus
     residuals: Residuals
-    objective: float
 
 
 def solve_pyramid(problem: WholeBodyProblem, edges: int = 4) -> WholeBodySolution:
@@ -131,12 +123,11 @@ def _solve(problem: WholeBodyProblem, sides: Array | None) -> WholeBodySolution:
     rigid, loose = eliminate(motion)
     consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _tolerance(problem.wanted)
     reduced = reduced_program(problem, motion, rigid, sides) if consistent else None
-    if reduced is not None and not problem.tasks:
+    verdict = "infeasible"
+    if reduced is not None:
         unchanged = _nominal(problem, motion, reduced)
         if unchanged is not None:
             return unchanged
-    verdict = "infeasible"
-    if reduced is not None:
         candidate = _ask(reduced.program)
         if candidate.y is not None:
             found = _checked(problem, motion, reduced, candidate.y, WholeBodyStatus.SOLVED)
@@ -203,10 +194,8 @@ def _answer(
 ) -> WholeBodySolution:
     control = problem.nominal if status is WholeBodyStatus.INACTIVE else y[: len(problem.nominal)]
     forces, acceleration = _forces_and_acceleration(problem, motion, reduced.elimination, y)
-    program = reduced.program
-    objective = float(0.5 * y @ program.hessian @ y + program.linear @ y) + reduced.constant
-    missed = _residuals(problem, control, acceleration, forces)
-    return WholeBodySolution(control, acceleration, forces, status, missed, objective)
+    missed = _residuals(problem, acceleration, forces)
+    return WholeBodySolution(control, acceleration, forces, status, missed)
 
 
 def _forces_and_acceleration(
@@ -218,10 +207,8 @@ def _forces_and_acceleration(
     return forces, motion.free + motion.by_control @ y[: elimination.controls] + motion.by_force @ stance
 
 
-def _residuals(problem: WholeBodyProblem, control: Array, acceleration: Array, forces: Array) -> Residuals:
+def _residuals(problem: WholeBodyProblem, acceleration: Array, forces: Array) -> Residuals:
     """From the problem's own matrices, independent of the elimination."""
-    pushed = np.einsum("kiv,ki->v", problem.jacobians, forces)
-    dynamics = problem.inertia @ acceleration + problem.bias - problem.actuation @ control - pushed
     missed = problem.jacobians @ acceleration - problem.wanted
     held = missed[problem.stance]
     along = np.einsum("ki,ki->k", held, problem.normals[problem.stance])
@@ -233,16 +220,7 @@ def _residuals(problem: WholeBodyProblem, control: Array, acceleration: Array, f
         short = -np.einsum("ki,ki->k", normals, missed[problem.opening])
         contact = max(contact, float(short.max()))
     cone = float(cone_excess(forces, problem.normals, problem.friction).max(initial=0.0))
-    outside = np.maximum(problem.lower - control, control - problem.upper)
-    rows = 0.0
-    if problem.acceleration_rows is not None and problem.acceleration_limits is not None:
-        excess = problem.acceleration_rows @ acceleration - problem.acceleration_limits
-        rows = float(excess.max(initial=0.0))
-    if problem.force_rows is not None and problem.force_limits is not None:
-        excess = problem.force_rows @ forces.reshape(-1) - problem.force_limits
-        rows = max(rows, float(excess.max(initial=0.0)))
-    missed_forces = float(np.abs(dynamics).max(initial=0.0))
-    return Residuals(missed_forces, contact, cone, float(outside.max(initial=0.0)), rows)
+    return Residuals(contact, cone)
 
 
 def _least_violation(
@@ -257,7 +235,7 @@ def _least_violation(
     nu = len(problem.nominal)
     misses = np.arange(nu, nu + loose.misses)
     half = 0.5 * (problem.upper - problem.lower)
-    costs = problem.weights * half**2
+    costs = half**2
     share = _OBJECTIVE_IN_LEAST_VIOLATION / max(1.0, float(costs[np.isfinite(costs)].max(initial=0.0)))
     hessian = share * plain.program.hessian
     hessian[misses, misses] += 1.0
@@ -277,5 +255,5 @@ def _least_violation(
     # Nothing passed: the nominal control clipped to its box, contacts without force.
     control = np.clip(problem.nominal, problem.lower, problem.upper)
     acceleration, forces = motion.free + motion.by_control @ control, np.zeros(problem.normals.shape)
-    missed = _residuals(problem, control, acceleration, forces)
-    return WholeBodySolution(control, acceleration, forces, WholeBodyStatus.FAILED, missed, np.inf)
+    missed = _residuals(problem, acceleration, forces)
+    return WholeBodySolution(control, acceleration, forces, WholeBodyStatus.FAILED, missed)

@@ -5,7 +5,6 @@ does not cover the motion between samples. So `predicted_position_rows` bound ac
 their ranges until a horizon, which is no shorter than stopping takes.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -14,23 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from safe_wrappers.checks import Array, finite_arrays, positive
 from safe_wrappers.control.contact.friction_cone import checked_friction
 from safe_wrappers.errors import ConfigurationError
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """An acceleration task: `weight * |jacobian @ qacc + drift - target|^2` is added to the objective.
-
-    Attributes:
-        jacobian: Shape (r, nv).
-        drift: `dJ/dt qvel`, shape (r,).
-        target: Wanted acceleration, shape (r,).
-        weight: At least 0.
-    """
-
-    jacobian: Array
-    drift: Array
-    target: Array
-    weight: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +31,9 @@ class WholeBodyProblem:
         upper: Largest control, shape (nu,).
         nominal: The control whose distance is minimised, shape (nu,).
         contact_acceleration: Wanted at the contact points, shape (k, 3), m/s^2; None is zero.
-        control_weight: Of the squared distance from the nominal, positive, a number or shape (nu,).
         force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces of equal effect.
         breaking: Contacts that are to open, shape (k,): force 0, normal acceleration at least the wanted; None: none.
         first_tangents: Direction of each pyramid's first edge, shape (k, 3); None for a default.
-        tasks: See `Task`; with any, no control is `inactive`.
         acceleration_rows: G in `G qacc <= g`, shape (m, nv) (`predicted_position_rows` makes some).
         acceleration_limits: g, shape (m,).
         force_rows: R in `R f <= r`, f the stacked contact forces, shape (m', 3 k) (`support_rows` makes some).
@@ -71,11 +51,9 @@ class WholeBodyProblem:
     upper: Array
     nominal: Array
     contact_acceleration: Array | None = None
-    control_weight: Array | float = 1.0
     force_weight: float = 1e-8
     breaking: NDArray[np.bool_] | None = None
     first_tangents: Array | None = None
-    tasks: Sequence[Task] = ()
     acceleration_rows: Array | None = None
     acceleration_limits: Array | None = None
     force_rows: Array | None = None
@@ -84,8 +62,6 @@ class WholeBodyProblem:
     """Indices of the contacts that are to stay."""
     opening: NDArray[np.intp] = field(init=False)
     """Indices of the contacts that are to open."""
-    weights: Array = field(init=False)
-    """`control_weight` as an array, shape (nu,)."""
     wanted: Array = field(init=False)
     """Wanted `J qacc`: `contact_acceleration`, or zeros, minus the drift, shape (k, 3)."""
 
@@ -103,7 +79,6 @@ class WholeBodyProblem:
         acceleration = 0.0 if self.contact_acceleration is None else self.contact_acceleration
         object.__setattr__(self, "stance", np.flatnonzero(~opens))
         object.__setattr__(self, "opening", np.flatnonzero(opens))
-        object.__setattr__(self, "weights", np.broadcast_to(self.control_weight, self.nominal.shape))
         object.__setattr__(self, "wanted", acceleration - self.drift)
 
 

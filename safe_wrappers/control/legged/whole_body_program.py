@@ -236,14 +236,13 @@ def eliminate(motion: Motion) -> tuple[Elimination, Elimination]:
 
 
 class ReducedProgram(NamedTuple):
-    """A program, a constant to be added to its objective, and the contact forces as a function of its unknowns.
+    """A program, and the contact forces as a function of its unknowns.
 
     A least violation may break the first `softenable` rows: those of accelerations, forces and opening contacts. The
     others are sides of pyramids.
     """
 
     program: Program
-    constant: float
     softenable: int
     elimination: Elimination
 
@@ -267,16 +266,9 @@ def reduced_program(
     weighted = problem.force_weight * elimination.matrix
     hessian = weighted.T @ elimination.matrix
     linear = weighted.T @ elimination.offset
-    constant = problem.force_weight * float(elimination.offset @ elimination.offset)
     each = np.arange(nu)
-    hessian[each, each] += problem.weights
-    linear[:nu] -= problem.weights * problem.nominal
-    constant += float(problem.weights @ problem.nominal**2)
-    for task in problem.tasks:
-        matrix, target = task.jacobian @ slope, task.target - task.drift - task.jacobian @ start
-        hessian += task.weight * (matrix.T @ matrix)
-        linear -= task.weight * (matrix.T @ target)
-        constant += task.weight * float(target @ target)
+    hessian[each, each] += 1.0
+    linear[:nu] -= problem.nominal
     rows, limits = _rows(problem, elimination, start, slope)
     softenable = len(limits)
     normals, friction = problem.normals[problem.stance], problem.friction[problem.stance]
@@ -295,7 +287,7 @@ def reduced_program(
     free = np.full(n - nu, np.inf)
     lower, upper = np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free])
     program = Program(hessian, linear, rows, limits, lower, upper, cones, cone_offsets)
-    return ReducedProgram(program, 0.5 * constant, softenable, elimination)
+    return ReducedProgram(program, softenable, elimination)
 
 
 def _rows(problem: WholeBodyProblem, forces: Elimination, start: Array, slope: Array) -> tuple[Array, Array]:

@@ -5,21 +5,19 @@ An env may count its actions in other units than its model's controls: the hands
 """
 
 import copy
-from collections.abc import Sequence
-from types import ModuleType
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.binding import Accessed
 from safe_wrappers.plants.mujoco.forecast import RESETS, Recorder
 from safe_wrappers.plants.mujoco.model import control_range
+from safe_wrappers.plants.simulator.copies import EnvCopier
 
 _TRIALS: Final = 100
 _FEWEST: Final = 10  # of them that must not have diverged
@@ -41,9 +39,8 @@ class ActionMap:
         high: Largest action, shape (nu,).
     """
 
-    def __init__(self, offset: ArrayLike, scale: ArrayLike, low: Array, high: Array) -> None:
-        self.low, self.high = (np.asarray(end, dtype=np.float64) for end in (low, high))
-        self.offset, self.scale = (_entries(name, given, self.low) for name, given in _named(offset, scale))
+    def __init__(self, offset: Array, scale: Array, low: Array, high: Array) -> None:
+        self.offset, self.scale, self.low, self.high = offset, scale, low, high
 
     @property
     def is_identity(self) -> bool:
@@ -99,22 +96,6 @@ def _times(scale: Array, end: Array) -> Array:
     return np.where(scale == 0.0, 0.0, scale) * np.where(scale == 0.0, 0.0, end)
 
 
-def _named(offset: ArrayLike, scale: ArrayLike) -> tuple[tuple[str, ArrayLike], tuple[str, ArrayLike]]:
-    return ("offset", offset), ("scale", scale)
-
-
-def _entries(name: str, given: ArrayLike, like: Array) -> Array:
-    try:
-        found = np.broadcast_to(np.asarray(given, dtype=np.float64), like.shape).copy()
-    except (TypeError, ValueError):
-        found = np.array(np.nan)
-    if not np.isfinite(found).all():
-        raise ConfigurationError(
-            f"action_map is (offset, scale), each one number or {like.size}; got {name} = {given!r}"
-        )
-    return found
-
-
 class MappedRecorder(Recorder):
     """Forecasts of actions that the env maps to controls; the arguments are those of `Recorder`, and the map."""
 
@@ -147,43 +128,32 @@ class _Tried(NamedTuple):
     departure: float  # largest difference of its states from those of this control, held
 
 
-def find_action_map(
-    env: gym.Env[Any, Any], source: Any, substeps: int, given: Sequence[ArrayLike] | None, ranges_agree: bool
-) -> ActionMap:
-    """The map by which an env makes controls of actions, found on a copy of it, or the given one, if that is right.
+def find_action_map(env: gym.Env[Any, Any], source: Any, substeps: int, ranges_agree: bool) -> ActionMap:
+    """The map by which an env makes controls of actions, found on a copy of it.
 
     Args:
         env: Its action space has one action per control. It and its random generator stay as they are.
         source: Has the unwrapped env's `.model` and `.data`.
         substeps: Physics steps of one step of the env.
-        given: (offset, scale); where no copy of the env can be stepped, they are taken as they are.
         ranges_agree: The action space is the control range, as far as there is one: then actions are controls where
             no copy can be stepped.
 
     Raises:
-        ConfigurationError: The given pair is none, or not what the env does.
         UnsupportedEnvError: No copy can be stepped, or the env does something else with its actions.
     """
     space, name = env.action_space, name_of(env)
     assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
     box = space.low.astype(np.float64), space.high.astype(np.float64)
-    if given is not None and (not isinstance(given, Sequence) or len(given) != 2):
-        raise ConfigurationError(
-            f"action_map is (offset, scale): control = offset + scale * action; got {given!r}"
-        )
-    wanted = None if given is None else ActionMap(given[0], given[1], *box)
-    likely = wanted or (ActionMap(0.0, 1.0, *box) if ranges_agree else None)
     try:
         tried = _tried(env.unwrapped, source, space, substeps)
     except Exception as error:
-        if likely is not None:
-            return likely
+        if ranges_agree:
+            return ActionMap(np.zeros(box[0].size), np.ones(box[0].size), *box)
         raise UnsupportedEnvError(
             f"{name} rescales or limits actions in its own step, and no copy of it can be stepped to find out how "
-            f"({type(error).__name__}: {error}); say what it does by MujocoPlant(action_map=(offset, scale)), where "
-            "control = offset + scale * action"
+            f"({type(error).__name__}: {error}). {_INSTEAD}"
         ) from error
-    guesses = [wanted] if wanted is not None else [_ends_to_ends(source.model, box), _through_two(tried, box)]
+    guesses = [_ends_to_ends(source.model, box), _through_two(tried, box)]
     errors = [np.abs(tried.controls - np.array([g.control(a) for a in tried.actions])) for g in guesses]
     best = int(np.argmin([np.nan_to_num(error, nan=np.inf).max() for error in errors]))
     worst, allowed = errors[best].max(axis=0), _ROUNDING * np.abs(tried.controls).max(axis=0)
@@ -194,8 +164,6 @@ def find_action_map(
             f"in {_TRIALS} steps of random actions its controls were up to {worst[i]:.3g} away from that, at "
             f"actuator {source.model.actuator(i).name or i!r}, which had {seen.min():.3g} to {seen.max():.3g}"
         )
-        if wanted is not None:
-            raise ConfigurationError(f"action_map is not what {name} does with its actions: {says}")
         raise UnsupportedEnvError(
             f"{name} rescales or limits actions in its own step, and not by control = offset + scale * action: "
             f"{says}. The map may depend on its state. {_INSTEAD}"
@@ -229,11 +197,8 @@ def _through_two(tried: _Tried, box: tuple[Array, Array]) -> ActionMap:
 
 def _tried(raw: Any, source: Any, space: gym.spaces.Box, substeps: int) -> _Tried:
     """Step a copy of an unwrapped env: by the middle of its actions, their upper end, and random ones."""
-    twin = duplicate(raw)
+    twin: Any = EnvCopier(raw).copy()
     at = source.on(twin) if isinstance(source, Accessed) else twin
-    for one in _envs_of(twin):
-        if getattr(one, "render_mode", None) is not None:
-            one.render_mode = None
     space = copy.deepcopy(space)
     space.seed(0)
     low, high = (
@@ -261,26 +226,3 @@ def _tried(raw: Any, source: Any, space: gym.spaces.Box, substeps: int) -> _Trie
     if len(taken) < _FEWEST:
         raise RuntimeError(f"in {len(actions) - len(taken)} of {len(actions)} steps its simulation diverged")
     return _Tried(np.array(taken, dtype=space.dtype).astype(np.float64), np.array(controls), departure)
-
-
-def _envs_of(raw: Any) -> list[Any]:
-    """An env and all that it holds, directly or not."""
-    held = [e for e in vars(raw).values() if isinstance(e, gym.Env)]
-    return [raw, *(inner for e in held for inner in _envs_of(e))]
-
-
-def duplicate(raw: Any) -> Any:
-    """A copy of an unwrapped env at its present state, without its renderers.
-
-    `copy.deepcopy` would make many envs anew from the arguments of their constructors, as `EzPickle` tells it to.
-    """
-    memo: dict[int, Any] = {}
-    envs = _envs_of(raw)
-    for one in envs:
-        memo[id(one)] = object.__new__(type(one))
-    for one in envs:
-        for name, value in vars(one).items():
-            rendered = name == "mujoco_renderer"
-            kept = value if isinstance(value, ModuleType) else copy.deepcopy(value, memo)
-            memo[id(one)].__dict__[name] = None if rendered else kept
-    return memo[id(raw)]

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, name_list
-from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.plants.mujoco.forecast import RESETS
-from safe_wrappers.plants.mujoco.model import fixed_bodies
+from safe_wrappers.plants.mujoco.model import fixed_bodies, named
 
 Visit = Callable[[mujoco.MjData, float], None]
 """Takes data with the contacts and forces of one evaluation, and the time for which it counts, s."""
@@ -216,16 +215,12 @@ class ContactForecast(NamedTuple):
 
 
 class ContactReader:
-    """Reads the contacts of a model's moving bodies with the fixed world.
-
-    `read` only copies MuJoCo's arrays; `forecast` evaluates all of them at once, because Python is slow.
-    """
+    """Reads the contacts of a model's moving bodies with the fixed world."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
-        fixed = fixed_bodies(model)
         # The last entry is for geom -1, of something flexible: it moves, but is not a body of the robot.
-        bodies = np.where(fixed, 0, np.arange(model.nbody))
+        bodies = np.where(fixed_bodies(model), 0, np.arange(model.nbody))
         self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
         self._wrench = np.zeros(6)
         self.clear()
@@ -233,44 +228,35 @@ class ContactReader:
     def clear(self) -> None:
         """Forget what has been read."""
         self.count = 0
-        self._kept: list[tuple[int, int, int, int]] = []
-        self._forces: list[Array] = []
-        self._copied = 0
-        self._copies: list[tuple[Array, ...]] = []
+        self._found: list[tuple[Any, ...]] = []
 
     def read(self, data: mujoco.MjData) -> None:
         """Copy every contact of a moving body with the fixed world, as MuJoCo has computed them last."""
-        step = self.count
+        step, body, contact = self.count, self._body_of_geom, data.contact
         self.count += 1
-        if not data.ncon:
-            return
-        contact, body, before = data.contact, self._body_of_geom, len(self._kept)
-        geoms, addresses = contact.geom.tolist(), contact.efc_address.tolist()
-        for i, ((one, other), address) in enumerate(zip(geoms, addresses, strict=True)):
+        for i, (one, other) in enumerate(contact.geom.tolist()):
             first, second = body[one], body[other]
-            if address < 0 or first == second or min(first, second) != 0:
+            if first == second or min(first, second) != 0 or contact.efc_address[i] < 0:
                 continue
             mujoco.mj_contactForce(self._model, data, i, self._wrench)
-            self._forces.append(self._wrench.copy())
             # MuJoCo's normal points from the first geom to the second, and the force is on the second.
-            self._kept.append((step, self._copied + i, first or second, 1 if first == 0 else -1))
-        if len(self._kept) == before:
-            return
-        self._copied += len(geoms)
-        fields = contact.pos, contact.frame, contact.friction, contact.dim
-        self._copies.append(tuple(field.copy() for field in fields))
+            side = 1.0 if first == 0 else -1.0
+            slide = contact.friction[i, :2].min() if contact.dim[i] > 1 else 0.0
+            frame = contact.frame[i].reshape(3, 3).copy()
+            self._found.append(
+                (step, first or second, contact.pos[i].copy(), side, frame, self._wrench[:3].copy(), slide)
+            )
 
     def forecast(self, finite: bool) -> ContactForecast:
         """All contacts that have been read since `clear`."""
-        if not self._kept:
+        if not self._found:
             none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
             return ContactForecast(self.count, none, none, nowhere, nowhere, nowhere, np.zeros(0), finite)
-        step, which, body, side = np.array(self._kept, dtype=np.int64).T
-        points, frames, slide, dims = (np.concatenate(f)[which] for f in zip(*self._copies, strict=True))
-        frames, sign = frames.reshape(-1, 3, 3), side[:, None].astype(np.float64)
-        force = sign * np.einsum("ki,kij->kj", np.array(self._forces)[:, :3], frames)
-        friction = np.where(dims > 1, slide[:, :2].min(axis=1), 0.0)
-        return ContactForecast(self.count, step, body, points, sign * frames[:, 0], force, friction, finite)
+        step, body, point, side, frame, force, friction = (
+            np.array(part) for part in zip(*self._found, strict=True)
+        )
+        normal, force = side[:, None] * frame[:, 0], side[:, None] * np.einsum("ki,kij->kj", force, frame)
+        return ContactForecast(self.count, step, body, point, normal, force, friction, finite)
 
     def follow(self, data: mujoco.MjData, substeps: int) -> ContactForecast:
         """Step the data, with the control it has, and return the contacts of all these physics substeps."""
@@ -305,14 +291,8 @@ def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:
 
 def chosen_bodies(model: mujoco.MjModel, argument: str, names: Sequence[str] | None) -> NDArray[np.bool_]:
     """Which bodies are named, shape (nbody + 1,); the last entry stands for flexible parts, which have no name."""
-    if names is None:
-        return np.ones(model.nbody + 1, dtype=bool)
-    names = name_list(argument, names, "names of bodies", "None for all")
-    known = {model.body(i).name: i for i in range(model.nbody)}
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        there = ", ".join(name for name in known if name)
-        raise UnknownNameError(f"{argument}: the model has no body {unknown[0]!r}; it has: {there}")
-    chosen = np.zeros(model.nbody + 1, dtype=bool)
-    chosen[[known[name] for name in names]] = True
+    chosen = np.full(model.nbody + 1, names is None)
+    if names is not None:
+        names = name_list(argument, names, "names of bodies", "None for all")
+        chosen[[named(model, "body", name, argument) for name in names]] = True
     return chosen

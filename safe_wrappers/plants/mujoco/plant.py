@@ -2,13 +2,11 @@
 
 import copy
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, ClassVar, Final
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
@@ -50,13 +48,11 @@ class MujocoPlant(Plant):
         delay_s: Evidence age plus detection plus actuation delay in s, over which this plant's model predicts.
         data: A function of the unwrapped env that returns its data; None: they are its `.data`.
         control_dt: How long the env holds an action, s; needed where it has no `dt` or `frame_skip`.
-        action_map: (offset, scale), one number or one per action: the env sets the control `offset + scale * action`.
-            None: an action is a control, or, where the action space is not the control range, this is found by
-            stepping a copy of the env.
         loop: The `plants.ControlLoop` that your controller closes; `margin_left_deg` is what is left of its margin.
 
     Attributes:
-        action_map: The map, once bound; None where an action is a control.
+        action_map: By which the env makes controls of actions, where the action space is not the control range; found
+            by stepping a copy of the env at binding. None where an action is a control.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, a disabled actuator, one not affine, or actions that no map fits.
@@ -78,11 +74,10 @@ class MujocoPlant(Plant):
         *,
         data: binding.DataOf | None = None,
         control_dt: float | None = None,
-        action_map: Sequence[ArrayLike] | None = None,
         loop: ControlLoop | None = None,
     ) -> None:
         self._given, self._functions = binding.given_and_functions(model, data)
-        self._given_dt, self._given_map = control_dt, action_map
+        self._given_dt = control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._pending: deque[Array] = deque()
         self._factors, self.loop = (1.0, 1.0), checked_loop(loop)
@@ -92,7 +87,6 @@ class MujocoPlant(Plant):
         self._range: tuple[Array, Array] = self.lower, self.upper
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        """Attach to an env and its model."""
         raw: Any = env.unwrapped
         env_checks.refuse_second_env(self._raw, env)
         env_checks.refuse_changed_actions(env)
@@ -153,10 +147,10 @@ class MujocoPlant(Plant):
         """Find the bounds of the action, and the map from it to the control."""
         self.action_map = None
         are_controls = binding.actions_are_controls(env.action_space, self.lower, self.upper)
-        if are_controls and np.isfinite(self.lower).all() and self._given_map is None:
+        if are_controls and np.isfinite(self.lower).all():
             return
         binding.refuse_other_actions(env, self.lower, self.upper)
-        found = find_action_map(env, self._source, self.substeps, self._given_map, are_controls)
+        found = find_action_map(env, self._source, self.substeps, are_controls)
         if are_controls and found.is_identity:
             return
         self.action_map = found
@@ -193,7 +187,6 @@ class MujocoPlant(Plant):
             self._predict_over_delay()
 
     def executed(self, control: Array | None) -> None:
-        """Remember a sent command; None begins an episode."""
         self._sent, self._sent_at = control, float(self._source.data.time)
         if control is None:
             self._pending.clear()
@@ -234,7 +227,6 @@ class MujocoPlant(Plant):
         return "" if same else f"the step ended {np.abs(state - end).max():.3g} from its forecast"
 
     def follow(self) -> None:
-        """Read the model anew if the env's has changed."""
         self._outdated |= self._source.model is not self._env_model or self._constants.changed()
         if self._outdated:
             self._take_model()
@@ -286,7 +278,6 @@ class MujocoPlant(Plant):
 
     @property
     def state(self) -> Array:
-        """(qpos, qvel), shape (nq + nv,)."""
         return self._snapshot[1 : 1 + self._nq + self._nv]
 
     @property
@@ -425,7 +416,6 @@ class MujocoPlant(Plant):
         return None if self._delay_steps else self._source.data
 
     def path(self, control: Array) -> list[Array]:
-        """The states (qpos, qvel) after each physics substep of a held control."""
         return list(self.forecast(control).path)
 
     def motion(self, kind: str, name: str) -> tuple[Array, Array]:
@@ -446,7 +436,6 @@ class MujocoPlant(Plant):
         return p.copy(), *point_motion(jacobian, self.frames.jacobian_rate(kind, name), self.qvel, *response)
 
     def attribute(self, name: str) -> Any:
-        """Read a published fact of the env."""
         found = getattr(self._raw, name, None)
         return found if found is not None else env_checks.read_attribute(self._env, name)
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
@@ -132,15 +131,8 @@ def _addresses(m: mujoco.MjModel, plant: MujocoPlant, joint: int, kind: str) -> 
 
 
 def _course(poses: Array, rests: bool) -> Course:
-    ahead = np.empty((len(poses), 2))
-    _headings(poses, ahead)
-    return Course(poses[:, :2], ahead, rests)
-
-
-@compiled
-def _headings(poses: Array, ahead: Array) -> None:
-    for i in range(len(poses)):
-        w, x, y, z = poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6]
-        to_x, to_y = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)
-        length = math.sqrt(to_x * to_x + to_y * to_y)
-        ahead[i, 0], ahead[i, 1] = to_x / length, to_y / length
+    w, x, y, z = poses[:, 3:7].T
+    to_x, to_y = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)
+    return Course(
+        poses[:, :2], np.column_stack([to_x, to_y]) / np.sqrt(to_x * to_x + to_y * to_y)[:, None], rests
+    )

@@ -3,7 +3,7 @@
     M qacc + h = B u + sum J_k' f_k
 
 holds with MuJoCo's own accelerations and forces, to rounding. The base may float (a free joint) or not. Contacts are
-points: MuJoCo's torsional and rolling friction (condim 4 and 6) is in `moments` and in no force. MuJoCo's contacts
+points: MuJoCo's torsional and rolling friction (condim 4 and 6) is in no force. MuJoCo's contacts
 are soft, and its solver ignores the drift `dJ/dt qvel`. The drift here is that of the material points that touch at
 present; under a round foot that rolls, such a point moves into the foot.
 """
@@ -35,8 +35,6 @@ class ContactPoints(NamedTuple):
     jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
     drift: Array  #: `dJ/dt qvel`, shape (k, 3), m/s^2
     forces: Array  #: on the pushed body, as MuJoCo's solver found them last, shape (k, 3), N
-    moments: Array  #: on the pushed body about the point, shape (k, 3), N m; 0 for condim 1 and 3
-    gaps: Array  #: signed distances, shape (k,), m; negative where bodies penetrate
 
 
 class FloatingBaseTerms(NamedTuple):
@@ -79,7 +77,7 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
     touching, fixed = np.flatnonzero(data.contact.efc_address >= 0), fixed_bodies(model)
     k = len(touching)
     jacobians, drift = np.zeros((k, 3, model.nv)), np.zeros((k, 3))
-    forces, moments, normals, first = (np.zeros((k, 3)) for _ in range(4))
+    forces, normals, first = (np.zeros((k, 3)) for _ in range(3))
     pushed, pushed_by = np.zeros(k, np.intp), np.zeros(k, np.intp)
     jac, dot, wrench = np.zeros((3, model.nv)), np.zeros((3, model.nv)), np.zeros(6)
     dim = data.contact.dim[touching]
@@ -95,7 +93,7 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
         frame = data.contact.frame[i].reshape(3, 3)
         mujoco.mj_contactForce(model, data, int(i), wrench)
         normals[row], first[row] = sign * frame[0], frame[1]
-        forces[row], moments[row] = sign * (wrench[:3] @ frame), sign * (wrench[3:] @ frame)
+        forces[row] = sign * (wrench[:3] @ frame)
         pushed[row], pushed_by[row] = other, one
         for body, side in ((other, 1.0), (one, -1.0)):
             if fixed[body]:
@@ -105,10 +103,9 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
             jacobians[row] += side * jac
             drift[row] += side * (dot @ data.qvel)
     points = np.array(data.contact.pos[touching]).reshape(k, 3)
-    gaps = np.array(data.contact.dist[touching]).reshape(k)
     friction = np.where(dim > 1, data.contact.friction[touching, 0], 0.0).reshape(k)
     geometry = points, normals, first, friction, pushed, pushed_by
-    return ContactPoints(*geometry, jacobians, drift, forces, moments, gaps)
+    return ContactPoints(*geometry, jacobians, drift, forces)
 
 
 class MomentumReader:

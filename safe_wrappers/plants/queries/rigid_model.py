@@ -24,8 +24,6 @@ class RigidModelCheck:
         springs: Names of the joints that are springs behind a motor; empty if there are none.
         resonances: Of the springs, at the pose of the check, the slowest first, rad/s.
         damping_ratios: Of each of them, to first order in the damping.
-        epsilon: 1 / sqrt(smallest stiffness), (N m/rad)^-1/2: the small parameter of singular perturbation; 0 without
-            springs.
         boundary_layer_s: Time constant with which the slowest of the vibrations decays, 1 / (ratio resonance), s;
             infinite without damping, 0 without springs.
         control_dt: Control interval of the env, s.
@@ -34,7 +32,6 @@ class RigidModelCheck:
     springs: tuple[str, ...]
     resonances: tuple[float, ...]
     damping_ratios: tuple[float, ...]
-    epsilon: float
     boundary_layer_s: float
     control_dt: float
 
@@ -92,7 +89,7 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
     springs = _springs(model, np.abs(moment).max(axis=0, initial=0.0) > 0.0)
     dofs = model.jnt_dofadr[springs]
     if not len(springs):
-        return RigidModelCheck((), (), (), 0.0, 0.0, plant.control_dt)
+        return RigidModelCheck((), (), (), 0.0, plant.control_dt)
     stiffness, damping = np.zeros((model.nv, model.nv)), np.diag(model.dof_damping)
     scalar = np.isin(model.jnt_type, of_model.SCALAR_JOINTS)
     every = model.jnt_dofadr[scalar]
@@ -111,7 +108,6 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
         tuple(model.joint(int(j)).name or f"#{j}" for j in springs),
         tuple(resonances.tolist()),
         tuple(ratios.tolist()),
-        float(1.0 / np.sqrt(model.jnt_stiffness[springs].min())),
         1.0 / slowest if slowest > 0.0 else np.inf,
         plant.control_dt,
     )

@@ -126,9 +126,8 @@ class EnvCopier:
             for name, value in vars(one).items():
                 known = id(value) in memo  # as None, too, which deepcopy would take for "not copied yet"
                 attributes[name] = memo[id(value)] if known else _copied(one, name, value, memo)
-        raw = memo[id(self._env.unwrapped)]
-        if "render_mode" in vars(raw):
-            raw.render_mode = None
+            if "render_mode" in attributes:
+                attributes["render_mode"] = None
         copied: gym.Env[Any, Any] = memo[id(self._env)]
         return copied
 

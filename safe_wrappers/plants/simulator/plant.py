@@ -153,7 +153,6 @@ class SimulatorPlant(RolloutPlant):
         self._foreseen: dict[bytes, tuple[Any, float | None, Measure | None]] = {}
 
     def bind(self, env: Env) -> None:
-        """Attach to an env, and check that its simulation is the env."""
         self._take_space(env.action_space)
         self._attach(env)
         self._simulation = simulation_of(env, self._snapshot)
@@ -187,12 +186,10 @@ class SimulatorPlant(RolloutPlant):
         return np.zeros(0)
 
     def observe(self) -> None:
-        """Every rollout starts where the env is."""
         self.observation_id += 1
         self._foreseen.clear()
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:
-        """Take what the env's reset or step has returned."""
         self._answered = True
         self.view = View(self.simulation.env.unwrapped, observation, info)
 
@@ -229,7 +226,6 @@ class SimulatorPlant(RolloutPlant):
         until: Callable[[View], bool] | None = None,
         between: str = "",
     ) -> Rollout:
-        """Simulate a control, then a policy, from the env's present state: see `RolloutPlant.rollout`."""
 
         def simulated(env: gym.Env[Any, Any]) -> tuple[Rollout, float | None, str]:
             with contextlib.ExitStack() as stack:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from safe_wrappers.plants.identified.coverage import allowed_misses, scores_needed, upper_bound
+from safe_wrappers.plants.identified import allowed_misses, scores_needed, upper_bound
 
 RATES = st.tuples(st.integers(1, 99), st.just(100)) | st.tuples(st.integers(1, 6), st.just(7))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from safe_wrappers.plants.identified.coverage import Coverage, allowed_misses, upper_bound
+from safe_wrappers.plants.identified import Coverage, allowed_misses, upper_bound
 
 
 @pytest.mark.parametrize(("scores", "rate"), [(9, 0.1), (60, 0.1), (40, 0.3)])

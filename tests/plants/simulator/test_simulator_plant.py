@@ -90,7 +90,14 @@ def test_a_policy_acts_after_the_control_and_measures_stop_a_rollout():
     env = Cart(start=(0.0, 1.0))
     plant = bound(env)
     env.reset(seed=0)
-    ahead = plant.rollout(np.ones(1), 30, policy=lambda view: -np.sign(view.observation[1:]))
+    asked = []
+
+    def policy(view):
+        asked.append(view.observation[1])
+        return -np.sign(view.observation[1:])
+
+    ahead = plant.rollout(np.ones(1), 30, policy=policy)
+    assert len(asked) == len(ahead.observations) - 1 == 29  # not after the last step
     speeds = [o[1] for o in ahead.observations]
     np.testing.assert_allclose(speeds[:3], [1.1, 1.0, 0.9])
     measured = plant.rollout(np.ones(1), 30, measure=lambda view: 0.15 - view.env.x, least=0.0)
@@ -107,6 +114,24 @@ def test_a_policy_acts_after_the_control_and_measures_stop_a_rollout():
     np.testing.assert_array_equal(damped, real)
     reached = plant.rollout(np.ones(1), 30, until=lambda view: view.observation[0] > 0.5)
     assert reached.reached and not reached.ended and len(reached.observations) < 10
+
+
+class Reused(Cart):
+    """Returns the same array at every step."""
+
+    seen = np.zeros(2)
+
+    def step(self, action):
+        self.seen[:], *rest = super().step(action)
+        return (self.seen, *rest)
+
+
+def test_the_first_observation_is_kept_when_the_env_overwrites_it():
+    env = Reused(start=(0.0, 1.0))
+    plant = bound(env, check_steps=0)
+    env.reset(seed=0)
+    first = plant.rollout(np.ones(1), 1).observations[0].copy()
+    np.testing.assert_array_equal(plant.rollout(np.ones(1), 5).observations[0], first)
 
 
 def restore_cart(raw, state):
