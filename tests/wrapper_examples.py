@@ -221,7 +221,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             "Reacher-v5",
             lambda: {
                 "uplink": sw.teleop.Link(0.04, 0.03, loss=0.1, in_order=False),
-                "downlink": {"delay_s": 0.02, "loss": 0.1},
+                "downlink": {"delay_s": 0.02, "outage_between_s": 0.5, "outage_length_s": 0.1},
             },
         ),
         "waves under a ceiling": (

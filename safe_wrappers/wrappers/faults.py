@@ -206,29 +206,41 @@ class Jitter(Fault):
         return newest
 
 
-class OnOffFault(Struck):
-    """Base of the faults that are on for `mean_length_s` at a time, then off for `mean_between_s`, on average, s.
+class OnOffProcess:
+    """A process that is off and on by turns, both for exponentially distributed times (means in s); it begins off."""
 
-    Both times are exponentially distributed; an episode begins without the fault.
-    """
+    def __init__(self, mean_between_s: float, mean_length_s: float) -> None:
+        self._between = positive("mean_between_s", mean_between_s, "s")
+        self._length = positive("mean_length_s", mean_length_s, "s")
+
+    def begin(self, random: WrapperRng) -> None:
+        """A new episode."""
+        self._on = False
+        self._until_s = random.draw.exponential(self._between)
+
+    def is_on(self, now_s: float, random: WrapperRng) -> bool:
+        """Whether it is on now; times must not run backwards."""
+        while now_s >= self._until_s:
+            self._on = not self._on
+            self._until_s += random.draw.exponential(self._length if self._on else self._between)
+        return self._on
+
+
+class OnOffFault(Struck):
+    """Base of the faults that are on for `mean_length_s` at a time, then off for `mean_between_s`, on average, s."""
 
     def __init__(
         self, env: Env, mean_between_s: float, mean_length_s: float, control_dt: float | None = None
     ) -> None:
-        self._between = positive("mean_between_s", mean_between_s, "s")
-        self._length = positive("mean_length_s", mean_length_s, "s")
+        self._process = OnOffProcess(mean_between_s, mean_length_s)
         super().__init__(env, control_dt, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
 
     def begin(self) -> None:
         super().begin()
-        self._on = False
-        self._until_s = self.random.draw.exponential(self._between)
+        self._process.begin(self.random)
 
     def strikes(self, now_s: float) -> bool:
-        while now_s >= self._until_s:
-            self._on = not self._on
-            self._until_s += self.random.draw.exponential(self._length if self._on else self._between)
-        return self._on
+        return self._process.is_on(now_s, self.random)
 
 
 class DroppedRefreshes(ShareFault):

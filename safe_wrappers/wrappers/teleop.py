@@ -9,9 +9,9 @@ from typing import Any, Final, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.faults import probability
+from safe_wrappers.wrappers.faults import OnOffProcess, probability
 from safe_wrappers.wrappers.layer import Env, WrapperRng
 from safe_wrappers.wrappers.stopping_budget import BoundBudget, BudgetLike, budget_from
 
@@ -28,17 +28,21 @@ class Link:
     Args:
         delay_s: Shortest time that a packet takes, s.
         jitter_s: How much longer it may take, s, uniform, drawn for each packet by itself.
-        loss: Probability that a packet is lost, from 0 to 1.
+        loss: Probability that a packet is lost, from 0 to 1; during an outage every one is.
         in_order: Whether a packet waits for those sent before it, as in a stream; datagrams may overtake (False).
+        outage_between_s: Mean time from the end of an outage to the start of the next, s; None: there are none.
+        outage_length_s: Mean length of an outage, s.
 
     Raises:
-        ConfigurationError: A negative or too long time, a probability outside of 0 to 1.
+        ConfigurationError: A negative or too long time, a probability outside of 0 to 1, half of an outage.
     """
 
     delay_s: float = 0.0
     jitter_s: float = 0.0
     loss: float = 0.0
     in_order: bool = True
+    outage_between_s: float | None = None
+    outage_length_s: float | None = None
 
     def __post_init__(self) -> None:
         check_fields(self, non_negative, ["delay_s", "jitter_s"], "s")
@@ -46,7 +50,12 @@ class Link:
             most = f"at most {LONGEST_DELAY_S:g} s"
             raise ConfigurationError(f"delay_s + jitter_s is {most}; got {self.longest_s:g} s")
         object.__setattr__(self, "loss", probability("loss", self.loss))
-        true_or_false("in_order", self.in_order)
+        if not isinstance(self.in_order, bool):
+            raise ConfigurationError(f"in_order is True or False, got {self.in_order!r}")
+        if (self.outage_between_s is None) != (self.outage_length_s is None):
+            given = f"{self.outage_between_s!r} and {self.outage_length_s!r}"
+            raise ConfigurationError(f"an outage needs outage_between_s and outage_length_s, s; got {given}")
+        check_fields(self, positive, ["outage_between_s", "outage_length_s"], "s")
 
     @property
     def longest_s(self) -> float:
@@ -74,12 +83,16 @@ class Line:
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:
         self._link, self._slack_s = link, slack_s
         self._random = WrapperRng(stream)
+        between_s, length_s = link.outage_between_s, link.outage_length_s
+        self._outages = None if between_s is None or length_s is None else OnOffProcess(between_s, length_s)
 
     newest: Packet  # of all that have arrived the one that was sent last
 
     def reset(self, env: Env, seed: int | None, first: Any = None) -> None:
         """Nothing is on its way, and `first` has arrived; call it after the env's own reset."""
         self._random.reset(env, seed)
+        if self._outages is not None:
+            self._outages.begin(self._random)
         self._coming: list[tuple[float, int, Any]] = []
         self._sent = 0
         self._latest_s = -math.inf
@@ -91,7 +104,10 @@ class Line:
         self._sent += 1
         # As many numbers for a lost packet as for one that is not: what follows stays the same.
         jitter_s = self._random.draw.uniform(0.0, link.jitter_s) if link.jitter_s else 0.0
-        if link.loss and self._random.draw.random() < link.loss:
+        lost = bool(link.loss and self._random.draw.random() < link.loss)
+        if self._outages is not None:
+            lost |= self._outages.is_on(now_s, self._random)
+        if lost:
             return sequence, True
         due_s = now_s + link.delay_s + jitter_s
         if link.in_order:

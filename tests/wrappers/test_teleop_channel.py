@@ -139,7 +139,7 @@ def test_an_action_that_is_not_finite_is_not_sent():
 def test_the_spec_rebuilds_it_with_all_that_it_holds():
     env = sw.TeleopChannel(
         sw.CBFActionFilter(gym.make("TeleopContact-v0"), [clamp()]),
-        sw.teleop.Link(0.01, 0.02, 0.1, False),
+        sw.teleop.Link(0.01, 0.02, 0.1, False, 1.0, 0.1),
         0.005,
         coding="wave",
         impedance=30.0,
@@ -261,12 +261,22 @@ def test_datagrams_overtake_each_other_and_a_stream_does_not():
     assert stream == sorted(stream) and len(stream) > 350
 
 
-def test_loss_takes_its_share():
-    shares = []
-    for seed in range(4):
-        came = traffic(line(sw.teleop.Link(loss=0.3), seed), 20_000)[1].values()
-        shares.append(sum(c is None for c in came) / 20_000)
-    assert np.mean(shares) == pytest.approx(0.3, abs=0.06)
+def test_loss_and_outages_take_their_share():
+    for link, expected in (
+        (sw.teleop.Link(loss=0.3), 0.3),
+        (sw.teleop.Link(outage_between_s=0.2, outage_length_s=0.1), 1.0 / 3.0),
+    ):
+        shares = []
+        for seed in range(4):
+            came = traffic(line(link, seed), 20_000)[1].values()
+            shares.append(sum(c is None for c in came) / 20_000)
+        assert np.mean(shares) == pytest.approx(expected, abs=0.06)
+    lost = [
+        c is None
+        for c in traffic(line(sw.teleop.Link(outage_between_s=0.2, outage_length_s=0.1)), 3000)[1].values()
+    ]
+    changes = np.count_nonzero(np.diff(np.array(lost, int)))
+    assert changes < 60  # in spells, not one by one
 
 
 def test_random_numbers_are_seeded_and_kept_apart():
@@ -287,6 +297,9 @@ def test_random_numbers_are_seeded_and_kept_apart():
         {"loss": -0.1},
         {"in_order": 1},
         {"delay_s": LONGEST_DELAY_S, "jitter_s": 0.1},
+        {"outage_between_s": 1.0},
+        {"outage_length_s": 1.0},
+        {"outage_between_s": 0.0, "outage_length_s": 1.0},
     ],
 )
 def test_links_that_cannot_be_are_refused(arguments):
