@@ -220,7 +220,7 @@ def whole_episodes() -> dict[str, Any]:
         env, total = make(trained), Count()
         for seed in COUNTED:
             observation, _ = env.reset(seed=seed)
-            trained.begin(env)
+            trained.begin()
             truncated = False
             while not truncated:
                 observation, reward, _, truncated, info = env.step(trained(observation))

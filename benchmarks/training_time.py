@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from benchmarks.tables import markdown, options
 from safe_wrappers.sb3 import InterventionCallback
 from safe_wrappers.train.config import ArmConfig, parse_experiment, read_config
-from safe_wrappers.train.config.algorithms import ALGORITHMS
+from safe_wrappers.train.config.algorithms import algorithm_class
 from safe_wrappers.train.run.stack import make_stack
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -42,7 +42,7 @@ class Training:
                 "gamma": arm.hyperparameters["gamma"],
             }
             envs = VecNormalize(envs, **norm)
-        self._model: Any = ALGORITHMS[arm.algorithm]("MlpPolicy", envs, seed=seed, **arm.hyperparameters)
+        self._model: Any = algorithm_class(arm.algorithm)("MlpPolicy", envs, seed=seed, **arm.hyperparameters)
         self.slice = int(arm.hyperparameters["n_steps"]) * arm.n_envs
         self.seconds: list[float] = []
 

@@ -195,7 +195,7 @@ class SafeGoalEnv(FieldEnv):
         model, data, qpos = self.model, self.data, self.data.qpos
         data.ctrl[:] = ctrl
         judge_vases = self.level.vases_cost and self._n_vases > 0
-        path = np.zeros((n_frames, 2))
+        self._path = path = np.zeros((n_frames, 2))
         touched = moved = moving = False
         for k in range(n_frames):
             mujoco.mj_step(model, data)

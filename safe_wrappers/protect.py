@@ -30,12 +30,6 @@ _LIMIT_LINE: Final = "limit = sw.constraints.JointSpeedLimit(limit=4.0)  # rad/s
 _SHIELD_LINE: Final = "shield = sw.constraints.PredictiveShield(h, horizon, backup)"
 
 
-def protect_options() -> frozenset[str]:
-    """Every option that `protect` takes for some env."""
-    of_recipes = [name for recipe in _EVERY.values() for name in _options(recipe)]
-    return frozenset(of_recipes + _options(CBFActionFilter))
-
-
 def recipe_of(env_id: str) -> str | None:
     """The name of the recipe that `protect` has for an id, or None."""
     family = _family(env_id)

@@ -7,16 +7,15 @@ and not before the config file could be read.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError
+from safe_wrappers.errors import SafeWrappersError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,16 +26,16 @@ COMMANDS: Final = {
     "evaluate": "evaluate the trained policies on the same episodes, with the filter off and on",
     "compare": "train, evaluate, and print the comparison",
     "sweep": "search the settings under `sweep` in the config, for the most return at cost zero",
-    "report": "write the comparison as one HTML page, from what is already there; of several, one each",
+    "report": "write the comparison as one HTML page, from what is already there",
     "enjoy": "let a trained policy act, in a window or on film if asked",
     "push": "upload a run's policy to the Hugging Face hub",
     "diagnose": "run an env, and a policy: what is wrong, and which wrapper treats it",
-    "list": "print the names of envs, recipes, wrappers, algorithms and configs, or of those kinds that are named",
+    "list": "print the names of envs, recipes, wrappers and algorithms, or of those kinds that are named",
     "init": "write a commented config to begin with",
     "schema": "print the JSON schema of configs, from which editors complete keys",
 }
 _OF_EXPERIMENTS: Final = ("train", "evaluate", "compare", "sweep", "report")
-FILTERS: Final = ("trained", "none", "protect", "both")
+FILTERS: Final = ("trained", "none", "protect")
 
 
 def make_parser(command: str) -> argparse.ArgumentParser:
@@ -44,8 +43,7 @@ def make_parser(command: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=f"safe-wrappers {command}", description=COMMANDS[command])
     add = parser.add_argument
     if command in _OF_EXPERIMENTS:
-        many = "+" if command == "report" else 1
-        add("configs", nargs=many, type=Path, metavar="CONFIG.yaml", help="the experiment")
+        add("config", type=Path, metavar="CONFIG.yaml", help="the experiment")
         # They may stand before the config and behind options: `main` tells them by their "=".
         parser.epilog = "key=value overrides a setting: total_steps=1000, arms.filtered.filter=protect"
         if command == "report":
@@ -59,13 +57,11 @@ def make_parser(command: str) -> argparse.ArgumentParser:
         if command == "enjoy":
             add("run", metavar="RUN", help="runs/NAME/ARM/seed_N, a policy's folder, or hub:owner/name")
             add("--episodes", type=int, default=3, help="episodes, seeds 0, 1, ... (default: %(default)s)")
-            what = (
-                "another filter than it was trained with (default: trained); both: without one, then with it"
-            )
+            what = "another filter than it was trained with (default: trained)"
             add("--filter", choices=FILTERS, default=FILTERS[0], help=what)
             how = parser.add_mutually_exclusive_group()
             how.add_argument("--render", action="store_true", help="draw in a window")
-            what = "a film of a typical episode and the worst one"
+            what = "a film of the episode with the median return"
             how.add_argument("--output", type=Path, metavar="FILM.webp", help=what)
         else:
             add("env", metavar="ENV", help="an id of gymnasium.make")
@@ -79,7 +75,7 @@ def make_parser(command: str) -> argparse.ArgumentParser:
         add("run", type=Path, metavar="RUN", help="a run's folder, or a policy's")
         add("repository", metavar="owner/name", help="made if it is not there")
     elif command == "list":
-        add("kinds", nargs="*", metavar="KIND", help="envs, recipes, wrappers, algorithms, configs")
+        add("kinds", nargs="*", metavar="KIND", help="envs, recipes, wrappers, algorithms")
     elif command == "init":
         default = Path("experiment.yaml")
         add("config", nargs="?", type=Path, default=default, metavar="CONFIG.yaml", help="the file to write")
@@ -108,9 +104,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from .processes import Interrupted
 
     try:
-        with importable([*(config.parent for config in getattr(options, "configs", [])), Path.cwd()]):
-            run = _report if command == "report" else _experiment if command in _OF_EXPERIMENTS else _other
-            run(command, options, overrides, Console())
+        # Modules of one's own, last: a file called yaml.py must not take an installed module's place.
+        sys.path += [str(at.resolve()) for at in (getattr(options, "config", Path()).parent, Path.cwd())]
+        run = _experiment if command in _OF_EXPERIMENTS else _other
+        run(command, options, overrides, Console())
     except (SafeWrappersError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -123,81 +120,57 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-@contextlib.contextmanager
-def importable(folders: Sequence[Path]) -> Iterator[None]:
-    """Lets Python find modules in these folders too, last of all; so do the processes that are started meanwhile."""
-    added = [path for path in dict.fromkeys(str(f.resolve()) for f in folders) if path not in sys.path]
-    # Last: a file of one's own called yaml.py must not take an installed module's place.
-    sys.path.extend(added)
-    try:
-        yield
-    finally:
-        sys.path[:] = [path for path in sys.path if path not in added]
-
-
 def _experiment(command: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
     from .config import parse_experiment, read_config
     from .processes.on_ray import check_place
 
-    check_place(options.on)
-    settings = read_config(options.configs[0], overrides)
+    place = getattr(options, "on", None)
+    check_place(place)
+    settings = read_config(options.config, overrides)
     if command == "sweep":
         from .sweep import sweep_experiment
 
-        sweep_experiment(settings, options.configs[0], overrides, console, options.on)
+        sweep_experiment(settings, options.config, overrides, console, place)
         return
 
     from .experiment import evaluate_experiment, summarize_experiment, train_experiment
+    from .files import say
     from .report import comparison_table, verdict, write_report
 
     experiment = parse_experiment(settings)
     if command in ("train", "compare"):
-        train_experiment(experiment, console, options.on)
+        train_experiment(experiment, console, place)
     if command in ("evaluate", "compare"):
-        evaluate_experiment(experiment, console, options.on)
+        evaluate_experiment(experiment, console, place)
     summary = summarize_experiment(experiment)
     if command in ("evaluate", "compare"):
         console.print(comparison_table(experiment, summary))
         console.print("\n".join(verdict(experiment, summary)), highlight=False, markup=False)
-    if command == "compare" and options.report:
-        path = write_report(experiment, summary, _compare_command(options.configs[0], overrides))
-        _say(console, f"Report: {path}")
-    _say(console, f"Files: {experiment.folder}")
-
-
-def _report(_: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
-    """A page of each config."""
-    from .config import parse_experiment, read_config
-    from .experiment import summarize_experiment
-    from .report import write_report
-
-    if options.output and len(options.configs) > 1:
-        raise ConfigurationError("--output is for one config; of several each page lies beside its runs")
-    for config in options.configs:
-        experiment = parse_experiment(read_config(config, overrides))
-        command = _compare_command(config, overrides)
-        path = write_report(experiment, summarize_experiment(experiment), command, options.output)
-        _say(console, f"Report: {path}")
+    if command == "report" or (command == "compare" and options.report):
+        line = shlex.join(["safe-wrappers", "compare", str(options.config), *overrides, "--report"])
+        path = write_report(experiment, summary, line, getattr(options, "output", None))
+        say(console, f"Report: {path}")
+    say(console, f"Files: {experiment.folder}")
 
 
 def _other(command: str, options: argparse.Namespace, overrides: list[str], console: Console) -> None:
     """The commands that take no experiment."""
     match command:
         case "diagnose":
-            from .diagnose import diagnose_command
+            from .acting import diagnose_command
 
             diagnose_command(
                 options.env, options.policy, options.steps, options.output, console, options.imports
             )
         case "enjoy":
-            from .enjoy import enjoy_command
+            from .acting import enjoy_command
 
             how = options.filter, options.render, options.output
             enjoy_command(options.run, options.episodes, *how, console, options.imports)
         case "push":
             from .policies import upload
 
-            _say(console, f"Uploaded: {', '.join(upload(options.run, options.repository))}")
+            console.print(f"Uploaded: {', '.join(upload(options.run, options.repository))}")
         case "list":
             from .init import list_command
 
@@ -210,14 +183,6 @@ def _other(command: str, options: argparse.Namespace, overrides: list[str], cons
             from .config.schema import config_schema
 
             print(json.dumps(config_schema(), indent=1))
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
-
-
-def _compare_command(config: Path, overrides: Sequence[str]) -> str:
-    return shlex.join(["safe-wrappers", "compare", str(config), *overrides, "--report"])
 
 
 if __name__ == "__main__":

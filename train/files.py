@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, tables of them, and one writer per folder."""
+"""Files that are there whole or not at all, tables of them, and one writer per folder; and lines on the terminal."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from rich.console import Console
+
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.wrappers.record_interventions import read_episodes
 
@@ -21,8 +23,9 @@ _PATIENCE_S: Final = 5.0
 """A process whose parent was killed has let go of its folder by then."""
 
 
-class FolderHeldError(RunStateError):
-    """Another process is working in the folder."""
+def say(console: Console, text: str) -> None:
+    """Prints a line as it is: not broken, nothing in it coloured or read as markup."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -102,7 +105,7 @@ def only_writer(folder: Path) -> Iterator[None]:
     """Holds the folder for this process; the system lets go of it when the process ends, however it ends.
 
     Raises:
-        FolderHeldError: Another process holds it for more than 5 s.
+        RunStateError: Another process holds it for more than 5 s.
     """
     folder.mkdir(parents=True, exist_ok=True)
     end = time.monotonic() + _PATIENCE_S
@@ -113,7 +116,7 @@ def only_writer(folder: Path) -> Iterator[None]:
                 break
             except BlockingIOError:
                 if time.monotonic() > end:
-                    raise FolderHeldError(
+                    raise RunStateError(
                         f"Another process is working in {str(folder)!r}; wait for it, or end it first."
                     ) from None
                 time.sleep(0.05)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -17,7 +16,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import recipe_names, recipe_of
 
 from .config import parse_experiment, read_config
-from .config.algorithms import DETERMINISTIC, DISCRETE, MASKED, OFF_POLICY, ON_POLICY
+from .config.algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY
 from .config.types import check_name
 from .files import write_text
 
@@ -31,7 +30,6 @@ env: {env}  # an id of gymnasium.make; {{id: ..., kwargs: {{...}}}} with argumen
 algorithm: {algorithm}
 total_steps: 100_000  # of all envs together, rounded up to whole rollouts
 n_envs: 4
-#vec_env: subproc  # each env in a process of its own
 #action_repeat: 4  # control steps for which the policy holds an action; the filter checks each
 #normalize: {{observation: true}}
 {hyperparameters}  # by SB3's names; `linear_3e-4`: falls to 0 over total_steps
@@ -117,11 +115,6 @@ def _envs() -> dict[str, str]:
     return rows | {name: f"recipe {recipe_of(name)}" for name in sorted(newest.values())}
 
 
-def _recipes() -> dict[str, str]:
-    ids = Counter(recipe_of(name) for name in _envs())
-    return {name: f"{ids[name]} ids" if ids[name] else "not installed here" for name in recipe_names()}
-
-
 def _wrappers() -> dict[str, str]:
     named = {name: getattr(safe_wrappers, name) for name in safe_wrappers.__all__}
     wrappers = gym.Wrapper | gym.vector.VectorWrapper
@@ -133,29 +126,12 @@ def _wrappers() -> dict[str, str]:
 def _algorithms() -> dict[str, str]:
     rows = dict.fromkeys(ON_POLICY, "any actions")
     rows |= dict.fromkeys(OFF_POLICY, "continuous actions, replay buffer")
-    rows |= dict.fromkeys(DISCRETE, "discrete actions, replay buffer")
-    return rows | dict.fromkeys(MASKED, "discrete actions, asks for masks")
-
-
-def _configs() -> dict[str, str]:
-    """Experiments in this folder and in `configs/`, each with the first line of its comment."""
-    rows = {}
-    for path in sorted([*Path().glob("*.yaml"), *Path("configs").glob("*.yaml")]):
-        try:
-            settings = read_config(path)
-        except ConfigurationError:
-            continue
-        if "arms" in settings:
-            lines = path.read_text(encoding="utf-8").strip().splitlines()
-            first = next(line for line in lines if not line.startswith("# yaml-language-server:"))
-            rows[str(path)] = first.lstrip("# ") if first.startswith("#") else ""
-    return rows
+    return rows | dict.fromkeys(DISCRETE, "discrete actions, replay buffer")
 
 
 _LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
     "envs": _envs,
-    "recipes": _recipes,
+    "recipes": lambda: dict.fromkeys(recipe_names(), ""),
     "wrappers": _wrappers,
     "algorithms": _algorithms,
-    "configs": _configs,
 }

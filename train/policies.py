@@ -14,8 +14,7 @@ import gymnasium as gym
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
-from .config import ArmConfig, FilterConfig, stored_arm
-from .evaluation.evaluate import conditions
+from .config import ArmConfig, stored_arm
 from .evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
 from .evaluation.summary import CONDITIONS, episode_file, number, seed_row
 from .files import read_json, read_rows, write_text
@@ -26,15 +25,7 @@ from .run.policy import CONFIG, TrainedPolicy, constraints_of, constraints_of_ar
 CARD: Final = "README.md"
 HUB: Final = "hub:"
 """Before `owner/name` where a folder could stand."""
-_FIGURES: Final = (
-    "return",
-    "cost",
-    "violations",
-    "intervention_rate",
-    "correction_mean",
-    "infeasible",
-    "fallback",
-)
+_FIGURES: Final = ("return", "cost", "violations", "intervention_rate", "infeasible", "fallback")
 
 
 def load_policy(
@@ -144,25 +135,20 @@ def _refuse_filter(trained: list[str], here: list[str]) -> None:
         )
 
 
-def write_card(arm: ArmConfig, seed: int, run: Path, default_filter: FilterConfig) -> None:
-    """Writes the card of a run's policy, with what is measured by now; does nothing if there is no policy yet.
-
-    Args:
-        arm: The run's arm.
-        seed: Its seed.
-        run: Its folder.
-        default_filter: The filter of the evaluation, of an arm that has none.
-    """
+def write_card(arm: ArmConfig, seed: int, run: Path) -> None:
+    """Writes the card of a run's policy, with what is measured by now; does nothing if there is no policy yet."""
     config = read_json(run / POLICY / CONFIG)
     if not config:
         return
-    used = conditions(arm, default_filter).get("filter_on", FilterConfig())
-    own = f"through the filter `{arm.filter.kind}`" if arm.filter.kind != "none" else "without a filter"
-    judge = "the task itself, where it reports a cost"
-    if arm.env.cost is not None or arm.env.judge is not None:
-        judge = arm.env.cost or "the filter's own limits"
-    versions = ", ".join(f"{name} {number}" for name, number in config["versions"].items())
-    constraints = [f"* {_code(constraint)}" for constraint in config["constraints"]] or ["None."]
+    rows = {name: read_rows(episode_file(run, name)) for name in CONDITIONS}
+    measured = {name: seed_row(episodes, _FIGURES) for name, episodes in rows.items() if episodes}
+    table = [["", "Steps", *(METRICS[key] for key in _FIGURES)], ["---"] * (2 + len(_FIGURES))]
+    for name, row in measured.items():
+        table.append([CONDITIONS[name], f"{row['steps']:,}", *(_cell(row, key) for key in _FIGURES)])
+    figures = (
+        "\n".join(f"| {' | '.join(cells)} |" for cells in table) if measured else "Nothing was measured yet."
+    )
+    constraints = "\n".join(f"* {_code(constraint)}" for constraint in config["constraints"]) or "None."
     text = f"""\
 ---
 library_name: stable-baselines3
@@ -171,44 +157,25 @@ tags: [{json.dumps(arm.env.id)}, reinforcement-learning, deep-reinforcement-lear
 
 # {arm.algorithm} on {html.escape(_line(arm.env.id), quote=False)}
 
-Arm {_code(arm.name)}, seed {seed}: trained for {config["timesteps"]:,} steps {own} (learner `{arm.learner.kind}`).
+Arm {_code(arm.name)}, seed {seed}, trained for {config["timesteps"]:,} steps, filter `{arm.filter.kind}`, learner
+`{arm.learner.kind}`; with {_code(json.dumps(config["versions"]))}.
 
-## Safety figures
+{figures}
 
-{_table(run)}
+Figures of one seed say nothing about another one. The constraints of the filter that it was trained with:
 
-Evaluation is deterministic; its filter is `{used.kind}`. Violations are judged by {_code(judge)}.
-Figures of one seed say nothing about another one.
+{constraints}
 
-## The filter that it was trained with
-
-{chr(10).join(constraints)}
-
-A policy that was trained through a filter is no safer without it. Loading refuses another env or filter, unless told.
-
-## Use
+A policy that was trained through a filter is no safer without it. Nothing is unpickled but data:
 
 ```python
 from safe_wrappers.train.policies import load_policy
 
-trained = load_policy("this folder")
+trained = load_policy("this folder")  # refuses another env or filter, unless told
 env = trained.make_env()  # the filter is on
 ```
-
-Nothing is unpickled but data. Made with {html.escape(_line(versions), quote=False)}.
 """
     write_text(run / POLICY / CARD, text)
-
-
-def _table(run: Path) -> str:
-    rows = {name: read_rows(episode_file(run, name)) for name in CONDITIONS}
-    measured = {name: seed_row(episodes, _FIGURES) for name, episodes in rows.items() if episodes}
-    if not measured:
-        return "Nothing was measured yet."
-    head = ["", *(CONDITIONS[name] for name in measured)]
-    body = [["Episodes; steps", *(f"{row['episodes']}; {row['steps']:,}" for row in measured.values())]]
-    body += [[METRICS[key], *(_cell(row, key) for row in measured.values())] for key in _FIGURES]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, ["---"] * len(head), *body])
 
 
 def _cell(row: Mapping[str, Any], key: str) -> str:
@@ -225,13 +192,12 @@ def _code(value: object) -> str:
     return f"`{_line(value)}`"
 
 
-def upload(folder: Path, repo_id: str, package: Any = None) -> list[str]:
+def upload(folder: Path, repo_id: str) -> list[str]:
     """Upload a policy's folder to the Hugging Face hub, file by file; the model card comes last.
 
     Args:
         folder: A policy's folder, or that of a run which has one.
         repo_id: `owner/name`; made if it is not there. The hub's own login is used.
-        package: huggingface_sb3, if not the installed one.
 
     Returns:
         The names of the files.
@@ -242,16 +208,16 @@ def upload(folder: Path, repo_id: str, package: Any = None) -> list[str]:
     folder = folder / POLICY if (folder / POLICY).is_dir() else folder
     arm = _config_of(folder)["arm"]
     names = [name for name in (CONFIG, MODEL, NORMALIZE, CARD) if (folder / name).is_file()]
-    push = _hub(repo_id, package).push_to_hub
+    push = _hub(repo_id).push_to_hub
     with contextlib.chdir(folder):  # it looks for the file in the current folder, whatever it is given
         for name in names:
             push(repo_id=repo_id, filename=name, commit_message=f"{arm}: {name}")
     return names
 
 
-def _download(repo_id: str, package: Any = None) -> Path:
+def _download(repo_id: str) -> Path:
     """Download a policy's folder; the hub's cache keeps it."""
-    load = _hub(repo_id, package).load_from_hub
+    load = _hub(repo_id).load_from_hub
     config = Path(load(repo_id=repo_id, filename=CONFIG))
     normalize = read_json(config).get("config", {}).get("normalize", {})
     for name in (MODEL, NORMALIZE) if any(normalize.values()) else (MODEL,):
@@ -259,12 +225,12 @@ def _download(repo_id: str, package: Any = None) -> Path:
     return config.parent
 
 
-def _hub(repo_id: str, package: Any) -> Any:
+def _hub(repo_id: str) -> Any:
     owner, _, name = repo_id.partition("/")
     if not (owner and name) or "/" in name:
         raise ConfigurationError(f"expected owner/name of a repository on the hub, got {repo_id!r}")
     try:
-        return package or importlib.import_module("huggingface_sb3")
+        return importlib.import_module("huggingface_sb3")
     except ImportError as error:
         raise ConfigurationError(
             f"the hub needs huggingface_sb3, which cannot be imported ({error}): pip install 'safe-wrappers[hub]'"

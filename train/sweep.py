@@ -8,8 +8,9 @@ from __future__ import annotations
 import importlib.util
 import json
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,21 +20,16 @@ from rich.console import Console
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
-from .config import ArmConfig, ExperimentConfig, SweepConfig, parse_experiment, set_value
+from .config import ExperimentConfig, SweepConfig, parse_experiment, set_value
 from .config.types import check_name
-from .evaluation.evaluate import conditions
+from .evaluation.evaluate import conditions, evaluate_run
 from .evaluation.summary import number
-from .experiment import (
-    check_training,
-    evaluation_jobs,
-    generations,
-    summarize_experiment,
-    training_jobs,
-    write_cards,
-)
-from .files import only_writer, write_rows, write_text
-from .processes import Job, RunsFailedError
+from .experiment import check_training, summarize_experiment, write_cards
+from .files import only_writer, say, write_rows, write_text
+from .processes import Job, Progress, RunsFailedError
 from .processes.parallel import run_jobs
+from .run.model import whole_rollouts
+from .run.training import train_run
 
 if TYPE_CHECKING:
     import optuna
@@ -77,8 +73,6 @@ def sweep_experiment(
     with only_writer(folder):
         study = open_study(space, folder)
         while trials := next_trials(study, space):
-            numbers = ", ".join(str(trial.number) for trial in trials)
-            console.print(f"Trial {numbers} of 0 to {space.config.trials - 1}", highlight=False)
             run_batch(space, trials, console, on)
             _write_results(study, list(space.config.parameters), folder)
     best, line = ranked(study)[0], "No trial came to an evaluation without violations: none is recommended."
@@ -86,22 +80,17 @@ def sweep_experiment(
         values = [f"{key}={best.params[key]}" for key in space.config.parameters]
         command = shlex.join(["safe-wrappers", "compare", str(config), *overrides, *values])
         line = f"Best: trial {best.number}, return {number(best.values[0])} at cost zero: {command}"
-    console.print(
-        f"{line}\nFiles: {folder / RESULTS_FILE}, and a folder for each trial beside it",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    say(console, f"{line}\nFiles: {folder / RESULTS_FILE}, and a folder for each trial beside it")
 
 
 class Space:
-    """The experiments that a sweep chooses from.
+    """The experiments that a sweep chooses from: the first arm with a filter, or the first one.
 
     Args:
         settings: The config, as `read_config` returned it, with a section `sweep`.
 
     Raises:
-        UnknownNameError: A parameter, or the sweep's arm, that does not exist.
+        UnknownNameError: A parameter that does not exist.
         ConfigurationError: There is no such section or no filter, or a parameter has values that are refused.
     """
 
@@ -113,15 +102,13 @@ class Space:
                 "sweep: {trials: 20, parameters: {hyperparameters.learning_rate: {low: 1e-5, high: 1e-3, log: true}}}"
             )
         self.config: SweepConfig = self.experiment.sweep
-        arms = {arm.name: arm for arm in self.experiment.arms}
         filtered = (arm.name for arm in self.experiment.arms if arm.filter.kind != "none")
-        name = self.config.arm or next(filtered, self.experiment.arms[0].name)
-        self.arm = arms[check_name(name, arms, "sweep.arm")]
+        self.arm = next(filtered, self.experiment.arms[0].name)
         self._settings = {key: value for key, value in settings.items() if key != "sweep"}
         self.distributions = {key: self._checked(key, given) for key, given in self.config.parameters.items()}
 
     def trial(self, name: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], ExperimentConfig]:
-        """The experiment of a trial, as settings and checked: the ranked arm, after those that it begins with.
+        """The experiment of a trial, as settings and checked; its only arm is the ranked one.
 
         Raises:
             ConfigurationError: The values do not go together.
@@ -129,40 +116,23 @@ class Space:
         settings = deepcopy(self._settings)
         for key, value in values.items():
             set_value(settings, key, deepcopy(value))
-        # Those that are left out may have had the filter that others are evaluated with.
-        first = next((arm for arm in self.experiment.arms if arm.filter.kind != "none"), None)
-        evaluation = dict(settings.get("evaluation") or {})
-        if first is not None and evaluation.get("filter") is None:
-            evaluation["filter"] = settings["arms"][first.name]["filter"]
-        arms: dict[str, Any] = {}
-        arm: ArmConfig | None = self.arm
-        while arm is not None:
-            arms[arm.name] = settings["arms"][arm.name]
-            arm = self.experiment.begins_with(arm)
-        output = self.experiment.folder / FOLDER
-        arms = dict(reversed(arms.items()))  # those first that others begin with
-        settings |= {"arms": arms, "evaluation": evaluation, "name": name, "output": str(output)}
+        output = str(self.experiment.folder / FOLDER)
+        settings |= {"arms": {self.arm: settings["arms"][self.arm]}, "name": name, "output": output}
         experiment = parse_experiment(settings)
-        if _FILTERED not in conditions(experiment.arms[-1], experiment.evaluation_filter):
+        if _FILTERED not in conditions(experiment.arms[0], experiment.evaluation_filter):
             raise ConfigurationError(
                 "trials are ranked by their return with the filter on, and there is no filter; give an arm or the"
                 " evaluation one (evaluation: {filter: protect})."
             )
         return settings, experiment
 
-    def values(self, trial: optuna.Trial) -> dict[str, Any]:
-        """What a trial has drawn; choices are texts there."""
-        choices = {key: given.get("choices", ()) for key, given in self.config.parameters.items()}
-        texts = {key: {_text(value): value for value in of} for key, of in choices.items()}
-        return {key: texts[key].get(value, value) for key, value in trial.params.items()}
-
     def identity(self) -> str:
         """What a study must agree on to go on: all that decides what is drawn and what a trial comes to."""
         experiment = self.trial("trial", {})[1]
-        searched = {**self.config.plain(), "trials": None, "storage": None}  # these may change
-        of_arms = [arm.fingerprint() for arm in experiment.arms]
+        searched = {**self.config.plain(), "trials": None}  # which may be raised
         evaluation = experiment.evaluation.plain() | {"filter": experiment.evaluation_filter.plain()}
-        return json.dumps([searched, of_arms, evaluation, experiment.seeds], sort_keys=True)
+        of_arm = experiment.arms[0].fingerprint()
+        return json.dumps([searched, of_arm, evaluation, experiment.seeds], sort_keys=True)
 
     def _checked(self, key: str, given: Mapping[str, Any]) -> optuna.distributions.BaseDistribution:
         from optuna import distributions
@@ -176,8 +146,10 @@ class Space:
         integers = all(isinstance(end, int) for end in ends)
         try:
             found: optuna.distributions.BaseDistribution
-            if "choices" in given:  # as text, since a study keeps no lists and mappings
-                found = distributions.CategoricalDistribution([_text(value) for value in given["choices"]])
+            if "choices" in given:  # as JSON, since a study keeps no lists and mappings
+                found = distributions.CategoricalDistribution(
+                    [json.dumps(value) for value in given["choices"]]
+                )
             else:
                 of = distributions.IntDistribution if integers else distributions.FloatDistribution
                 found = of(**given)
@@ -202,12 +174,10 @@ def open_study(space: Space, folder: Path) -> optuna.Study:
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = space.config.storage or f"sqlite:///{(folder / 'study.db').resolve()}"
-    study = optuna.create_study(
-        storage=storage, study_name=space.experiment.name, direction="maximize", load_if_exists=True
-    )
+    storage = f"sqlite:///{(folder / 'study.db').resolve()}"
+    study = optuna.create_study(storage=storage, study_name=FOLDER, direction="maximize", load_if_exists=True)
     ours = space.identity()
-    if study.user_attrs.setdefault("identity", ours) != ours:
+    if study.user_attrs.get("identity", ours) != ours:
         raise RunStateError(
             f"The study in {storage!r} is of another sweep. Choose another `name` or `output`, go back to its"
             " settings, or delete it with its trials."
@@ -237,8 +207,23 @@ def next_trials(study: optuna.Study, space: Space) -> list[optuna.Trial]:
     return left
 
 
+def run_trial(experiment: ExperimentConfig, progress: Progress) -> None:
+    """A trial's job: trains its arm with every seed and evaluates it, or goes on with that.
+
+    Args:
+        experiment: As `Space.trial` returns it.
+        progress: Where steps of all seeds together are reported to.
+    """
+    arm = experiment.arms[0]
+    for at, seed in enumerate(experiment.seeds):
+        folder, before = experiment.run_folder(arm, seed), at * whole_rollouts(arm)
+        train_run(arm, seed, folder, replace(progress, steps=lambda n, b=before: progress.steps(b + n)))
+        quiet = replace(progress, steps=lambda _: None)
+        evaluate_run(arm, seed, folder, experiment.evaluation, experiment.evaluation_filter, quiet)
+
+
 def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: str | None = None) -> None:
-    """Trains and evaluates trials, and tells their study what they came to.
+    """Runs trials side by side, each in one process, and tells their study what they came to.
 
     Args:
         space: What is searched.
@@ -252,49 +237,44 @@ def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: st
     """
     from optuna.trial import TrialState
 
-    attempts: dict[str, tuple[optuna.Trial, ExperimentConfig]] = {}
-    for trial in trials:
-        name = f"trial_{trial.number:04d}"
+    jobs: list[Job] = []
+    failed: set[str] = set()
+    names = {f"trial_{trial.number:04d}": trial for trial in trials}
+    for name, trial in names.items():
+        values = {k: json.loads(v) if isinstance(v, str) else v for k, v in trial.params.items()}
         try:
-            settings, experiment = space.trial(name, space.values(trial))
+            settings, experiment = space.trial(name, values)
             check_training(experiment)
         except ConfigurationError as error:
-            console.print(f"{name}: {error}", highlight=False, markup=False, soft_wrap=True)
-            trial.study.tell(trial, state=TrialState.FAIL)
+            say(console, f"{name}: {error}")
+            failed.add(name)
             continue
         write_text(experiment.folder / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
-        attempts[name] = trial, experiment
+        steps = len(experiment.seeds) * whole_rollouts(experiment.arms[0])
+        jobs.append(Job(name, steps, "steps", run_trial, (experiment,)))
+    try:
+        run_jobs(jobs, space.experiment.workers, console, "Trials", on=on)
+    except RunsFailedError as error:
+        say(console, str(error))
+        failed |= error.names
+    for name in failed:
+        names[name].study.tell(names[name], state=TrialState.FAIL)
+    for job in jobs:
+        if job.name not in failed:
+            _tell(names[job.name], *job.arguments)
 
-    def run(make: Callable[..., list[Job]], arms: Mapping[str, Sequence[ArmConfig]], title: str) -> None:
-        jobs = [job for name in attempts for job in make(attempts[name][1], arms[name], name)]
-        try:
-            run_jobs(jobs, space.experiment.workers, console, title, on=on)
-        except RunsFailedError as error:
-            console.print(str(error), highlight=False, markup=False, soft_wrap=True)
-            for name in {job.split(" ")[0] for job in error.names}:
-                trial, _ = attempts.pop(name)
-                trial.study.tell(trial, state=TrialState.FAIL)
 
-    levels = {name: list(generations(experiment)) for name, (_, experiment) in attempts.items()}
-    for depth in range(max(map(len, levels.values()), default=0)):
-        arms = {name: level[depth] if depth < len(level) else [] for name, level in levels.items()}
-        run(training_jobs, arms, "Training of trials")
-    run(evaluation_jobs, {name: found.arms for name, (_, found) in attempts.items()}, "Evaluation of trials")
-    for name, (trial, experiment) in attempts.items():
-        write_cards(experiment)
-        arm = experiment.arms[-1].name
-        rows = [
-            row
-            for row in summarize_experiment(experiment).per_seed
-            if (row["condition"], row["arm"]) == (_FILTERED, arm)
-        ]
-        if not all(VIOLATIONS in row for row in rows):
-            raise ConfigurationError(
-                f"{name}: trials are ranked at cost zero, and the task reports no cost. Give it a judge: env.cost"
-                " (module:function) or env.judge (constraints)."
-            )
-        trial.set_constraint(VIOLATIONS, float(np.mean([row[VIOLATIONS] for row in rows])))
-        trial.study.tell(trial, float(np.mean([row["return"] for row in rows])))
+def _tell(trial: optuna.Trial, experiment: ExperimentConfig) -> None:
+    """Tells the study what a trial's evaluation with the filter on came to, as means over its seeds."""
+    write_cards(experiment)
+    rows = [row for row in summarize_experiment(experiment).per_seed if row["condition"] == _FILTERED]
+    if not all(VIOLATIONS in row for row in rows):
+        raise ConfigurationError(
+            f"{experiment.name}: trials are ranked at cost zero, and the task reports no cost. Give it a judge:"
+            " env.cost (module:function) or env.judge (constraints)."
+        )
+    trial.set_constraint(VIOLATIONS, float(np.mean([row[VIOLATIONS] for row in rows])))
+    trial.study.tell(trial, float(np.mean([row["return"] for row in rows])))
 
 
 def is_kept(trial: optuna.trial.FrozenTrial) -> bool:
@@ -327,7 +307,3 @@ def _write_results(study: optuna.Study, parameters: Sequence[str], folder: Path)
             row |= {"state": state, "return": trial.values[0], VIOLATIONS: trial.constraints[VIOLATIONS]}
         rows.append(row)
     write_rows(folder / RESULTS_FILE, ("trial", "state", "return", VIOLATIONS, *parameters), rows)
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)

@@ -153,10 +153,3 @@ def test_equals_the_loop(targets):
     relative = np.array([t[:2] for t in targets], dtype=np.float64).reshape(-1, 2)
     kinds = np.array([t[2] for t in targets], dtype=np.intp)
     np.testing.assert_allclose(pseudo_lidar(relative, kinds, 3), by_loop(targets), atol=1e-9)
-
-
-def test_object_ahead_reads_in_the_first_bin_and_the_last():
-    readings = pseudo_lidar(np.array([[1.5, 0.0]]), np.array([0]), 1)
-    assert readings[0] == pytest.approx(0.5)
-    assert readings[-1] == pytest.approx(0.5)  # on the border: all of it aliases backwards
-    assert readings[1:-1].max() == 0.0

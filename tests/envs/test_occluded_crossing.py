@@ -334,17 +334,12 @@ def test_a_given_layout_is_kept_and_the_rest_is_sampled_beside_it(env):
     ("layout", "error", "match"),
     [
         ({"hazards": []}, UnknownNameError, "agent, goal, cars, pillars"),
-        ({"agent": [0, 0]}, ConfigurationError, "x, y, heading"),
         ({"agent": [0, 3.4, 0]}, ConfigurationError, r"\|y\| <= 3.3"),
         ({"agent": [-3.9, 0, 0]}, ConfigurationError, r"\|x\| <= 3.8"),
         ({"agent": [-2.2, -1.9, 0], "pillars": PILLARS}, ConfigurationError, "in a pillar"),
-        ({"agent": [math.nan, 0, 0]}, ConfigurationError, "finite"),
-        ({"goal": "there"}, ConfigurationError, "goal"),
         ({"cars": [[0, 1]] * 5}, ConfigurationError, "6 cars"),
-        ({"cars": [[0, math.inf]] * 6}, ConfigurationError, "finite"),
         ({"pillars": PILLARS[:3]}, ConfigurationError, "4 pillars"),
         ({"pillars": [[x, -2.9] for x in (-1.5, -0.5, 0.5, 1.5)]}, ConfigurationError, "no room"),
-        ([0, 1], ConfigurationError, "mapping"),
     ],
 )
 def test_bad_layouts_are_refused_with_the_reason(env, layout, error, match):

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 import time
 
 import gymnasium as gym
@@ -138,23 +137,15 @@ class FilmedGoal(FakeGoal):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, render_mode=None, trouble=""):
+    def __init__(self, render_mode=None):
         super().__init__()
         self.render_mode = render_mode
-        self.trouble = trouble
 
     def render(self):
-        if self.trouble == "raise":
-            raise RuntimeError("no display")
-        if self.trouble == "abort":
-            print("a warning before", file=sys.stderr, flush=True)
-            os.abort()
-        if self.trouble == "hang":
-            time.sleep(60)
         frame = np.full((60, 80, 3), 5 * self._steps, np.uint8)
         column, row = (np.clip(self._at * (20, 15) + (40, 30), 1, 58)).astype(int)
         frame[row - 1 : row + 2, column - 1 : column + 2] = (255, 0, 0)
-        if "FILMED_BLUE" in os.environ:
+        if os.environ.get("MUJOCO_GL") == "egl":
             frame[..., 2] = 255
         return frame
 

@@ -39,10 +39,9 @@ def steps(count=200, **values):
     columns = {
         "episode_seed": 100 + 2 * np.arange(count) // count,
         "step": (np.arange(count) % (count // 2)).astype(np.int32),
-        **dict.fromkeys(("intervened", "infeasible", "fallback", "violated"), none),
+        **dict.fromkeys(("intervened", "violated"), none),
         "correction": np.zeros(count, np.float32),
         "proposed": np.zeros((count, 2), np.float32),
-        "executed": np.zeros((count, 2), np.float32),
         "refused": np.zeros((count, 1), dtype=bool),
         "coordinates": np.random.default_rng(0).normal(size=(count, 3)).astype(np.float32),
         "constraint_names": np.array(["Clearance"]),

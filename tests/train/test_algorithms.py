@@ -14,12 +14,11 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
-from safe_wrappers.train.config import EvaluationConfig, FilterConfig
-from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, MASKED, OFF_POLICY
+from safe_wrappers.train.config import EvaluationConfig
+from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, algorithm_class
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.experiment import training_jobs
 from safe_wrappers.train.files import read_rows
-from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, resume
 from safe_wrappers.train.run.folder import finished_facts
@@ -34,8 +33,6 @@ SETTINGS = {
     "PPO": f"n_steps: 32, batch_size: 32, n_epochs: 1, {SMALL}",
     "A2C": f"n_steps: 8, {SMALL}",
     "TRPO": f"n_steps: 32, batch_size: 32, n_critic_updates: 1, {SMALL}",
-    "RecurrentPPO": "n_steps: 32, batch_size: 32, n_epochs: 1, policy_kwargs: {net_arch: [8], lstm_hidden_size: 8}",
-    "MaskablePPO": f"n_steps: 32, batch_size: 32, n_epochs: 1, {SMALL}",
     "TD3": f"{REPLAY}, action_noise: {{normal: 0.1}}",
     "DDPG": f"{REPLAY}, action_noise: {{ornstein_uhlenbeck: 0.1}}",
 } | dict.fromkeys(("SAC", "TQC", "CrossQ", "DQN", "QRDQN"), REPLAY)
@@ -62,42 +59,24 @@ def discrete():
 gym.register("DiscreteGoal-v0", discrete)
 
 
-class Masked(FakeFilter):
-    """The fake filter for those three actions, which also says beforehand what it would refuse."""
-
-    asked = 0
-
-    def _refused(self, action):
-        at = self.unwrapped.agent_position + 0.1 * np.array([float(action) - 1.0, 0.0])
-        return np.linalg.norm(at - HAZARD) - self.unwrapped.hazard_radius < self.margin
-
-    def action_masks(self):
-        Masked.asked += 1
-        return np.array([not self._refused(action) for action in range(3)])
+class Shielded(FakeFilter):
+    """The fake filter for those three actions."""
 
     def step(self, action):
-        refused = self._refused(action)
-        assert not refused or not self.masked, "the mask forbade it"
+        at = self.unwrapped.agent_position + 0.1 * np.array([float(action) - 1.0, 0.0])
+        refused = np.linalg.norm(at - HAZARD) - self.unwrapped.hazard_radius < self.margin
         *result, info = self.env.step(1 if refused else action)
         info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
         info[keys.CBF_INTERVENED] = refused
         return *result, info
 
-    masked = True
-
-
-def masks(env):
-    return Masked(env)
-
 
 def shielded(env):
-    env = Masked(env)
-    env.masked = False
-    return env
+    return Shielded(env)
 
 
 def one_arm(fake_experiment, algorithm, arm, *overrides):
-    discrete = ["env=test_algorithms:DiscreteGoal-v0"] if algorithm in (*DISCRETE, *MASKED) else []
+    discrete = ["env=test_algorithms:DiscreteGoal-v0"] if algorithm in DISCRETE else []
     return fake_experiment(
         f"algorithm={algorithm}",
         f"hyperparameters={{{SETTINGS[algorithm]}}}",
@@ -120,9 +99,8 @@ def installed(algorithm):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, algorithm):
     installed(algorithm)
-    of_three = "masks" if algorithm in MASKED else "shielded"
-    discrete = algorithm in (*DISCRETE, *MASKED)
-    arm = FILTERED if not discrete else f"filter: {{factory: 'test_algorithms:{of_three}'}}"
+    discrete = algorithm in DISCRETE
+    arm = FILTERED if not discrete else "filter: {factory: 'test_algorithms:shielded'}"
     arm += f", {TWO}" if algorithm in OFF_POLICY else ""
     experiment = one_arm(fake_experiment, algorithm, arm)
     (arm,) = experiment.arms
@@ -130,7 +108,7 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
     checkpoint = latest_checkpoint(folder / "checkpoints")
     assert checkpoint.timesteps == 64
     model = resume(checkpoint.folder, algorithm, make_vec_env(arm), "cpu", 192)
-    assert type(model) is ALGORITHMS[algorithm]
+    assert type(model) is algorithm_class(algorithm)
     if algorithm in OFF_POLICY:
         assert type(model.replay_buffer) is ExecutedActionReplayBuffer
         assert model.replay_buffer.size() == 64 and model.replay_buffer.changed.any()
@@ -138,20 +116,10 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
     assert json.loads((folder / "finished.json").read_text())["timesteps"] == 192
     rows = read_rows(folder / "episodes.csv")
     assert len(rows) == 64 // 20 + 128 // 20
-    # An action that is masked is never proposed; QRDQN and DQN begin with random ones, which are changed.
-    assert (sum(row["intervention_rate"] for row in rows) > 0) == (algorithm not in MASKED)
+    assert sum(row["intervention_rate"] for row in rows) > 0
     evaluate_run(arm, 0, folder, EvaluationConfig(2, 7), experiment.evaluation_filter, Reports().progress)
     for condition in ("filter_off", "filter_on"):
         assert len(read_rows(evaluation_folder(folder) / f"{condition}.csv")) == 2
-
-
-def test_masks_need_somebody_who_has_them(fake_experiment):
-    pytest.importorskip("sb3_contrib")
-    (arm,) = one_arm(fake_experiment, "MaskablePPO", "filter: none").arms
-    with pytest.raises(
-        ConfigurationError, match="neither test_algorithms:DiscreteGoal-v0 nor the arm's filter"
-    ):
-        check_task(arm, make_stack(arm.env, arm.filter))
 
 
 def test_dqn_learns_cart_pole_through_its_shield(fake_experiment):
@@ -165,37 +133,6 @@ def test_dqn_learns_cart_pole_through_its_shield(fake_experiment):
     folder = fake_experiment().output / "dqn"
     train_run(arm, 0, folder, Reports().progress)
     assert json.loads((folder / "finished.json").read_text())["timesteps"] == 64
-
-
-@pytest.mark.parametrize("algorithm", ["RecurrentPPO", "PPO"])
-def test_a_policy_s_memory_is_carried_through_an_episode_and_emptied_after_it(fake_experiment, algorithm):
-    installed(algorithm)
-    (arm,) = one_arm(fake_experiment, algorithm, FILTERED, "total_steps=32").arms
-    folder = fake_experiment().output / algorithm
-    train_run(arm, 0, folder, Reports().progress)
-    policy, observation = load_policy(folder), np.zeros(2)
-    first, second = policy(observation), policy(observation)
-    assert np.array_equal(first, second) == (algorithm == "PPO")
-    policy.begin()
-    assert np.array_equal(policy(observation), first) and np.array_equal(policy(observation), second)
-
-
-def test_a_policy_of_masks_asks_the_env_for_them(fake_experiment):
-    installed("MaskablePPO")
-    (arm,) = one_arm(
-        fake_experiment, "MaskablePPO", "filter: {factory: 'test_algorithms:masks'}", "total_steps=32"
-    ).arms
-    folder = fake_experiment().output / "masked"
-    train_run(arm, 0, folder, Reports().progress)
-    policy, observation = load_policy(folder), np.zeros(2)
-    liked = int(policy(observation))
-    env = Masked(discrete())
-    for allowed in range(3):
-        env.action_masks = lambda allowed=allowed: np.arange(3) == allowed
-        policy.begin(env)
-        assert policy(observation) == allowed
-    policy.begin(make_stack(arm.env, FilterConfig()))  # nobody has masks there
-    assert policy(observation) == liked
 
 
 @pytest.mark.parametrize(
@@ -265,7 +202,7 @@ def test_the_steps_that_are_announced_and_reported_are_those_that_are_trained(
         *(["n_envs=1"] if "episode" in hyperparameters else []),
     )
     (arm,), folder = experiment.arms, experiment.run_folder(experiment.arms[0], 0)
-    (job,) = training_jobs(experiment, [arm])
+    (job,) = training_jobs(experiment)
     train_run(arm, 0, folder, Reports().progress)
     trained = finished_facts(folder)["timesteps"]
     assert f", {trained:,} steps, " in about(experiment)

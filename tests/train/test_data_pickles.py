@@ -12,7 +12,7 @@ from test_run import Reports
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.enjoy import enjoy_command
+from safe_wrappers.train.acting import enjoy_command
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import resume
 from safe_wrappers.train.run.data_pickles import read_pickle

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.train.acting import of_run
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.diagnose import of_run
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 TINY = """

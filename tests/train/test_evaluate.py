@@ -6,7 +6,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps
-from safe_wrappers.train.files import read_json, read_rows
+from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.run import Progress, train_run
 
 SILENT = Progress(lambda steps: None, pytest.fail)
@@ -40,15 +40,6 @@ def test_every_arm_sees_the_same_episodes_with_the_filter_off_and_on(fake_experi
                 assert sum(row["violations"] for row in rows) == 0
     assert starts == [starts[0]] * 4
     assert len({tuple(start) for start in starts[0]}) == 3
-
-
-def test_what_stands_where_is_kept(fake_experiment):
-    folder = evaluate(fake_experiment(), 1)
-    places = read_json(folder / "filter_on_places.json")
-    assert sorted(places) == ["100", "101", "102"]
-    assert places["100"] == {
-        "goal": [[1.0, 0.0]], "hazard": [[0.5, 0.0]], "vase": [[0.5, 0.6]], "goal_radius": 0.1, "hazard_radius": 0.2,
-    }  # fmt: skip
 
 
 def test_the_steps_agree_with_the_table(fake_experiment):
@@ -110,17 +101,8 @@ def test_without_any_filter_only_one_condition(fake_experiment):
     assert sorted(path.name for path in folder.iterdir()) == [
         "evaluation.json",
         "filter_off.csv",
-        "filter_off_places.json",
         "filter_off_steps.npz",
     ]
-
-
-def test_a_task_that_publishes_no_positions_has_no_places(fake_experiment):
-    folder = evaluate(fake_experiment("env=InvertedPendulum-v5", "arms={unfiltered: {filter: none}}"), 0)
-    assert read_json(folder / "filter_off_places.json") == {}
-    row = read_rows(folder / "filter_off.csv")[0]
-    assert "goals_reached" not in row
-    assert np.isfinite(row["return"])
 
 
 def test_evaluation_reaches_tensorboard(fake_experiment):

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up import fill, steps
+from made_up import steps
 
-from safe_wrappers.train.evaluation.summary import Curve, summarize
-from safe_wrappers.train.report.figures import curve_picture, over_the_episode, plane_picture, refusals
-from safe_wrappers.train.report.where import Scene, place_pictures, scene_pictures, telling_pair
+from safe_wrappers.train.evaluation.summary import Curve
+from safe_wrappers.train.report.figures import curve_picture, place_pictures, refusals, telling_pair
 
 ARMS = ["bare", "safe"]
-EVENTS = {"infeasible": ("were infeasible", "-"), "fallback": ("ran the fallback", ":")}
 
 
 def texts(picture):
@@ -46,17 +44,6 @@ def test_which_constraint_refused_and_how_much():
         in said
     )
     assert "refused by no constraint. Never acted: Clearance" in refusals({"safe": steps()}).reading
-
-
-def test_when_in_an_episode():
-    log = steps(infeasible=flags(200, 3), fallback=flags(200, 3, 4))
-    picture = over_the_episode("When", EVENTS, {"safe": log, "bare": steps()}, ARMS)
-    assert picture.reading == (
-        "“safe”: of 200 steps 1 were infeasible and 2 ran the fallback. “bare”: of 200 steps 0 were infeasible"
-        " and 0 ran the fallback."
-    )
-    assert {"safe: were infeasible", "safe: ran the fallback", "step in the episode"} <= texts(picture)
-    assert over_the_episode("When", EVENTS, {"safe": steps()}, ARMS).image == ""
 
 
 def test_where_in_state_space():
@@ -103,34 +90,6 @@ def test_the_planted_pair_is_found_wherever_it_is_in_any_unit(planted, columns):
 def test_many_steps_are_thinned_but_rare_flags_are_kept():
     coordinates = np.random.default_rng(0).normal(size=(60_000, 2))
     assert telling_pair(coordinates, flags(60_000, 1)) == (0, 1)  # thinning by three would leave none
-
-
-def test_a_scene_from_above():
-    path = np.linspace([0.0, 0.0, 9.0], [1.0, 0.0, 9.0], 20)
-    log = steps(20, coordinates=path, intervened=flags(20, 3, 4, 12), violated=flags(20, 5))
-    places = {
-        "hazard": [[0.5, 0.2, 0.0]],
-        "goal": [[1.0, 0.0]],
-        "vase": [],
-        "hazard_radius": 0.2,
-        "goal_radius": 0.1,
-    }
-    (picture,) = scene_pictures([Scene("One", "#000000", log, log.episode_seed == 100, places)])
-    assert picture.reading == "1 of 10 steps in violation, 2 changed by the filter."
-    assert {"path", "start", "changed by the filter", "in violation", "hazard", "goal"} <= texts(picture)
-    assert "vase" not in texts(picture) and scene_pictures([]) == []
-
-
-def test_return_against_cost(fake_experiment):
-    experiment = fake_experiment()
-    fill(experiment, {"return": 20, "cost": 50}, {"return": 10})
-    picture = plane_picture(summarize(experiment), ["unfiltered", "filtered"])
-    assert picture.reading == " ".join(
-        f"“{arm}”: putting the filter on took the cost from 50 to 0 and the return from 20 to 10."
-        for arm in ("unfiltered", "filtered")
-    )
-    assert {"filtered, filter off", "filtered, filter on", "unfiltered, filter on"} <= texts(picture)
-    assert plane_picture(summarize(experiment), []).image == ""
 
 
 def test_a_learning_curve():

@@ -7,7 +7,6 @@ import numpy as np
 from made_up import fill, steps
 from test_report import Page
 
-from safe_wrappers.train.config import FilterConfig
 from safe_wrappers.train.evaluation.summary import summarize
 from safe_wrappers.train.policies import write_card
 from safe_wrappers.train.report import write_report
@@ -63,7 +62,7 @@ def test_no_word_becomes_markup_in_the_card(fake_experiment, tmp_path):
     policy.mkdir()
     config = {"timesteps": 10, "versions": {HOSTILE: HOSTILE}, "constraints": [HOSTILE]}
     (policy / "config.json").write_text(json.dumps(config))
-    write_card(arm, 0, tmp_path, FilterConfig())
+    write_card(arm, 0, tmp_path)
     card = (policy / "README.md").read_text()
     code = re.findall(r"^`[^`\n]+`", card) + re.findall(r"(?<!`)`[^`\n]+`(?!`)", card)
     outside = card

@@ -198,10 +198,6 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
         assert ("interventions/infeasible" in filtered) == (arm.name == "filtered")
         assert "evaluation_filter_on/infeasible" in filtered
         assert not [tag for tag in filtered if tag.startswith("evaluation_filter_off")]
-    with (experiment.folder / "summary.csv").open() as file:
-        metrics = {row["metric"] for row in csv.DictReader(file)}
-    assert {"return", "infeasible"} <= metrics
-    assert not [metric for metric in metrics if "cost" in metric or "violation" in metric]
     with (experiment.folder / "per_seed.csv").open() as file:
         assert all(row["violations"] == row["cost"] == "" for row in csv.DictReader(file))
     text = (experiment.folder / "summary.json").read_text()
@@ -210,7 +206,7 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
     assert "Steps in violation, total │ not judged │ not judged" in table
     assert "Violations are not judged: the task reports no cost." in table
     assert "Violations are not judged: the task reports no cost." in " ".join(verdict(experiment, summary))
-    assert "violations not judged" in page and "of 40 steps in violation" not in page
+    assert "Violations are not judged" in page and "of 40 steps in violation" not in page
 
 
 def test_a_cost_function_judges_training_and_evaluation_as_the_task_would(fake_experiment):

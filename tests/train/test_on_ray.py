@@ -87,10 +87,8 @@ def test_a_node_is_lost_and_its_run_goes_on_from_its_checkpoint_elsewhere(cluste
 
     loses = threading.Thread(target=lose_a_node)
     loses.start()
-    told = console()
-    train_experiment(experiment, told, "ray")
+    train_experiment(experiment, console(), "ray")
     loses.join()
-    assert "was lost; begun again" in told.file.getvalue()
     for folder in folders:
         assert json.loads((folder / "finished.json").read_text())["timesteps"] == 8192
         rows = read_rows(folder / "episodes.csv")

@@ -9,7 +9,7 @@ import pytest
 
 import safe_wrappers  # noqa: F401  (registers its envs)
 from safe_wrappers.drawing.scene import find_renderer
-from safe_wrappers.train.videos.film import for_film
+from safe_wrappers.train.videos import for_film
 
 ROBOTS = {
     "SafePointGoal1-v0": "agent",

@@ -35,7 +35,6 @@ def test_the_filters_word_is_taken_down_step_by_step(tmp_path):
         ("intervened", keys.CBF_INTERVENED),
         ("refused", keys.CBF_REFUSED),
         ("proposed", keys.PROPOSED_ACTION),
-        ("executed", keys.EXECUTED_ACTION),
         ("correction", keys.CBF_CORRECTION),
     ):
         assert getattr(log, name) == pytest.approx(np.array([info[key] for info in infos])), name
@@ -52,8 +51,7 @@ def test_the_filters_word_is_taken_down_step_by_step(tmp_path):
 def test_without_a_filter_nothing_was_done():
     actions = np.full((5, 2), 0.5, np.float32)
     log, _ = record(gym.make("SafePointGoal1-v0"), actions)
-    assert not (log.intervened.any() or log.infeasible.any() or log.fallback.any())
-    assert (log.executed == log.proposed).all()
+    assert not (log.intervened.any() or log.violated.any())
     assert (log.proposed == 0.5).all()
     assert log.refused.shape == (5, 0)
     assert len(log.constraint_names) == 0

@@ -7,7 +7,7 @@ import types
 import pytest
 from test_run import Reports
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.config import EvaluationConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.run.trackers import check_trackers, run_logger
@@ -88,7 +88,7 @@ def test_what_is_not_installed_or_does_not_exist_is_refused(fake_experiment, mon
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None)
     with pytest.raises(ConfigurationError, match=r"wandb is not .*pip install 'safe-wrappers\[wandb\]'"):
         check_trackers(tracked(fake_experiment, "wandb"))
-    with pytest.raises(UnknownNameError, match="Did you mean 'wandb'"):
+    with pytest.raises(ConfigurationError, match="input should be 'wandb' or 'mlflow'"):
         tracked(fake_experiment, "wand")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Field, StrictBool
@@ -19,21 +19,16 @@ if TYPE_CHECKING:
 _CONTRIB: Final = "sb3_contrib"
 _MODULES: Final = {
     **dict.fromkeys(("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN"), "stable_baselines3"),
-    **dict.fromkeys(("TQC", "CrossQ", "TRPO", "QRDQN", "RecurrentPPO", "MaskablePPO"), _CONTRIB),
+    **dict.fromkeys(("TQC", "CrossQ", "TRPO", "QRDQN"), _CONTRIB),
 }
-ON_POLICY: Final = ("PPO", "A2C", "TRPO", "RecurrentPPO", "MaskablePPO")
+ON_POLICY: Final = ("PPO", "A2C", "TRPO")
 """They learn from what they have just done, continuous actions or discrete ones."""
 OFF_POLICY: Final = ("SAC", "TD3", "DDPG", "TQC", "CrossQ")
 """They learn from a replay buffer, continuous actions."""
 DISCRETE: Final = ("DQN", "QRDQN")
 """They learn from a replay buffer, discrete actions; their filter is an ActionShield."""
-MASKED: Final = ("MaskablePPO",)
-"""Discrete actions; at every step they ask the env which of them are allowed (`action_masks`)."""
-RECURRENT: Final = ("RecurrentPPO",)
-"""Their policies have a memory, which is carried from step to step of an episode."""
 DETERMINISTIC: Final = ("TD3", "DDPG")
 """Of `OFF_POLICY` those whose policy tries nothing out by itself."""
-HER: Final = "HerReplayBuffer"
 LINEAR: Final = "linear_"
 SCHEDULED: Final = ("learning_rate", "clip_range", "clip_range_vf")
 """What may fall in the course of a run: a number, or a text such as `linear_3e-4`."""
@@ -41,6 +36,8 @@ SCHEDULED: Final = ("learning_rate", "clip_range", "clip_range_vf")
 _NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tensorboard_log"} | {
     "_init_setup_model",
     "stats_window_size",
+    "replay_buffer_class",
+    "replay_buffer_kwargs",
 }
 _Noise = Annotated[
     dict[Literal["normal", "ornstein_uhlenbeck"], Annotated[Number, Field(gt=0)]],
@@ -53,7 +50,6 @@ _TYPES: Final[Mapping[str, Any]] = {
     "action_noise": Annotated[
         _Noise | None, BeforeValidator(lambda given: None if given == "none" else given)
     ],
-    "replay_buffer_class": Literal["HerReplayBuffer"],
     "train_freq": Any,  # may be [4, "episode"]
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "buffer_size"), Count),
     **dict.fromkeys(("learning_starts", "sde_sample_freq"), NonNegative),
@@ -63,31 +59,26 @@ _FALLS: Final = "a number, or linear_<number> for one that falls to 0 over total
 _LINEAR_NUMBER: Final = Annotated[str, matching(LINEAR + r"(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,2})?", _FALLS)]
 
 
-class _Algorithms(Mapping[str, "type[BaseAlgorithm]"]):
-    """Name -> class."""
-
-    def __getitem__(self, name: str) -> type[BaseAlgorithm]:
-        module = _MODULES[name]
-        try:
-            algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
-        except ModuleNotFoundError as missing:
-            if missing.name != _CONTRIB:
-                raise
-            raise ConfigurationError(
-                f"algorithm: {name} is one of sb3-contrib's, which is not installed: pip install"
-                " 'safe-wrappers[contrib]'"
-            ) from None
-        return algorithm
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(_MODULES)
-
-    def __len__(self) -> int:
-        return len(_MODULES)
+ALGORITHMS: Final = tuple(_MODULES)
+"""Names, Stable-Baselines3's and sb3-contrib's."""
 
 
-ALGORITHMS: Final[Mapping[str, type[BaseAlgorithm]]] = _Algorithms()
-"""Name -> class, Stable-Baselines3's and sb3-contrib's. `ConfigurationError` where the package is missing."""
+def algorithm_class(name: str) -> type[BaseAlgorithm]:
+    """The class of one of `ALGORITHMS`.
+
+    Raises:
+        ConfigurationError: It is one of sb3-contrib's, which is not installed.
+    """
+    try:
+        found: type[BaseAlgorithm] = getattr(importlib.import_module(_MODULES[name]), name)
+    except ModuleNotFoundError as missing:
+        if missing.name != _CONTRIB:
+            raise
+        raise ConfigurationError(
+            f"algorithm: {name} is one of sb3-contrib's, which is not installed: pip install"
+            " 'safe-wrappers[contrib]'"
+        ) from None
+    return found
 
 
 def check_hyperparameters(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -96,7 +87,7 @@ def check_hyperparameters(algorithm: str, given: Mapping[str, Any]) -> dict[str,
     Raises:
         ConfigurationError: Unknown names, values of the wrong type or outside their range.
     """
-    signature = inspect.signature(ALGORITHMS[algorithm])
+    signature = inspect.signature(algorithm_class(algorithm))
     parameters = {k: v for k, v in signature.parameters.items() if k not in _NOT_HYPERPARAMETERS}
     checked = {}
     for key, value in given.items():
@@ -109,4 +100,4 @@ def check_hyperparameters(algorithm: str, given: Mapping[str, Any]) -> dict[str,
 
 def default_of(algorithm: str, argument: str) -> Any:
     """The default of an argument of the algorithm's constructor."""
-    return inspect.signature(ALGORITHMS[algorithm]).parameters[argument].default
+    return inspect.signature(algorithm_class(algorithm)).parameters[argument].default

@@ -13,13 +13,13 @@ import yaml
 
 from safe_wrappers.errors import ConfigurationError
 
-from .algorithms import DETERMINISTIC, DISCRETE, HER, MASKED, OFF_POLICY, ON_POLICY, check_hyperparameters
+from .algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY, check_hyperparameters
 from .models import ArmConfig, ExperimentConfig
 from .types import check_name, validate
 
 _EXPERIMENT_KEYS: Final = tuple(field.name for field in fields(ExperimentConfig))
 _ARM_KEYS: Final = tuple(field.name for field in fields(ArmConfig) if field.name != "name")
-COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key not in ("filter", "learner", "start_from"))
+COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key not in ("filter", "learner"))
 """What may be said for all arms at the top."""
 
 
@@ -57,9 +57,7 @@ def read_config(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
         ConfigurationError: No such file, not YAML, not a mapping, or an override that is not `key=value`.
     """
     if not path.is_file():
-        near = sorted(str(p) for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
-        there = f" Configs there: {', '.join(near)}." if near else ""
-        raise ConfigurationError(f"There is no config file {str(path)!r}.{there}")
+        raise ConfigurationError(f"There is no config file {str(path)!r}.")
     settings = _load(path.read_bytes(), str(path))
     if not isinstance(settings, dict):
         raise ConfigurationError(
@@ -127,8 +125,6 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
     experiment: ExperimentConfig = validate(ExperimentConfig, own, "")
     if len(set(experiment.seeds)) < len(experiment.seeds):
         raise ConfigurationError(f"seeds: each may be given once, got {experiment.seeds}.")
-    for arm in experiment.arms:
-        _check_start(arm, experiment)
     return replace(experiment, arms=tuple(_with_constraints(arm, experiment) for arm in experiment.arms))
 
 
@@ -157,7 +153,7 @@ def _conflicts(arm: ArmConfig) -> list[tuple[bool, str]]:
     """What does not go together, and why."""
     learner, given = arm.learner, arm.hyperparameters
     scaled = arm.normalize.observation or arm.normalize.reward
-    discrete, on_policy = arm.algorithm in (*DISCRETE, *MASKED), arm.algorithm in ON_POLICY
+    discrete, on_policy = arm.algorithm in DISCRETE, arm.algorithm in ON_POLICY
     return [
         (
             arm.algorithm in DETERMINISTIC and "action_noise" not in given,
@@ -176,11 +172,6 @@ def _conflicts(arm: ArmConfig) -> list[tuple[bool, str]]:
             f" nothing; leave normalize out, or use {' or '.join(ON_POLICY)}.",
         ),
         (
-            arm.replays_goals and (learner.cost_limit is not None or arm.env.occlusion is not None),
-            f"{HER} asks the task for rewards anew, without the price of learner.cost_limit and the penalty of"
-            " env.occlusion.",
-        ),
-        (
             discrete and (learner.stores_executed or learner.maps),
             f"learner {learner.kind} is for continuous actions, and {arm.algorithm} has discrete ones. Use naive or"
             " adaption_penalty.",
@@ -192,27 +183,10 @@ def _conflicts(arm: ArmConfig) -> list[tuple[bool, str]]:
             f" {learner.kind} with {', '.join(OFF_POLICY)}.",
         ),
         (
-            learner.stores_executed and not arm.replays_goals and "replay_buffer_kwargs" in given,
-            f"learner {learner.kind} sets hyperparameters.replay_buffer_kwargs itself; leave it out.",
-        ),
-        (
-            (learner.stores_executed or arm.replays_goals) and given.get("n_steps", 1) > 1 and not on_policy,
-            f"learner {learner.kind} and {HER} have one-step returns; leave hyperparameters.n_steps out.",
+            learner.stores_executed and given.get("n_steps", 1) > 1,
+            f"learner {learner.kind} has one-step returns; leave hyperparameters.n_steps out.",
         ),
     ]
-
-
-def _check_start(arm: ArmConfig, experiment: ExperimentConfig) -> None:
-    where = f"arms.{arm.name}.start_from"
-    if arm.start_from is None or arm.start_from.endswith(".zip"):
-        return
-    before = {other.name: other for other in experiment.arms[: experiment.arms.index(arm)]}
-    source = before[check_name(arm.start_from, before, f"{where} (an arm before this one, or a file *.zip)")]
-    if source.algorithm != arm.algorithm:
-        raise ConfigurationError(
-            f"{where}: {source.name} is trained with {source.algorithm}, this arm with {arm.algorithm}; a policy goes"
-            " on with the algorithm that it was trained with."
-        )
 
 
 def _with_constraints(arm: ArmConfig, experiment: ExperimentConfig) -> ArmConfig:

@@ -16,12 +16,9 @@ import gymnasium as gym
 from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, model_validator
 from pydantic.dataclasses import dataclass
 
-from safe_wrappers import LeaseExpiry, OcclusionPenalty, StuckEscape
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.protect import protect_options
-from safe_wrappers.wrappers.faults import FAULTS
 
-from .algorithms import ALGORITHMS, HER
+from .algorithms import ALGORITHMS
 from .types import (
     Count,
     FolderName,
@@ -30,10 +27,8 @@ from .types import (
     Number,
     Options,
     Section,
-    arguments,
     check_name,
     validate,
-    with_keys,
 )
 
 
@@ -63,14 +58,6 @@ def _registered(env_id: str) -> bool:
 
 def _check_algorithm(name: str) -> str:
     return check_name(name, ALGORITHMS)
-
-
-def _check_faults(given: dict[str, Options]) -> dict[str, Options]:
-    for fault in given:
-        check_name(fault, FAULTS)
-        for name in given[fault]:
-            check_name(name, arguments(FAULTS[fault]), fault)
-    return given
 
 
 @dataclass(frozen=True)
@@ -121,10 +108,6 @@ class LearnerConfig(Section):
             )
         if given and not self.penalised:
             raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
-        if self.multiplier_rate != LearnerConfig.multiplier_rate and self.cost_limit is None:
-            raise ConfigurationError(
-                "multiplier_rate belongs to cost_limit: {cost_limit: 25, multiplier_rate: 0.001}."
-            )
         return self
 
     @property
@@ -165,15 +148,15 @@ NAIVE: Final = LearnerConfig()
 class FilterConfig(Section):
     """Which filter: `none`, `protect`, or a mapping. A lease without a clearance is given the filter's constraint."""
 
-    protect: Annotated[Options | None, with_keys(protect_options() - {"plant"})] = None
+    protect: Options | None = None
     """Options of `safe_wrappers.protect`, such as `margin` (added to the recipe's own)."""
     factory: FunctionName | None = None
     """`module:function`: called with the env, returns it filtered."""
     kwargs: Options = Field(default_factory=dict)
     """Further arguments of the factory."""
-    lease: Annotated[Options | None, with_keys(arguments(LeaseExpiry, "plant", "measured"))] = None
+    lease: Options | None = None
     """Arguments of a [LeaseExpiry](wrappers/late-commands.md#leaseexpiry) around the filter."""
-    escape: Annotated[Options | None, with_keys(arguments(StuckEscape))] = None
+    escape: Options | None = None
     """Arguments of a [StuckEscape](wrappers/learner.md#stuckescape) around the filter."""
 
     @model_validator(mode="before")
@@ -225,10 +208,10 @@ class EnvConfig(Section):
     register the id."""
     kwargs: Options = Field(default_factory=dict)
     """Passed to `gymnasium.make`."""
-    faults: Annotated[dict[str, Options], AfterValidator(_check_faults)] = Field(default_factory=dict)
+    faults: dict[str, Options] = Field(default_factory=dict)
     """[Faults](wrappers/recording.md#faults) between policy and robot, in training and evaluation: a wrapper's
     name and its arguments, the innermost first."""
-    occlusion: Annotated[Options | None, with_keys(arguments(OcclusionPenalty))] = None
+    occlusion: Options | None = None
     """Arguments of an [OcclusionPenalty](wrappers/occlusion-penalty.md) around the task, inside the filter."""
     cost: FunctionName | None = None
     """`module:function` that judges a task without a cost of its own:
@@ -239,9 +222,6 @@ class EnvConfig(Section):
     """`constraints`: policies observe what the filter decides by, in training and evaluation
     ([FilterObservation](wrappers/learner.md#filterobservation)); without a filter, what the evaluation's filter
     would."""
-    reset_options: Options = Field(default_factory=dict)
-    """Options of every reset in training, such as `{layout: {hazards: []}}` of the goal tasks. Evaluation resets
-    without them: every arm is judged on the task itself."""
 
     @model_validator(mode="after")
     def _has_one_judge(self) -> EnvConfig:
@@ -284,25 +264,21 @@ class ArmConfig(Section):
     """The env: an id, or the keys of [`env`](#env)."""
     algorithm: Annotated[str, AfterValidator(_check_algorithm)]
     """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.6,<3'` also `TQC`, `CrossQ`,
-    `TRPO`, `RecurrentPPO`, `QRDQN`, `MaskablePPO`. The last two and `DQN` are for discrete actions; filtered, those
-    have an [ActionShield](wrappers/filter.md#actionshield), and `MaskablePPO` learns from its masks."""
+    `TRPO`, `QRDQN`. `DQN` and `QRDQN` are for discrete actions; filtered, those have an
+    [ActionShield](wrappers/filter.md#actionshield)."""
     total_steps: Count
     """Steps of all envs together, rounded up to whole rollouts: PPO with its default of `n_steps: 2048` and four
     envs trains 8,192 steps if 4,000 are asked for. Progress and report say how many were trained. May be [raised
     later](cli.md#training-for-longer)."""
     hyperparameters: Options = Field(default_factory=dict)
     """Arguments of the algorithm's class, by SB3's names. An arm's are added to those at the top, if the algorithm
-    is the same. `policy` is `MlpPolicy`, or `MultiInputPolicy` where observations are dicts, if it is not given (of
-    RecurrentPPO `MlpLstmPolicy` and `MultiInputLstmPolicy`).
+    is the same. `policy` is `MlpPolicy`, or `MultiInputPolicy` where observations are dicts, if it is not given.
     `buffer_size` is `total_steps`, at most a million. What the run decides itself (`env`, `seed`, `device`,
-    `verbose`, `tensorboard_log`, `stats_window_size`) is refused."""
+    `verbose`, `tensorboard_log`, `stats_window_size`, the class of the replay buffer) is refused."""
     filter: FilterConfig = FilterConfig()
     """`none`, `protect`, or the keys of [`filter`](#filter)."""
     learner: LearnerConfig = NAIVE
     """What the learner sees where the filter changed an action: see [`learner`](#learner)."""
-    start_from: str | None = None
-    """An arm of this experiment, whose policy of the same seed this one begins with, or an SB3 file `*.zip`: see
-    [fine-tuning](concepts/learner.md#fine-tuning)."""
     normalize: NormalizeConfig = NormalizeConfig()
     action_repeat: Count = 1
     """Control steps for which an action of the policy is held, in training and evaluation
@@ -310,9 +286,6 @@ class ArmConfig(Section):
     actions."""
     n_envs: Count = 1
     """Envs of a run."""
-    vec_env: Literal["dummy", "subproc"] = "dummy"
-    """Envs one after the other, or each in a process of its own: the same results, bit for bit. A run then has
-    `n_envs` processes more; set `workers` accordingly. May be changed later."""
     checkpoint_every: Count = 50_000
     """Steps between two checkpoints, saved between two rollouts. May be changed later."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
@@ -320,14 +293,9 @@ class ArmConfig(Section):
     trackers: list[Literal["wandb", "mlflow"]] = Field(default_factory=list)
     """[Where curves and films go](cli.md#where-everything-lies) beside TensorBoard. May be changed later."""
 
-    @property
-    def replays_goals(self) -> bool:
-        """Whether the replay buffer is HER's, which gives transitions new goals."""
-        return self.hyperparameters.get("replay_buffer_class") == HER
-
     def fingerprint(self) -> dict[str, Any]:
         """What a run folder must agree on to be continued: all that changes what is learned."""
-        harmless = ("name", "checkpoint_every", "device", "vec_env", "trackers")
+        harmless = ("name", "checkpoint_every", "device", "trackers")
         return {key: value for key, value in self.plain().items() if key not in harmless}
 
 
@@ -354,13 +322,8 @@ class SweepConfig(Section):
     at_once: Count = 1
     """Trials that are drawn together and run at the same time. More use more cores or nodes, and know less of each
     other. With `seed` it decides what is drawn, on any machine."""
-    arm: str | None = None
-    """The arm that is trained and ranked, after those that it begins with; by default the first one with a filter."""
     seed: NonNegative = 0
     """Of the search."""
-    storage: str | None = None
-    """URL of the database that keeps the study, as SQLAlchemy has it (`postgresql://...`, `sqlite:///...`); by
-    default `sweep/study.db` in the experiment's folder."""
 
 
 @dataclass(frozen=True)
@@ -389,10 +352,6 @@ class ExperimentConfig(Section):
     def run_folder(self, arm: ArmConfig, seed: int) -> Path:
         """Where one run lies."""
         return self.folder / arm.name / f"seed_{seed}"
-
-    def begins_with(self, arm: ArmConfig) -> ArmConfig | None:
-        """The arm whose policy an arm begins with; None: none, or a file's."""
-        return next((other for other in self.arms if other.name == arm.start_from), None)
 
     @property
     def evaluation_filter(self) -> FilterConfig:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import difflib
-import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Annotated, Any, ClassVar
 
@@ -43,23 +42,6 @@ def check_name(name: object, valid: Iterable[str], where: str = "") -> str:
         options = [*difflib.get_close_matches(str(name), options, n=8, cutoff=0.3), "..."]
     place = f"{where}: " if where else ""
     raise UnknownNameError(f"{place}unknown name {name!r}.{hint} Valid names: {', '.join(options)}.")
-
-
-def with_keys(names: Iterable[str]) -> AfterValidator:
-    """A mapping may have these keys."""
-    valid = tuple(names)
-
-    def check(given: Any) -> Any:
-        for name in given or ():
-            check_name(name, valid)
-        return given
-
-    return AfterValidator(check)
-
-
-def arguments(of: Callable[..., Any], *without: str) -> list[str]:
-    """The names of a wrapper's arguments that a config can give."""
-    return [name for name in inspect.signature(of).parameters if name not in ("env", *without)]
 
 
 def matching(pattern: str, expected: str) -> AfterValidator:
@@ -139,8 +121,6 @@ def validate(kind: Any, value: Any, where: str) -> Any:
     if refused["type"] == "missing":
         raise ConfigurationError(f"{'.'.join(keys[:-1]) or 'config'}: {keys[-1]!r} is missing.")
     place, context, given = ".".join(keys), refused.get("ctx", {}), refused["input"]
-    if refused["type"] == "literal_error":
-        check_name(given, re.findall("'(.*?)'", context["expected"]), place)
     cause = context.get("error")
     if isinstance(cause, ConfigurationError):  # a validator's own words
         raise type(cause)(f"{place}: {cause}")

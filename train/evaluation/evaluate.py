@@ -1,19 +1,20 @@
-"""Paired evaluation: every policy on the same episode seeds, with the filter on and with it off."""
+"""Paired evaluation: every policy on the same episode seeds, filter on and off; and what of it is shown first."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 
 from safe_wrappers import info as keys
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
-from ..config import ArmConfig, EvaluationConfig, FilterConfig
-from ..files import only_writer, read_json, write_json, write_rows
+from ..config import ArmConfig, EvaluationConfig, ExperimentConfig, FilterConfig
+from ..files import only_writer, read_json, read_rows, write_json, write_rows
 from ..processes import Progress, RunStoppedError
 from ..run.folder import EVALUATION, check_finished
 from ..run.policy import TrainedPolicy
@@ -29,8 +30,8 @@ STATE_FILE: Final = "evaluation.json"
 def evaluation_folder(run_folder: Path) -> Path:
     """Where a run's evaluation lies.
 
-    Per condition (`filter_off`, `filter_on`) a table of episodes `.csv`, the steps `_steps.npz`
-    (`safe_wrappers.train.evaluation.step_log`), and for tasks seen from above what stood where, `_places.json`.
+    Per condition (`filter_off`, `filter_on`) a table of episodes `.csv`, and the steps `_steps.npz`
+    (`safe_wrappers.train.evaluation.step_log`).
     """
     return run_folder / EVALUATION
 
@@ -102,7 +103,6 @@ def evaluate_run(
                 log = steps.finish()
             logger.dump(checkpoint.timesteps)
             write_rows(out / f"{condition}.csv", EVALUATION_COLUMNS, rows)
-            write_json(out / f"{condition}_places.json", steps.places)
             save_steps(out / f"{condition}_steps.npz", log)
         logger.close()
         write_json(out / STATE_FILE, state)
@@ -113,7 +113,7 @@ def _episode(
 ) -> dict[str, Any]:
     """Runs an episode, and records its steps; its figures as `RecordInterventions` has them."""
     observation, _ = env.reset(seed=episode_seed)
-    policy.begin(env)
+    policy.begin()
     steps.begin(episode_seed)
     done = False
     while not done:
@@ -124,3 +124,67 @@ def _episode(
         done = terminated or truncated
     figures: dict[str, Any] = info[keys.EPISODE_SUMMARY]
     return figures
+
+
+class Pair(NamedTuple):
+    """A comparison: an arm without the filter (the filtered one itself where there is no other), and one with it."""
+
+    bare: ArmConfig
+    filtered: ArmConfig
+
+
+class ShownEpisode(NamedTuple):
+    """The evaluation episode that is looked at in every arm and condition.
+
+    Attributes:
+        seed: The training seed of the policies.
+        episode_seed: Of the episode.
+        reason: How it was chosen, for the page.
+    """
+
+    seed: int
+    episode_seed: int
+    reason: str
+
+
+def compared_pairs(experiment: ExperimentConfig) -> list[Pair]:
+    """What the headline compares.
+
+    - The first arm with a filter, and the first one without a filter on the same env (or, where there is none,
+      the filtered arm with its filter off);
+    - where no arm has a filter but the evaluation does: every arm, with it off and on;
+    - nothing where there is no filter at all.
+    """
+    filtered = next((arm for arm in experiment.arms if arm.filter.kind != "none"), None)
+    if filtered is not None:
+        bare = (arm for arm in experiment.arms if arm.filter.kind == "none" and arm.env == filtered.env)
+        return [Pair(next(bare, filtered), filtered)]
+    if experiment.evaluation_filter.kind != "none":
+        return [Pair(arm, arm) for arm in experiment.arms]
+    return []
+
+
+def shown_episode(experiment: ExperimentConfig) -> ShownEpisode | None:
+    """The evaluation episode with the median return of the headline's policy; None before any evaluation.
+
+    The policy is that of the first filtered arm with the filter on, or of the first arm where nothing is filtered.
+    """
+    pair = next(iter(compared_pairs(experiment)), None)
+    arm, condition = (experiment.arms[0], "filter_off") if pair is None else (pair.filtered, "filter_on")
+    seed = experiment.seeds[0]
+    rows = read_rows(evaluation_folder(experiment.run_folder(arm, seed)) / f"{condition}.csv")
+    if not rows:
+        return None
+    typical = typical_seed({int(row["episode_seed"]): row["return"] for row in rows})
+    words = f"“{arm.name}” with the {condition.replace('_', ' ')}"
+    reason = (
+        f"Episode seed {typical}, policies of training seed {seed}: of the {len(rows)} evaluation episodes the one"
+        f" with the median return of {words}."
+    )
+    return ShownEpisode(seed, typical, reason)
+
+
+def typical_seed(returns: Mapping[int, float]) -> int:
+    """The episode seed with the median return (of an even number the lower one)."""
+    ordered = sorted(returns, key=lambda seed: (returns[seed], seed))
+    return ordered[(len(ordered) - 1) // 2]

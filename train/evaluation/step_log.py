@@ -31,12 +31,9 @@ class StepLog:
         episode_seed: Shape (T,).
         step: The step's number in its episode, from 0, shape (T,); likewise what follows without another shape.
         intervened: The filter changed the action.
-        infeasible: It found no admissible action.
-        fallback: Its last resort acted.
         violated: The task's own truth saw a cost, at the step's end or at any substep.
         correction: L2, action units.
         proposed: The policy's action, shape (T, action size).
-        executed: The action that the env was given, shape (T, action size).
         refused: Which constraints refused the boxed proposal, shape (T, constraints).
         coordinates: The state in which the step began, shape (T, coordinates).
         constraint_names: Shape (constraints,).
@@ -47,12 +44,9 @@ class StepLog:
     episode_seed: NDArray[np.int64]
     step: NDArray[np.int32]
     intervened: NDArray[np.bool_]
-    infeasible: NDArray[np.bool_]
-    fallback: NDArray[np.bool_]
     violated: NDArray[np.bool_]
     correction: NDArray[np.float32]
     proposed: NDArray[np.float32]
-    executed: NDArray[np.float32]
     refused: NDArray[np.bool_]
     coordinates: NDArray[np.float32]
     constraint_names: NDArray[np.str_]
@@ -75,8 +69,7 @@ def is_violation(info: Mapping[str, Any]) -> bool:
 def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], Array]]:
     """A few named numbers that say where in state space a task is.
 
-    - A task that publishes `agent_position` (seen from above): its place, and where the nearest hazard is, ahead and
-      to the left if it publishes `agent_heading`;
+    - A task that publishes `agent_position` (seen from above): its place;
     - any other MuJoCo env: every joint's position and speed by name, angles of hinges without limits in [-pi, pi];
     - any other env: its observation, if that is a flat Box.
 
@@ -88,9 +81,7 @@ def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], A
     """
     task: Any = env.unwrapped
     if np.size(getattr(task, "agent_position", ())) >= 2:
-        hazards = hasattr(task, "agent_heading") and np.size(getattr(task, "hazard_positions", ())) > 0
-        nearest = [f"nearest hazard, {side} (m)" for side in ("ahead", "to the left")] if hazards else []
-        return ["x (m)", "y (m)", *nearest], lambda _: _from_above(task, hazards)
+        return ["x (m)", "y (m)"], lambda _: np.array(task.agent_position, dtype=float)[:2]
     if hasattr(task, "model") and hasattr(task, "data"):
         model = task.model
         hinge = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -107,16 +98,6 @@ def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], A
         names = [f"observation {at}" for at in range(space.shape[0])]
         return names, lambda observation: np.array(observation, dtype=float)
     return [], lambda _: np.zeros(0)
-
-
-def _from_above(task: Any, hazards: bool) -> Array:
-    at = np.array(task.agent_position, dtype=float)[:2]
-    if not hazards:
-        return at
-    ways = np.atleast_2d(np.array(task.hazard_positions, dtype=float))[:, :2] - at
-    way = ways[np.argmin(np.linalg.norm(ways, axis=1))]
-    ahead = np.array([math.cos(task.agent_heading), math.sin(task.agent_heading)])
-    return np.array([*at, ahead @ way, ahead[0] * way[1] - ahead[1] * way[0]])
 
 
 def _joint_names(model: Any) -> list[str]:
@@ -137,45 +118,27 @@ def _joint_names(model: Any) -> list[str]:
     return names
 
 
-def _published(env: gym.Env[Any, Any], name: str) -> Any:
-    """A number, a place or places of a task, as plain data; an empty list where it publishes none."""
-    return np.asarray(getattr(env.unwrapped, name, []), dtype=float).tolist()
-
-
 class StepRecorder:
     """Collects an evaluation's steps; keys that no filter wrote count as "did nothing".
 
     Args:
         env: The whole stack.
-
-    Attributes:
-        places: Of each episode, by its seed, what a task seen from above publishes: where hazards and vases were at
-            its start, each place that the goal was at, and their radii; lists of [x, y], m.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env = env
         self._rows: dict[str, list[Any]] = {name: [] for name in _PER_STEP}
         self._left_out = 0
-        self.places: dict[int, dict[str, Any]] = {}
 
     def begin(self, episode_seed: int) -> None:
         """An episode has been reset."""
         # Only now: some tasks do not know where they are before their first reset.
         self._names, self._read = coordinates_of(self._env)
         self._episode_seed, self._step = episode_seed, 0
-        if np.size(_published(self._env, "agent_position")):
-            found = {what: _published(self._env, f"{what}_positions") for what in ("hazard", "vase")}
-            radii = {f"{what}_radius": _published(self._env, f"{what}_radius") for what in ("hazard", "goal")}
-            self.places[episode_seed] = found | radii | {"goal": []}
 
     def before(self, observation: Any) -> None:
         """Takes down the state in which the next step begins."""
         self._coordinates = self._read(observation)
-        if self._episode_seed in self.places:
-            goal, goals = _published(self._env, "goal_position"), self.places[self._episode_seed]["goal"]
-            if goal and goals[-1:] != [goal]:
-                goals.append(goal)
 
     def after(self, action: Any, info: dict[str, Any]) -> None:
         """Takes down what the step did.
@@ -192,12 +155,9 @@ class StepRecorder:
             "episode_seed": self._episode_seed,
             "step": step,
             "intervened": bool(info.get(keys.CBF_INTERVENED, False)),
-            "infeasible": bool(info.get(keys.CBF_INFEASIBLE, False)),
-            "fallback": bool(info.get(keys.CBF_FALLBACK, False)),
             "violated": is_violation(info),
             "correction": info.get(keys.CBF_CORRECTION, 0.0),
             "proposed": np.ravel(info.get(keys.PROPOSED_ACTION, action)),
-            "executed": np.ravel(info.get(keys.EXECUTED_ACTION, action)),
             "refused": np.asarray(info.get(keys.CBF_REFUSED, np.zeros(0)), dtype=bool),
             "coordinates": self._coordinates,
         }
@@ -206,7 +166,7 @@ class StepRecorder:
 
     def finish(self) -> StepLog:
         """All steps so far; there must have been one."""
-        flags = ("intervened", "infeasible", "fallback", "violated", "refused")
+        flags = ("intervened", "violated", "refused")
         kinds = {"episode_seed": np.int64, "step": np.int32} | dict.fromkeys(flags, np.bool_)
         columns: dict[str, Any] = {
             name: np.array(values, dtype=kinds.get(name, np.float32)) for name, values in self._rows.items()

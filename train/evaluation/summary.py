@@ -155,7 +155,7 @@ def summarize(experiment: ExperimentConfig) -> Summary:
 
 
 def write_summary(summary: Summary, folder: Path) -> None:
-    """Writes `per_seed.csv` (one row per arm, seed and condition), `summary.csv` and `summary.json`.
+    """Writes `per_seed.csv` (one row per arm, seed and condition) and `summary.json`.
 
     What was not judged or not reported has no row in the summary and an empty cell in the seeds' table. `spread` says
     what `low` and `high` are: the range of two seeds, or an interval over more.
@@ -173,15 +173,6 @@ def write_summary(summary: Summary, folder: Path) -> None:
         }
         for arm, conditions in summary.table.items()
     }
-    rows = [
-        {"arm": arm, "condition": condition, "metric": metric}
-        | {key: "" if value is None else value for key, value in result.items()}
-        for arm, conditions in plain.items()
-        for condition, metrics in conditions.items()
-        for metric, result in metrics.items()
-    ]
-    columns = ("arm", "condition", "metric", "iqm", "low", "high", "seeds", "spread")
-    write_rows(folder / "summary.csv", columns, rows)
     write_json(folder / "summary.json", plain)
 
 
@@ -277,7 +268,7 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
     end = max(run[-1, 0] for run in runs)
     for bins in range(_MOST_BINS, 0, -1):
         edges = np.linspace(0, end, bins + 1)
-        means = np.array([_bin_means(edges, *run.T) for run in runs])
+        means = np.array([_means(edges, *run.T) for run in runs])
         if np.isfinite(means).all():
             break
     low = high = None
@@ -288,12 +279,6 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
     return Curve((edges[:-1] + edges[1:]) / 2, interquartile_mean(means, axis=0), low, high, means)
 
 
-def _bin_means(edges: Array, at: Array, values: Array) -> Array:
-    """Means of the values in each bin; NaN in an empty one."""
-    bins = np.searchsorted(edges[1:-1], at)
-    sums, counts = (
-        np.bincount(bins, weights=w, minlength=len(edges) - 1) for w in (values, np.ones(len(at)))
-    )
-    means = np.full(len(counts), np.nan)
-    np.divide(sums, counts, out=means, where=counts > 0)
-    return means
+def _means(edges: Array, at: Array, values: Array) -> Array:
+    """Means of the values in each bin, whose right end is its own; NaN in an empty one. Steps are whole numbers."""
+    return np.asarray(stats.binned_statistic(at - 0.5, values, "mean", edges).statistic)

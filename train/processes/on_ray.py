@@ -108,15 +108,9 @@ class _Post:
     def __init__(self) -> None:
         self._said: list[tuple[str, Message]] = []
         self._stopped: set[str] = set()
-        self._begun: set[str] = set()
 
     def put(self, name: str, message: Message) -> None:
         self._said.append((name, message))
-
-    def begin(self, name: str) -> None:
-        if name in self._begun:
-            self.put(name, ("say", "its process was lost; begun again"))
-        self._begun.add(name)
 
     def take(self) -> list[tuple[str, Message]]:
         taken, self._said = self._said, []
@@ -137,7 +131,6 @@ def _work(pickled: bytes, name: str, path: list[str], folder: str, post: Any) ->
     os.chdir(folder)
     # For processes that it starts; Ray gave this one its own.
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-    ray.get(post.begin.remote(name))
     asked, stopped = 0.0, False
 
     def stopping() -> bool:

@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
@@ -19,7 +19,6 @@ from rich.progress import Progress, TaskID
 from . import STOPPED, Interrupted, Job, Message, RunsFailedError, environment, work
 
 _POLL_S: Final = 0.2
-_LINES_S: Final = 30.0
 _SAVE_S: Final = 60.0
 """How long stopped jobs may take: a rollout, its update and a checkpoint with a large replay buffer."""
 
@@ -29,7 +28,6 @@ def run_jobs(
     workers: int | None,
     console: Console,
     title: str,
-    unwanted: Callable[[str], bool] = lambda _: False,
     on: str | None = None,
 ) -> None:
     """Runs jobs in parallel, each in a process of its own with one BLAS and torch thread.
@@ -43,8 +41,6 @@ def run_jobs(
         workers: Processes at a time; None for one per core that this process may use, or that the cluster has.
         console: Where progress, messages and failures are shown.
         title: What is going on.
-        unwanted: Asked often, by a job's name, whether nobody needs it any more: it is stopped like by a signal,
-            or not begun, and that is no failure.
         on: Where: None for this machine, or `ray` or `ray:ADDRESS`.
 
     Raises:
@@ -54,24 +50,26 @@ def run_jobs(
     waiting = list(jobs)
     running: set[str] = set()
     failures: dict[str, str] = {}
-    asked: set[str] = set()
     wait_until = float("inf")
     with ExitStack() as stack:
         signals = stack.enter_context(_noted_signals())
         # Read by the BLAS libraries when the spawned process loads them; more threads would only fight for cores.
         one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         stack.enter_context(environment(one))
-        place = _workers(on, workers)
+        place: Any = LocalWorkers(workers)
+        if on is not None:
+            from .on_ray import RayWorkers
+
+            place = RayWorkers(on, workers)
         stack.callback(place.kill)
         shown = _Shown(console)
         stack.enter_context(shown.bars)
         while running or (waiting and not signals):
             while waiting and len(running) < place.at_once and not signals:
                 job = waiting.pop(0)
-                if not unwanted(job.name):
-                    place.start(job)
-                    running.add(job.name)
-                    shown.start(job)
+                place.start(job)
+                running.add(job.name)
+                shown.start(job)
             for name, (kind, told) in place.messages(_POLL_S):
                 if kind == "end":
                     running.remove(name)
@@ -82,13 +80,11 @@ def run_jobs(
                     shown.say(f"{name}: {told}")
                 else:
                     shown.steps(name, told)
-            shown.tick()
             if signals and wait_until == float("inf"):
                 wait_until = time.monotonic() + _SAVE_S
                 shown.say(f"Stopping, for at most {_SAVE_S:.0f} s; another signal stops at once.")
-            for name in {name for name in running - asked if signals or unwanted(name)}:
-                asked.add(name)
-                place.stop(name)
+                for name in running:
+                    place.stop(name)
             if len(signals) > 1 or time.monotonic() > wait_until:
                 break
     texts = "\n".join(f"{name}: {text}" for name, text in failures.items())
@@ -97,14 +93,6 @@ def run_jobs(
         raise Interrupted(signals[0])
     if failures:
         raise RunsFailedError(f"{title}: {len(failures)} of {len(jobs)} failed.\n{texts}", failures)
-
-
-def _workers(on: str | None, at_once: int | None) -> Any:
-    if on is None:
-        return LocalWorkers(at_once)
-    from .on_ray import RayWorkers
-
-    return RayWorkers(on, at_once)
 
 
 @contextmanager
@@ -132,12 +120,11 @@ def _noted_signals() -> Iterator[list[int]]:
 
 
 class _Shown:
-    """A bar for each running job on a terminal; now and then a line for each in a file or a pipe."""
+    """A bar for each running job on a terminal; lines at its begin and end in a file or a pipe."""
 
     def __init__(self, console: Console) -> None:
         self.bars = Progress(console=console, transient=True, disable=not console.is_terminal)
         self._tasks: dict[str, TaskID] = {}
-        self._said_at = time.monotonic()
 
     def start(self, job: Job) -> None:
         self._tasks[job.name] = self.bars.add_task(job.name, total=job.total)
@@ -153,13 +140,6 @@ class _Shown:
 
     def say(self, text: str) -> None:
         self.bars.console.print(text, soft_wrap=True, highlight=False, markup=False)
-
-    def tick(self) -> None:
-        """To be called often."""
-        if not self.bars.console.is_terminal and time.monotonic() - self._said_at > _LINES_S:
-            self._said_at = time.monotonic()
-            for task in self.bars.tasks:
-                self.say(f"  {task.description}: {task.percentage:.0f} %")
 
 
 _here: dict[str, Any] = {}

@@ -1,77 +1,101 @@
-"""What came out and how it was learned: returns, costs and corrections, each with a sentence that reads it."""
+"""How it was learned, what was refused, and where the filter stepped in: pictures, each with a sentence on it.
+
+Matplotlib draws them; they are images inside the page.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+import base64
+import io
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+from typing import Any, Final, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
+from numpy.typing import NDArray
 
 from ..evaluation.step_log import StepLog
-from ..evaluation.summary import Curve, Estimate, Summary, number
-from .drawing import Picture, color_of, draw
+from ..evaluation.summary import Curve, number
 
 CONDITIONS: Final = {"filter_off": "off", "filter_on": "on"}
-NOTHING_EVALUATED: Final = "Nothing has been evaluated yet: run `safe-wrappers evaluate`."
-_EPISODE_BINS: Final = 20
+COLORS: Final = ("#d1601f", "#1a6fb5", "#3d8b5f", "#8f5bb3", "#8a7a1e", "#b0447a")
+"""Of the arms, in their order."""
+MARK: Final = "#e0a100"
+"""What the filter changed."""
+BAD: Final = "#d0202e"
+"""Violations."""
+SOFT: Final = "#5c6672"
+_STYLE: Final[dict[Any, Any]] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "safe-wrappers",
+    "text.parse_math": False,
+    "font.size": 10,
+    "axes.labelcolor": SOFT,
+    "axes.titlecolor": SOFT,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.edgecolor": "#d9dce0",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#e3e5e8",
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+}
+WIDTH: Final = 4.7
+"""Inches: half of the page, or the whole of a phone's, so that the text can be read on both."""
+_CELLS: Final = 32
+_BINS: Final = 8
+_MOST_ROWS: Final = 20_000
 
 
-def _rows(summary: Summary, arm: str, condition: str) -> list[dict[str, Any]]:
-    """The seeds' own numbers."""
-    return [row for row in summary.per_seed if (row["arm"], row["condition"]) == (arm, condition)]
+class Picture(NamedTuple):
+    """A picture, or, where there is nothing to draw, only the sentence that says so."""
+
+    title: str
+    reading: str
+    """A sentence that reads it for the case at hand; also what a reader is told who cannot see it."""
+    image: str = ""
+    """A data URI."""
 
 
-def _bar(line: Any, other: float, estimate: Estimate, color: str, width: float, alpha: float) -> None:
-    if estimate.low is not None and estimate.high is not None:
-        line(other, estimate.low, estimate.high, color=color, linewidth=width, alpha=alpha)
+def color_of(arm: str, arms: Sequence[str]) -> str:
+    """An arm's colour."""
+    return COLORS[arms.index(arm) % len(COLORS)]
 
 
-def plane_picture(summary: Summary, arms: Sequence[str]) -> Picture:
-    """Return against cost: each arm's evaluation with the filter off (ring) and on (disc), every seed as a dot."""
-    title = "Return against cost"
-    ends = {
-        arm: {
-            condition: (cell["return"], cell["cost"])
-            for condition in CONDITIONS
-            if {"return", "cost"} <= (cell := summary.table[arm][condition]).keys()
-        }
-        for arm in arms
-    }
-    if not any(ends.values()):
-        return Picture(title, NOTHING_EVALUATED)
+def draw(paint: Callable[[Axes], None], height: float = 2.9) -> str:
+    """One axes, painted, with its legend above it, as an SVG image for a page.
 
-    def paint(axes: Axes) -> None:
-        axes.set(xlabel="return per episode (more is better)", title="cost per episode (less is better)")
-        for arm, of_arm in ends.items():
-            color = color_of(arm, arms)
-            for condition, (x, y) in of_arm.items():
-                fill = "none" if condition == "filter_off" else color
-                seeds = np.array([(row["return"], row["cost"]) for row in _rows(summary, arm, condition)])
-                if len(seeds) > 1:
-                    axes.scatter(seeds[:, 0], seeds[:, 1], s=14, facecolor=fill, edgecolor=color, alpha=0.5)
-                _bar(axes.hlines, y.iqm, x, color, 1.0, 0.7)
-                _bar(axes.vlines, x.iqm, y, color, 1.0, 0.7)
-                label = f"{arm}, filter {CONDITIONS[condition]}"
-                axes.scatter(x.iqm, y.iqm, s=62, facecolor=fill, edgecolor=color, label=label, zorder=3)
-            if len(of_arm) == 2:
-                tail, head = ((x.iqm, y.iqm) for x, y in of_arm.values())
-                arrow = {"arrowstyle": "-|>", "color": color, "alpha": 0.6, "shrinkA": 7, "shrinkB": 7}
-                axes.annotate("", xy=head, xytext=tail, arrowprops=arrow)
-
-    said = []
-    for arm, of_arm in ends.items():
-        if len(of_arm) == 2:
-            (x0, y0), (x1, y1) = of_arm.values()
-            said.append(
-                f"“{arm}”: putting the filter on took the cost from {number(y0.iqm)} to {number(y1.iqm)} and the"
-                f" return from {number(x0.iqm)} to {number(x1.iqm)}."
+    Args:
+        paint: Called with the axes.
+        height: In inches; the width is `WIDTH`.
+    """
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        axes = figure.subplots()
+        paint(axes)
+        marks, labels = axes.get_legend_handles_labels()
+        if labels:
+            figure.legend(
+                marks, labels, loc="outside upper left", ncols=min(len(labels), 3) if len(labels) != 4 else 2
             )
-        said += [f"“{arm}”: return {number(x.iqm)}, cost {number(y.iqm)}." for x, y in of_arm.values()][
-            : len(of_arm) % 2
-        ]
-    return Picture(title, " ".join(said), draw(paint, height=3.4))
+        data = io.BytesIO()
+        figure.savefig(data, format="svg", metadata={"Date": None})
+    return data_uri("image/svg+xml", data.getvalue())
+
+
+def data_uri(kind: str, data: bytes) -> str:
+    """A file inside the page."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def curve_picture(title: str, unit: str, curves: Mapping[str, Curve | None], arms: Sequence[str]) -> Picture:
@@ -108,44 +132,6 @@ def curve_picture(title: str, unit: str, curves: Mapping[str, Curve | None], arm
     return Picture(title, reading, draw(paint))
 
 
-def over_the_episode(
-    title: str, events: Mapping[str, tuple[str, str]], logs: Mapping[str, StepLog], arms: Sequence[str]
-) -> Picture:
-    """Shares of steps in which something happened, over the step in the episode; a sentence where nothing did.
-
-    Args:
-        title: Of the picture.
-        events: Flags of `StepLog`, each with its verb and how its line looks.
-        logs: arm -> its evaluation steps with the filter on, all seeds and episodes.
-        arms: All arms, in the order of their colours.
-    """
-    said = [
-        f"“{arm}”: of {len(log):,} steps "
-        + " and ".join(f"{int(getattr(log, event).sum()):,} {verb}" for event, (verb, _) in events.items())
-        + "."
-        for arm, log in logs.items()
-    ]
-    if not any(getattr(log, event).any() for log in logs.values() for event in events):
-        return Picture(title, " ".join(said))
-    last = max(int(log.step.max()) for log in logs.values()) + 1
-    edges: Any = np.unique(np.linspace(0, last, min(_EPISODE_BINS, last) + 1).round())
-
-    def paint(axes: Axes) -> None:
-        axes.set(xlabel="step in the episode", title="% of steps", xlim=(0, last))
-        for arm, log in logs.items():
-            steps, _ = np.histogram(log.step, edges)
-            for event, (verb, line) in events.items():
-                hits, _ = np.histogram(log.step[getattr(log, event)], edges)
-                share = 100 * hits / np.where(steps > 0, steps, np.nan)
-                label = arm if len(events) == 1 else f"{arm}: {verb}"
-                axes.stairs(
-                    share, edges, baseline=None, color=color_of(arm, arms), linestyle=line, label=label
-                )
-        axes.set_ylim(bottom=0)
-
-    return Picture(title, " ".join(said), draw(paint))
-
-
 def refusals(logs: Mapping[str, StepLog]) -> Picture:
     """Which constraint refused how many of the policies' (boxed) actions, and how large corrections were."""
     said = []
@@ -166,3 +152,94 @@ def refusals(logs: Mapping[str, StepLog]) -> Picture:
                 f"Half of its {values.size:,} corrections were below {half}, the largest {most} (L2)."
             )
     return Picture("Which constraint refused, and how large corrections were", " ".join(said))
+
+
+def telling_pair(coordinates: NDArray[np.floating], flags: NDArray[np.bool_]) -> tuple[int, int]:
+    """Picks the two coordinates in whose plane flagged steps lie most apart from the others.
+
+    Apart is measured by total variation between the two histograms over 8 by 8 quantile bins: 0 where
+    flagged steps are spread as the others, 1 where the two never meet.
+
+    Args:
+        coordinates: Shape (T, D), D >= 2, finite.
+        flags: Shape (T,), with at least one True and one False.
+
+    Returns:
+        Their columns, in order.
+    """
+    every = -(-len(flags) // _MOST_ROWS)
+    if flags[::every].any() and not flags[::every].all():
+        coordinates, flags = coordinates[::every], flags[::every]
+    inner = np.linspace(0, 1, _BINS + 1)[1:-1]
+    cells = [np.searchsorted(np.unique(np.quantile(column, inner)), column) for column in coordinates.T]
+
+    def apart(pair: tuple[int, int]) -> float:
+        cell = cells[pair[0]] * _BINS + cells[pair[1]]
+        here, there = (np.bincount(cell[part], minlength=_BINS**2) / part.sum() for part in (flags, ~flags))
+        return float(np.abs(here - there).sum())
+
+    return max(combinations(range(len(cells)), 2), key=apart)
+
+
+def place_pictures(arm: str, log: StepLog, bare_arm: str, bare: StepLog | None) -> list[Picture]:
+    """The shares of steps that the filter changed, cell by cell of the two most telling coordinates.
+
+    Args:
+        arm: The filtered arm.
+        log: Its evaluation steps with the filter on.
+        bare_arm: The arm without the filter.
+        bare: Its steps with the filter off; where violations were is shown in the same frame.
+    """
+    title = f"Where the filter stepped in: {arm}"
+    if log.coordinates.shape[1] < 2 or not np.isfinite(log.coordinates).all():
+        return [Picture(title, "This task has fewer than two coordinates that could be read.")]
+    if log.intervened.all() or not log.intervened.any():
+        what = "Everywhere: all" if log.intervened.any() else "Nowhere: none"
+        return [Picture(title, f"{what} of {len(log):,} steps were changed.")]
+    pair = telling_pair(log.coordinates, log.intervened)
+    shown = [(title, log, log.intervened, "changed", MARK)]
+    if bare is not None and bare.violated.any() and list(bare.coordinate_names) == list(log.coordinate_names):
+        violations = f"Where violations were: {bare_arm}, filter off"
+        shown.insert(0, (violations, bare, bare.violated, "in violation", BAD))
+    flagged = np.concatenate([steps.coordinates[flags] for _, steps, flags, _, _ in shown])[:, pair]
+    low, high = np.quantile(flagged, (0.005, 0.995), axis=0)
+    air = np.where(high > low, 0.5 * (high - low), 0.5)
+    return [_place(*each, pair, low - air, high + air) for each in shown]
+
+
+def _place(
+    title: str,
+    log: StepLog,
+    flags: NDArray[np.bool_],
+    verb: str,
+    color: str,
+    pair: tuple[int, int],
+    low: NDArray[np.floating],
+    high: NDArray[np.floating],
+) -> Picture:
+    places = log.coordinates[:, pair]
+    inside = ((places >= low) & (places <= high)).all(axis=1)
+    names = [str(log.coordinate_names[at]) for at in pair]
+
+    def paint(axes: Axes) -> None:
+        axes.set(xlabel=names[0], title=names[1])
+        if all(name.endswith("(m)") for name in names):
+            axes.set_aspect("equal")  # a round obstacle is to look round
+        shades = LinearSegmentedColormap.from_list("shares", ["#e8e9ea", color])
+        cells = axes.hexbin(
+            places[inside, 0],
+            places[inside, 1],
+            C=flags[inside],
+            gridsize=(_CELLS, int(_CELLS * 0.55)),
+            extent=(low[0], high[0], low[1], high[1]),
+            cmap=shades,
+            vmin=0,
+            vmax=1,
+        )
+        bar = axes.figure.colorbar(cells, ax=axes, shrink=0.8)
+        bar.set_label(f"share of steps {verb}")
+
+    middle = np.median(places[flags], axis=0)
+    about = f"in the middle of them ({middle[0]:.2g}, {middle[1]:.2g})"
+    reading = f"{100 * flags.mean():.2g} % of {len(flags):,} steps were {verb}; {about}."
+    return Picture(title, reading, draw(paint, height=3.2))

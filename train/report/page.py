@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
@@ -15,8 +13,7 @@ import yaml
 from safe_wrappers.errors import RunStateError
 
 from ..config import ExperimentConfig
-from ..evaluation.episode_selection import compared_pairs, shown_episode
-from ..evaluation.evaluate import evaluated_steps, evaluation_folder
+from ..evaluation.evaluate import compared_pairs, evaluated_steps, shown_episode
 from ..evaluation.metrics import OF_THE_FILTER, REGISTRY
 from ..evaluation.step_log import MOST_STEPS, StepLog, pool
 from ..evaluation.summary import (
@@ -25,27 +22,20 @@ from ..evaluation.summary import (
     Summary,
     judged_by,
     learning_curve,
-    number,
     over_seeds,
-    spread,
 )
-from ..files import Row, read_json, write_rows, write_text
-from ..run.folder import START_FILE, finished_facts
-from ..videos.record import load_video, video_path
-from .drawing import Picture, color_of, data_uri
-from .figures import CONDITIONS, curve_picture, over_the_episode, plane_picture, refusals
-from .tables import RUN_COLUMNS, SHORT, every_metric, run_rows, short_rows
-from .verdict import compare, percent, verdict
-from .where import Scene, place_pictures, scene_pictures
+from ..files import write_text
+from ..run.folder import finished_facts
+from ..videos import load_video, video_path
+from .figures import CONDITIONS, Picture, curve_picture, data_uri, place_pictures, refusals
+from .tables import SHORT, every_metric, short_rows
+from .verdict import verdict
 
-_PACKAGES: Final = ("safe-wrappers", "gymnasium", "mujoco", "stable-baselines3", "torch", "numpy", "daqp")
 _CURVES: Final = {
     "return": ("Return", "return per episode"),
     "cost": ("Cost", "cost per episode"),
     "intervention_rate": ("Steps changed", "share of steps that the filter changed"),
 }
-_CHANGED: Final = {"intervened": ("were changed", "-")}
-_FAILED: Final = {"infeasible": ("were infeasible", "-"), "fallback": ("ran the fallback", ":")}
 _TEMPLATES: Final = jinja2.Environment(
     loader=jinja2.PackageLoader("safe_wrappers.train.report", ""),
     autoescape=True,
@@ -58,7 +48,7 @@ _TEMPLATES: Final = jinja2.Environment(
 def write_report(
     experiment: ExperimentConfig, summary: Summary, command: str = "", path: Path | None = None
 ) -> Path:
-    """Writes an experiment's page, and its learning curves beside it, as `<name of the page>_curves.csv`.
+    """Writes an experiment's page.
 
     Args:
         experiment: The experiment; what its folder holds is shown, nothing is trained.
@@ -88,27 +78,20 @@ def write_report(
         about=about(experiment),
         first=first,
         rest=rest,
-        found=compare(experiment, summary),
-        number=number,
-        percent=percent,
-        spread=spread,
         short=SHORT,
         rows=[(a, list(short_rows(summary, a))) for a in experiment.arms if any(summary.table[a.name].values())],
         over=over_seeds(*summary.seeds),
         judge=judged_by(experiment, summary.judged),
         shown=shown,
         films=[
-            (f"{arm.name}, filter {words}", data_uri("image/webp", video.animation), video.said)
+            (f"{arm.name}, filter {words}", data_uri("image/webp", video[0]), video[1])
             for arm in experiment.arms
             for condition, words in CONDITIONS.items()
-            if (video := load_video(video_path(experiment, arm, condition))) is not None
+            if summary.table[arm.name][condition]  # else the film is of another policy
+            and (video := load_video(video_path(experiment, arm, condition))) is not None
         ],
-        scenes=_scenes(experiment),
-        plane=plane_picture(summary, names) if summary.judged else None,
         acting=acting,
         interventions=[] if not acting else [
-            over_the_episode("When in an episode it stepped in", _CHANGED, acting, names),
-            over_the_episode("Infeasible and fallback steps in evaluation", _FAILED, acting, names),
             refusals(acting),
             *_places(experiment, acting),
         ],
@@ -116,17 +99,12 @@ def write_report(
         left_out=sum(log.left_out for log in acting.values()),
         curves=[curve_picture(*_CURVES[metric], of_arms, names) for metric, of_arms in curves.items()],
         band="range" if len(seeds) < SEEDS_FOR_AN_INTERVAL else "bootstrap 95 % interval",
-        run_columns=RUN_COLUMNS,
-        runs=list(run_rows(experiment, summary)),
-        unfinished=sum(not finished_facts(experiment.run_folder(a, seed)) for a in experiment.arms for seed in seeds),
         learners={arm.name: arm.learner.kind for arm in experiment.arms if arm.filter.kind != "none"},
         registry=REGISTRY,
         command=command,
-        versions=[("python", platform.python_version()), *((each, version(each)) for each in _PACKAGES)],
         settings=yaml.safe_dump(values | {"arms": list(values["arms"])}, sort_keys=False),
         every=list(every_metric(experiment, summary)),
     )  # fmt: skip
-    write_rows(path.with_name(f"{path.stem}_curves.csv"), _CURVE_COLUMNS, _curve_rows(experiment, curves))
     write_text(path, page)
     return path
 
@@ -140,23 +118,6 @@ def _curves(experiment: ExperimentConfig, summary: Summary) -> dict[str, dict[st
         for metric, of in arms.items()
         if of and (summary.judged or metric != "cost")
     }
-
-
-_CURVE_COLUMNS: Final = ("metric", "arm", "what", "training_steps", "value")
-
-
-def _curve_rows(experiment: ExperimentConfig, curves: dict[str, dict[str, Curve | None]]) -> Iterator[Row]:
-    """Every line of every curve, point by point; `what` is `mean`, `low`, `high`, or `seed 0` and so on."""
-    for metric, of_arms in curves.items():
-        for arm, curve in of_arms.items():
-            if curve is None:
-                continue
-            lines = {"mean": curve.iqm, "low": curve.low, "high": curve.high}
-            lines |= {f"seed {s}": values for s, values in zip(experiment.seeds, curve.seeds, strict=True)}
-            for what, values in lines.items():
-                for steps, value in zip(curve.steps, () if values is None else values, strict=False):
-                    point = {"training_steps": float(steps), "value": float(value)}
-                    yield {"metric": metric, "arm": arm, "what": what, **point}
 
 
 def _logs(experiment: ExperimentConfig, condition: str) -> Iterator[tuple[str, StepLog]]:
@@ -174,28 +135,6 @@ def _places(experiment: ExperimentConfig, acting: dict[str, StepLog]) -> Iterato
             yield from place_pictures(filtered.name, acting[filtered.name], bare.name, off.get(bare.name))
 
 
-def _scenes(experiment: ExperimentConfig) -> list[Picture]:
-    """The shown episode seen from above, for tasks that publish where things are."""
-    shown = shown_episode(experiment)
-    pair = next(iter(compared_pairs(experiment)), None)
-    wanted = [(experiment.arms[0], "filter_off")]
-    if pair is not None:
-        wanted = [(pair.bare, "filter_off"), (pair.filtered, "filter_on")]
-    scenes = []
-    for arm, condition in wanted if shown is not None else ():
-        assert shown is not None
-        folder = experiment.run_folder(arm, shown.seed)
-        places = read_json(evaluation_folder(folder) / f"{condition}_places.json").get(
-            str(shown.episode_seed)
-        )
-        log = evaluated_steps(folder, condition)
-        if places and log is not None and (log.episode_seed == shown.episode_seed).any():
-            color = color_of(arm.name, [each.name for each in experiment.arms])
-            title = f"{arm.name}, filter {CONDITIONS[condition]}, from above"
-            scenes.append(Scene(title, color, log, log.episode_seed == shown.episode_seed, places))
-    return scene_pictures(scenes)
-
-
 def about(experiment: ExperimentConfig) -> str:
     """What was trained on what, for how long, and how it was judged."""
     kinds = ", ".join(dict.fromkeys(f"{arm.algorithm} on {arm.env.id}" for arm in experiment.arms))
@@ -207,16 +146,7 @@ def about(experiment: ExperimentConfig) -> str:
     )
     how_long = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
     seeds = len(experiment.seeds)
-    begun = ""
-    for arm in experiment.arms:
-        path = experiment.run_folder(arm, experiment.seeds[0]) / START_FILE
-        start = read_json(path)
-        if start:
-            begun += (
-                f" Arm {arm.name} began with the policy of {start['from']} after {start['timesteps']:,} steps, which"
-                " do not count as its own."
-            )
     return (
         f"{kinds}, {how_long} steps, {seeds} seed{'s' * (seeds > 1)}; evaluation on"
-        f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed.{begun}"
+        f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed."
     )

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from datetime import timedelta
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from rich.markup import escape
 from rich.table import Table
@@ -12,7 +11,6 @@ from rich.table import Table
 from ..config import ArmConfig, ExperimentConfig
 from ..evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
 from ..evaluation.summary import CONDITIONS, Estimate, Summary, judged_by, number, over_seeds
-from ..run.folder import finished_facts
 
 SHORT: Final = {
     "return": "Return / episode",
@@ -23,11 +21,6 @@ SHORT: Final = {
     "fallback": "Fallback",
 }
 """The short table's numbers and their headings."""
-RUN_COLUMNS: Final = {
-    "steps": "Steps", "episodes": "Episodes", **{name: SHORT[name] for name in list(SHORT)[:5]},
-    "elapsed_s": "Training time", "steps_per_s": "Steps/s", "filter_time_us": "Filter call in µs",
-}  # fmt: skip
-"""The numbers of the runs' table and their headings; the last three are what a finished run says of itself."""
 
 
 class Cell(NamedTuple):
@@ -81,29 +74,6 @@ def short_rows(summary: Summary, arm: ArmConfig) -> Iterator[tuple[str, list[Cel
             share = Cell(f"{100 * cell['intervention_rate'].iqm:.3g} %")
             changed = [share, Cell(f"{total['infeasible']:,}"), Cell(f"{total['fallback']:,}")]
         yield title, [_estimate(cell, "return"), _estimate(cell, "cost"), violations, *changed]
-
-
-def run_rows(experiment: ExperimentConfig, summary: Summary) -> Iterator[tuple[str, list[Cell]]]:
-    """What each run's training came to in all, and how long it took."""
-    trained = {(row["arm"], row["seed"]): row for row in summary.per_seed if row["condition"] == "training"}
-    for arm in experiment.arms:
-        for seed in experiment.seeds:
-            facts = finished_facts(experiment.run_folder(arm, seed))
-            row = trained.get((arm.name, seed), {}) | {
-                name: facts.get(name) for name in list(RUN_COLUMNS)[-3:]
-            }
-            yield f"{arm.name}, seed {seed}", [_of_run(row, name) for name in RUN_COLUMNS]
-
-
-def _of_run(row: Mapping[str, Any], name: str) -> Cell:
-    value = row.get(name)
-    if value is None:
-        return Cell(NOT_JUDGED if "episodes" in row and name in OF_THE_JUDGE else "-")
-    if name == "elapsed_s":
-        return Cell(str(timedelta(seconds=round(value))))
-    if name == "intervention_rate":
-        return Cell(f"{100 * value:.3g} %")
-    return Cell(number(value), mood=("bad" if value else "good") if name == "violations" else "")
 
 
 def _estimate(cell: Mapping[str, Estimate], metric: str) -> Cell:

@@ -41,13 +41,39 @@ class EpisodeRows(BaseCallback):
         return True
 
 
-class ProgressCallback(BaseCallback):
-    """Reports the step count, at most twice a second."""
+class CheckpointCallback(BaseCallback):
+    """Saves between two rollouts, when the buffer is empty and the last update is done: now and then, and to stop.
 
-    def __init__(self, progress: Progress) -> None:
+    Reports the step count, at most twice a second.
+
+    SB3's own callback saves in the midst of a rollout, from where nothing goes on bit for bit.
+
+    Args:
+        every: Steps.
+        save: Saves.
+        progress: Where to report to, and whether the run is to end.
+
+    Raises:
+        RunStoppedError: Out of `learn`, when it is to end.
+    """
+
+    def __init__(self, every: int, save: Callable[[], object], progress: Progress) -> None:
         super().__init__()
+        self.every = every
+        self.save = save
         self.progress = progress
         self._next = 0.0
+
+    def _on_training_start(self) -> None:
+        self._last = self.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        stopping = self.progress.stopping()
+        if self.num_timesteps - self._last >= self.every or (stopping and self.num_timesteps > 0):
+            self._last = self.num_timesteps
+            self.save()
+        if stopping:
+            raise RunStoppedError(f"stopped; goes on from step {self.num_timesteps:,}")
 
     def _on_step(self) -> bool:
         if time.monotonic() >= self._next:
@@ -57,38 +83,3 @@ class ProgressCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.progress.steps(self.num_timesteps)
-
-
-class CheckpointCallback(BaseCallback):
-    """Saves between two rollouts, when the buffer is empty and the last update is done: now and then, and to stop.
-
-    SB3's own callback saves in the midst of a rollout, from where nothing goes on bit for bit.
-
-    Args:
-        every: Steps.
-        save: Saves.
-        stopping: Whether the run is to end.
-
-    Raises:
-        RunStoppedError: Out of `learn`, when it is to end.
-    """
-
-    def __init__(self, every: int, save: Callable[[], object], stopping: Callable[[], bool]) -> None:
-        super().__init__()
-        self.every = every
-        self.save = save
-        self.stopping = stopping
-
-    def _on_training_start(self) -> None:
-        self._last = self.num_timesteps
-
-    def _on_rollout_start(self) -> None:
-        stopping = self.stopping()
-        if self.num_timesteps - self._last >= self.every or (stopping and self.num_timesteps > 0):
-            self._last = self.num_timesteps
-            self.save()
-        if stopping:
-            raise RunStoppedError(f"stopped; goes on from step {self.num_timesteps:,}")
-
-    def _on_step(self) -> bool:
-        return True

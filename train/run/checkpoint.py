@@ -5,21 +5,19 @@ from __future__ import annotations
 import json
 import random
 import shutil
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
-from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
 
-from ..config.algorithms import ALGORITHMS
+from ..config.algorithms import algorithm_class
 from ..files import read_json, write_json
 from .data_pickles import pickles_of_model, read_pickle
 
@@ -34,7 +32,7 @@ _NO_BUFFER: Final[dict[str, Any]] = {
     "replay_buffer_kwargs": {},
     "optimize_memory_usage": False,
 }
-"""A policy that only acts needs no replay buffer; SB3 would make one of full size, and HER's needs an env."""
+"""A policy that only acts needs no replay buffer; SB3 would make one of full size."""
 
 
 class Checkpoint(NamedTuple):
@@ -77,12 +75,6 @@ def resume(folder: Path, algorithm: str, env: VecEnv, device: str, buffer_size: 
         buffer = read_pickle(replay)
         buffer.device = model.device
         model.buffer_size = buffer.buffer_size * buffer.n_envs
-        if isinstance(buffer, HerReplayBuffer):
-            buffer.set_env(env)
-            with warnings.catch_warnings():
-                # HER ends the episodes that were cut: a continued run starts new ones, as it should.
-                warnings.filterwarnings("ignore", "The last trajectory in the replay buffer")
-                buffer.truncate_last_trajectory()
         model.replay_buffer = buffer
     states = json.loads((folder / _RANDOM).read_text())
     version, internal, gauss = states["python"]
@@ -98,7 +90,7 @@ def _load(
     path = folder / MODEL
     try:
         known = pickles_of_model(path) | changed
-        model: BaseAlgorithm = ALGORITHMS[algorithm].load(path, env, device, custom_objects=known)
+        model: BaseAlgorithm = algorithm_class(algorithm).load(path, env, device, custom_objects=known)
     except (OSError, ValueError, KeyError) as error:
         raise RunStateError(
             f"{str(path)!r} cannot be read ({error}). Delete {str(folder)!r}: a run goes on from the checkpoint"

@@ -26,7 +26,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecNormalize
-from stable_baselines3.her import GoalSelectionStrategy
 
 from safe_wrappers.errors import RunStateError
 
@@ -38,7 +37,7 @@ _KINDS: Final = (
     *(OrderedDict, deque, np.ndarray, np.dtype, np.generic, np.random.BitGenerator, np.random.SeedSequence),
     *(torch.device, torch.optim.Optimizer, spaces.Space, BaseBuffer, ActionNoise, BasePolicy, RunningMeanStd),
     *(utils.ConstantSchedule, utils.FloatSchedule, utils.LinearSchedule, TrainFreq, TrainFrequencyUnit),
-    *(VecNormalize, GoalSelectionStrategy),
+    VecNormalize,
 )
 """Classes that are data, and their subclasses."""
 _OTHERS: Final = {

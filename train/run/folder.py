@@ -15,8 +15,6 @@ from ..files import read_json, write_json
 
 RUN_FILE: Final = "run.json"
 FINISHED_FILE: Final = "finished.json"
-START_FILE: Final = "start.json"
-"""Whose policy the run began with."""
 CHECKPOINTS: Final = "checkpoints"
 EVALUATION: Final = "evaluation"
 POLICY: Final = "policy"
@@ -97,8 +95,7 @@ def claim_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
     """Marks a folder that `check_folder` let through as this run's, or as one whose total was raised."""
     if not _is_begun(folder):  # of another config, which came to nothing
         shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)
-        for name in (EPISODES, START_FILE):
-            (folder / name).unlink(missing_ok=True)
+        (folder / EPISODES).unlink(missing_ok=True)
     ours = {"arm": arm.name, "seed": seed, "config": arm.fingerprint()}
     if not _is_begun(folder) or read_json(folder / RUN_FILE) != ours:
         write_json(folder / RUN_FILE, ours)

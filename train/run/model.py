@@ -8,7 +8,6 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
@@ -18,7 +17,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.sb3 import (
     ExecutedActionDictReplayBuffer,
-    ExecutedActionHerReplayBuffer,
     ExecutedActionReplayBuffer,
     LagrangianMultiplier,
     MarginCurriculum,
@@ -26,15 +24,12 @@ from safe_wrappers.sb3 import (
 
 from ..config import ArmConfig
 from ..config.algorithms import (
-    ALGORITHMS,
     DISCRETE,
-    HER,
     LINEAR,
-    MASKED,
     OFF_POLICY,
     ON_POLICY,
-    RECURRENT,
     SCHEDULED,
+    algorithm_class,
     default_of,
 )
 
@@ -51,7 +46,7 @@ def new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
             gamma=arm.hyperparameters.get("gamma", 0.99),
         )
     settings = _constructor_arguments(arm, envs)
-    model: BaseAlgorithm = ALGORITHMS[arm.algorithm](env=envs, seed=seed, device=arm.device, **settings)
+    model: BaseAlgorithm = algorithm_class(arm.algorithm)(env=envs, seed=seed, device=arm.device, **settings)
     return model
 
 
@@ -62,7 +57,7 @@ def buffer_size(arm: ArmConfig) -> int:
 
 def _constructor_arguments(arm: ArmConfig, envs: VecEnv) -> dict[str, Any]:
     has_dict = isinstance(envs.observation_space, spaces.Dict)
-    policy = f"{'MultiInput' if has_dict else 'Mlp'}{'Lstm' if arm.algorithm in RECURRENT else ''}Policy"
+    policy = "MultiInputPolicy" if has_dict else "MlpPolicy"
     # A copy: SB3 writes into policy_kwargs, and a run folder is known again by its settings.
     settings = {"policy": policy, **deepcopy(arm.hyperparameters)}
     for key in SCHEDULED:
@@ -79,15 +74,9 @@ def _constructor_arguments(arm: ArmConfig, envs: VecEnv) -> dict[str, Any]:
         settings["action_noise"] = None
     if arm.algorithm not in ON_POLICY:
         settings["buffer_size"] = buffer_size(arm)
-    mode = {"mode": arm.learner.kind}
-    if arm.replays_goals:
-        own = arm.learner.stores_executed or arm.learner.penalised
-        settings["replay_buffer_class"] = ExecutedActionHerReplayBuffer if own else HerReplayBuffer
-        given = settings.get("replay_buffer_kwargs") or {}
-        settings["replay_buffer_kwargs"] = given | (mode if own else {})
-    elif arm.learner.stores_executed:
+    if arm.learner.stores_executed:
         kind_of = ExecutedActionDictReplayBuffer if has_dict else ExecutedActionReplayBuffer
-        settings |= {"replay_buffer_class": kind_of, "replay_buffer_kwargs": mode}
+        settings |= {"replay_buffer_class": kind_of, "replay_buffer_kwargs": {"mode": arm.learner.kind}}
     return settings
 
 
@@ -119,23 +108,17 @@ def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
     """Refuses an arm whose algorithm or margin does not fit this task, which only the task itself can tell.
 
     Raises:
-        ConfigurationError: Actions of the wrong kind; a filter without a margin; or, for HER, no goals, or training
-            before an episode ends.
+        ConfigurationError: Actions of the wrong kind, or a filter without a margin.
     """
-    where, space = f"arms.{arm.name}", env.observation_space
+    where = f"arms.{arm.name}"
     kinds: tuple[type, ...] = (spaces.Box,) if arm.algorithm in OFF_POLICY else ()
-    if arm.algorithm in (*DISCRETE, *MASKED):
-        kinds = (spaces.Discrete, spaces.MultiDiscrete) if arm.algorithm in MASKED else (spaces.Discrete,)
+    if arm.algorithm in DISCRETE:
+        kinds = (spaces.Discrete,)
     if kinds and not isinstance(env.action_space, kinds):
         others = OFF_POLICY if isinstance(env.action_space, spaces.Box) else DISCRETE
         raise ConfigurationError(
             f"{where}: {arm.algorithm} needs actions of a {' or '.join(kind.__name__ for kind in kinds)}, and"
-            f" {arm.env.id} has {env.action_space}. Other algorithms: {', '.join((*ON_POLICY[:-1], *others))}."
-        )
-    if arm.algorithm in MASKED and not env.has_wrapper_attr("action_masks"):
-        raise ConfigurationError(
-            f"{where}: {arm.algorithm} asks the env which actions are allowed, and neither {arm.env.id} nor the arm's"
-            " filter has action_masks. Give the arm a filter (an ActionShield has them), or use PPO."
+            f" {arm.env.id} has {env.action_space}. Other algorithms: {', '.join((*ON_POLICY, *others))}."
         )
     if (margin := arm.learner.margin_curriculum) is not None:
         if not env.has_wrapper_attr("set_margin"):
@@ -144,18 +127,3 @@ def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
             env.get_wrapper_attr("set_margin")(max(margin.start, margin.end))
         except ConfigurationError as error:
             raise ConfigurationError(f"{where}.learner.margin_curriculum: {error}") from None
-    if not arm.replays_goals:
-        return
-    goals = {"observation", "achieved_goal", "desired_goal"}
-    has_goals = isinstance(space, spaces.Dict) and goals <= set(space)
-    if not (has_goals and env.has_wrapper_attr("compute_reward")):
-        raise ConfigurationError(
-            f"{where}: {HER} needs observations that are a Dict with {', '.join(sorted(goals))}, and a task that has"
-            f" compute_reward; {arm.env.id} has {space}. Leave hyperparameters.replay_buffer_class out."
-        )
-    steps = env.spec.max_episode_steps if env.spec is not None else None
-    if steps is not None and learning_starts(arm) < steps * arm.n_envs:
-        raise ConfigurationError(
-            f"{where}: {HER} draws from episodes that have ended. With {arm.n_envs} envs of {steps} steps an episode"
-            f" hyperparameters.learning_starts has to be at least {steps * arm.n_envs}; it is {learning_starts(arm)}."
-        )

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import gymnasium as gym
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -17,7 +16,6 @@ from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
 from ..config import ArmConfig, FilterConfig
-from ..config.algorithms import MASKED
 from ..files import write_json
 from .checkpoint import load_model, load_normalize, save_policy
 from .folder import POLICY
@@ -71,17 +69,9 @@ class TrainedPolicy:
         used = {"trained": self.arm.filter, "none": FilterConfig(), "protect": FilterConfig(protect={})}
         return make_stack(self.arm.env, used[action_filter], self.arm.learner.in_evaluation, render_mode)
 
-    def begin(self, env: gym.Env[Any, Any] | None = None) -> None:
-        """Start an episode: its first action is the policy's, and a policy's memory is empty.
-
-        Args:
-            env: Asked for action masks by MaskablePPO's policies; without one, all actions are free.
-        """
+    def begin(self) -> None:
+        """Start an episode: its first action is the policy's."""
         self._held, self._left = None, 0
-        self._memory: Any = None
-        self._masks = None
-        if env is not None and self.arm.algorithm in MASKED and env.has_wrapper_attr("action_masks"):
-            self._masks = env.get_wrapper_attr("action_masks")
 
     def __call__(self, observation: Any) -> Any:
         """The action of a control step, for an observation as the env gives it."""
@@ -93,15 +83,7 @@ class TrainedPolicy:
     def _decide(self, observation: Any) -> Any:
         if self._normalize is not None:
             observation = self._normalize.normalize_obs(observation)
-        masks = {} if self._masks is None else {"action_masks": self._masks()}
-        action, self._memory = self.model.predict(
-            observation,
-            state=self._memory,
-            episode_start=np.array([self._memory is None]),
-            deterministic=self.deterministic,
-            **masks,
-        )
-        return action
+        return self.model.predict(observation, deterministic=self.deterministic)[0]
 
 
 def write_policy(arm: ArmConfig, seed: int, run: Path, model: BaseAlgorithm) -> Path:

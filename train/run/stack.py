@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import functools
-import importlib
-import signal
+import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any, Final, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -31,39 +30,14 @@ _TOLERANCE: Final = 1e-6
 
 
 def make_vec_env(arm: ArmConfig) -> VecEnv:
-    """Makes `arm.n_envs` envs, as `arm.vec_env` says."""
-    if arm.vec_env == "dummy":
-        return DummyVecEnv([functools.partial(make_training_env, arm)] * arm.n_envs)
-    return SubprocVecEnv([functools.partial(_in_process, arm)] * arm.n_envs, "spawn")
+    """Makes `arm.n_envs` envs, one after the other in this process."""
+    return DummyVecEnv([functools.partial(make_training_env, arm)] * arm.n_envs)
 
 
 def make_training_env(arm: ArmConfig) -> gym.Env[Any, Any]:
     """One env as the arm trains in it."""
     env = make_stack(arm.env, arm.filter, arm.learner)
-    if arm.env.reset_options:
-        env = ResetOptions(env, arm.env.reset_options)
     return env if arm.action_repeat == 1 else sw.ActionRepeat(env, arm.action_repeat)
-
-
-class ResetOptions(gym.Wrapper[Any, Any, Any, Any]):
-    """Gives options to every reset; a reset's own come on top."""
-
-    def __init__(self, env: gym.Env[Any, Any], options: Mapping[str, Any]) -> None:
-        super().__init__(env)
-        self._options = options
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Resets the env."""
-        return self.env.reset(seed=seed, options={**self._options, **(options or {})})
-
-
-def _in_process(arm: ArmConfig) -> gym.Env[Any, Any]:
-    # Signals to the whole command (Ctrl-C, `timeout`) are for the run, which decides what becomes of its envs.
-    for which in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(which, signal.SIG_IGN)
-    return make_training_env(arm)
 
 
 def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
@@ -122,10 +96,11 @@ def make_stack(
     if observed is not None:
         task = _with_features(task, observed)
     if action_filter.escape is not None:
-        task = sw.StuckEscape(task, **action_filter.escape)
+        task = _called("filter.escape", sw.StuckEscape, task, action_filter.escape)
     recorded: gym.Env[Any, Any] = sw.RecordInterventions(task)
     for name, arguments in env.faults.items():
-        recorded = _called(f"env.faults.{name}", FAULTS[name], recorded, arguments)
+        fault = FAULTS[check_name(name, FAULTS, "env.faults")]
+        recorded = _called(f"env.faults.{name}", fault, recorded, arguments)
     monitored = Monitor(recorded)
     return sw.AdaptionPenalty(monitored, **learner.penalties) if learner.penalised else monitored
 
@@ -142,7 +117,8 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
     """The task in its filter; as it is if there is none."""
     if action_filter.protect is not None:
         try:
-            return sw.protect(task, **action_filter.protect)
+            protected: gym.Env[Any, Any] = _called("filter.protect", sw.protect, task, action_filter.protect)
+            return protected
         except UnsupportedEnvError as error:
             raise ConfigurationError(
                 f"filter: {error}\nPut these lines into a function of the env, in a module beside the config; then"
@@ -185,17 +161,13 @@ def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> gym.Env[An
 
 def _factory(name: str) -> Any:
     """What a config calls `module:function`."""
-    module_name, _, function = name.partition(":")
     try:
-        module = importlib.import_module(module_name)
-    except ImportError as error:
+        return pkgutil.resolve_name(name)
+    except (ImportError, AttributeError) as error:
         raise ConfigurationError(
-            f"filter.factory: cannot import {module_name!r}: {error}. Modules beside the config and in the working"
-            " folder are found, too."
+            f"filter.factory: cannot import {name!r}: {error}. Modules beside the config and in the working folder"
+            " are found, too."
         ) from None
-    valid = [name for name in dir(module) if not name.startswith("_")]
-    check_name(function, valid, f"filter.factory: {module_name}")
-    return getattr(module, function)
 
 
 class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import shutil
 import time
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +12,22 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecEnv
 
-from safe_wrappers.errors import ConfigurationError, RunStateError
+from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
 
 from ..config import ArmConfig
 from ..files import only_writer, write_json
 from ..processes import Progress
-from .callbacks import CheckpointCallback, EpisodeRows, ProgressCallback
-from .checkpoint import MODEL, NORMALIZE, Checkpoint, latest_checkpoint, resume, save_checkpoint
-from .data_pickles import pickles_of_model, read_pickle
+from .callbacks import CheckpointCallback, EpisodeRows
+from .checkpoint import Checkpoint, latest_checkpoint, resume, save_checkpoint
 from .folder import (
     CHECKPOINTS,
     EPISODES,
     EVALUATION,
     FINISHED_FILE,
     POLICY,
-    START_FILE,
     check_finished,
     check_folder,
     claim_folder,
@@ -43,9 +39,7 @@ from .stack import make_vec_env
 from .trackers import run_logger
 
 
-def train_run(
-    arm: ArmConfig, seed: int, folder: Path, progress: Progress, start: tuple[str, Path] | None = None
-) -> None:
+def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> None:
     """Trains one arm with one seed, or goes on where the folder's last checkpoint stands.
 
     A finished run is left as it is, unless the arm's `total_steps` were raised: then it goes on, and its evaluation,
@@ -59,10 +53,8 @@ def train_run(
         seed: For the networks, the exploration and the envs.
         folder: The run's own folder.
         progress: Where to report to, and whether to stop.
-        start: Whose policy a new run begins with, by name, and its SB3 file or the run's folder; None: a random one.
 
     Raises:
-        ConfigurationError: The policy to begin with does not fit.
         RunStateError: The folder belongs to another config, another process is at work in it, or its last checkpoint
             cannot be read.
         RunStoppedError: It was to stop, and has saved a checkpoint; says from which step the run will go on.
@@ -75,7 +67,7 @@ def train_run(
             return
         checkpoint = latest_checkpoint(folder / CHECKPOINTS)
         with contextlib.closing(make_vec_env(arm)) as envs:
-            _train(arm, seed, folder, envs, checkpoint, progress, start)
+            _train(arm, seed, folder, envs, checkpoint, progress)
 
 
 def _train(
@@ -85,18 +77,9 @@ def _train(
     envs: VecEnv,
     checkpoint: Checkpoint | None,
     progress: Progress,
-    start: tuple[str, Path] | None,
 ) -> None:
-    begun = None
-    if checkpoint is None:
-        model = new_model(arm, seed, envs)
-        if start is not None:
-            begun = _begin_with(model, f"arms.{arm.name}", *start)
-    else:
-        model = _continued(arm, envs, checkpoint, progress)
+    model = new_model(arm, seed, envs) if checkpoint is None else _continued(arm, envs, checkpoint, progress)
     claim_folder(arm, seed, folder)
-    if begun is not None:
-        write_json(folder / START_FILE, begun)
     for outdated in (EVALUATION, POLICY):
         shutil.rmtree(folder / outdated, ignore_errors=True)
     (folder / FINISHED_FILE).unlink(missing_ok=True)
@@ -138,10 +121,9 @@ def _learn(
         return facts
 
     callbacks = [
-        CheckpointCallback(arm.checkpoint_every, save, progress.stopping),
+        CheckpointCallback(arm.checkpoint_every, save, progress),
         InterventionCallback(),
         EpisodeRows(folder / EPISODES),
-        ProgressCallback(progress),
         *learner_callbacks(arm),
     ]
     try:
@@ -183,52 +165,3 @@ def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
             f"{str(folder / CHECKPOINTS)!r} is empty; delete {str(folder)!r} and train again."
         )
     return checkpoint
-
-
-def _begin_with(model: BaseAlgorithm, where: str, name: str, path: Path) -> dict[str, Any]:
-    """Puts a saved policy, and the running statistics beside it, into a new model; its optimizer begins anew.
-
-    Args:
-        model: The arm's, before its first step.
-        where: The arm's key in the config.
-        name: Whose policy it is.
-        path: A model that SB3 has saved, or the folder of a finished run; running statistics are looked for in
-            `vecnormalize.pkl` beside the model.
-
-    Returns:
-        What happened, for the run's folder.
-
-    Raises:
-        ConfigurationError: There is no such model; or it does not fit: other spaces, weights or scaling.
-        RunStateError: A pickle in it names what is no data.
-    """
-    refusal = f"{where}: the policy of {name}"
-    if path.is_dir() and (checkpoint := latest_checkpoint(path / CHECKPOINTS)) is not None:
-        path = checkpoint.folder / MODEL
-    try:
-        data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=pickles_of_model(path))
-        assert data is not None
-    except (OSError, ValueError, AssertionError, KeyError) as error:
-        raise ConfigurationError(f"{refusal}: {str(path)!r} is no model of SB3 ({error})") from None
-    for what in ("observation_space", "action_space"):
-        if data[what] != getattr(model, what):
-            raise ConfigurationError(
-                f"{refusal} is for another {what}: {data[what]}; the arm has {getattr(model, what)}"
-            )
-    scaling, beside = model.get_vec_normalize_env(), path.parent / NORMALIZE
-    # Not by attribute: an unpickled one has no envs yet, which it would ask for what it does not have.
-    known = vars(read_pickle(beside)) if beside.exists() else {}
-    if ("obs_rms" in known) != ("obs_rms" in ({} if scaling is None else vars(scaling))):
-        raise ConfigurationError(
-            f"{refusal} has learned from observations of another scaling (normalize.observation; of a file in"
-            f" {NORMALIZE} beside it)"
-        )
-    weights: Any = parameters["policy"]
-    try:
-        model.policy.load_state_dict(weights)
-    except RuntimeError as error:  # torch names the weights that differ
-        raise ConfigurationError(f"{refusal} has other weights (policy, policy_kwargs): {error}") from None
-    if scaling is not None:
-        statistics = {key: known[key] for key in ("obs_rms", "ret_rms") if key in known}
-        vars(scaling).update(deepcopy(statistics))
-    return {"from": name, "timesteps": int(data["num_timesteps"])}

@@ -1,1 +1,0 @@
-"""The same episode on film, in every arm and condition."""
