@@ -56,7 +56,7 @@ def _car_goal(env: Env, detour: bool = True) -> Recommended:
         CoastingClearance(
             keep_out=[Discs("hazard_positions", radius=0.2)],
             untouched=[Discs("vase_positions", radius=VASE_HULL_RADIUS_M)] if vases else [],
-            outline=[[side * x, y] for x, y in CAR.corners for side in (1.0, -1.0)],
+            outline=[[side * x, y] for x, y in CAR.hull_corners for side in (1.0, -1.0)],
             robot_model_attr="robot_model",
             # Measured for full torque for one control step and then rest, 0.03 m from rest and 0.09 m from full
             # speed, and half as much again.
