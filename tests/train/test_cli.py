@@ -130,20 +130,6 @@ for arguments in (["--help"], ["--version"], ["trian"], ["train"], ["train", "a.
     assert "There is no config file 'a.yaml'" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["train", "a.yaml", "--report"], "unrecognized arguments: --report"),
-        (["train", "a.yaml", "--no"], "unrecognized arguments: --no"),
-        (["train", "n_envs=1"], "the following arguments are required: CONFIG.yaml"),
-    ],
-)
-def test_options_of_another_command_are_refused(words, message, capsys):
-    with pytest.raises(SystemExit) as end:
-        main(words)
-    assert end.value.code == 2 and message in capsys.readouterr().err
-
-
 def test_a_factory_is_found_beside_the_config(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "project"
     folder.mkdir()

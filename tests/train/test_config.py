@@ -82,12 +82,10 @@ def test_arms_override_the_common_settings():
         ({"totalsteps": 3}, "config: unknown name 'totalsteps'. Did you mean 'total_steps'?"),
         ({"algorithm": "PP0"}, "algorithm: unknown name 'PP0'. Did you mean 'PPO'?"),
         ({"env": "InvertedPendulums-v5"}, "Did you mean 'InvertedPendulum-v5'?"),
-        ({"env": {"id": "Pendulum-v1", "kwarg": {}}}, "env: unknown name 'kwarg'. Did you mean 'kwargs'?"),
         (
             {"hyperparameters": {"nsteps": 3}},
             "hyperparameters of PPO: unknown name 'nsteps'. Did you mean 'n_steps'?",
         ),
-        ({"arms": {"a": {"filters": "none"}}}, "arms.a: unknown name 'filters'. Did you mean 'filter'?"),
         (
             {"arms": {"a": {"filter": "protected"}}},
             "a.filter: unknown name 'protected'. Did you mean 'protect'?",
@@ -106,8 +104,6 @@ def test_unknown_names_are_refused_with_the_nearest(settings, message):
         ({"device": "gpu"}, "device: input should be 'cpu', 'cuda' or 'auto', got 'gpu'."),
         ({"total_steps": 0}, "total_steps: input should be greater than or equal to 1, got 0."),
         ({"total_steps": "many"}, "total_steps: input should be a valid integer, got 'many'."),
-        ({"total_steps": True}, "total_steps: input should be a valid integer, got True."),
-        ({"n_envs": 1.5}, "n_envs: input should be a valid integer, got 1.5."),
         ({"seeds": []}, "seeds: list should have at least 1 item"),
         ({"seeds": [1, 1]}, "seeds: each may be given once, got [1, 1]."),
         ({"arms": {}}, "arms: expected at least one"),
@@ -115,10 +111,6 @@ def test_unknown_names_are_refused_with_the_nearest(settings, message):
         (
             {"arms": {"a": {"filter": False}}},
             "arms.a.filter: expected a mapping of protect, factory, kwargs, lease, escape; got False.",
-        ),
-        (
-            {"arms": {"a": {"filter": {"factory": "no_colon"}}}},
-            "factory: expected 'module:function', got 'no_colon'.",
         ),
         (
             {"arms": {"a": {"filter": {"kwargs": {"x": 1}}}}},
@@ -142,12 +134,6 @@ def test_a_key_without_a_value_has_its_default():
     assert (arm.n_envs, arm.normalize.reward, arm.filter.kind) == (1, False, "none")
     (arm,) = changed(arms={"a": {"filter": {"protect": None}}}).arms
     assert (arm.filter.kind, arm.filter.protect) == ("protect", {})
-
-
-@pytest.mark.parametrize("key", sorted(MINIMAL))
-def test_missing_settings_are_named(key):
-    with pytest.raises(ConfigurationError, match=f"config: '{key}' is missing"):
-        parse_experiment({k: v for k, v in MINIMAL.items() if k != key})
 
 
 def test_yaml_numbers_as_people_write_them(tmp_path):

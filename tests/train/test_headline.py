@@ -136,8 +136,3 @@ def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_ex
         " The filter changed 50 % of the evaluation steps. Of 800 steps with it 0 steps were infeasible and 0 ran the"
         " fallback."
     )
-
-
-def test_without_any_filter_there_is_nothing_to_compare(fake_experiment):
-    experiment = fake_experiment("arms={one: {filter: none}, two: {filter: none}}")
-    assert told(experiment, off={"violations": 5}, on={}) == "There is no filter to compare with yet."

@@ -108,16 +108,6 @@ def test_summary_of_rows(fake_experiment):
     }
 
 
-def test_spin_outs_are_a_total_and_a_rate_over_all_steps(fake_experiment):
-    experiment = fake_experiment()
-    write_training(experiment, 0, 0, [episode(spin_outs=3, length=40), episode(spin_outs=0, length=10)])
-    write_training(experiment, 1, 0, [episode(spin_outs="", length=40)])  # a task without wheels
-    table = summarize(experiment).table
-    assert table["unfiltered"]["training"]["spin_outs"].iqm == 3.0
-    assert table["unfiltered"]["training"]["spin_outs_per_million"].iqm == 1e6 * 3 / 50
-    assert not {"spin_outs", "spin_outs_per_million"} & table["filtered"]["training"].keys()
-
-
 def test_learning_curve(fake_experiment):
     experiment = fake_experiment()
     for seed in (0, 1):
