@@ -44,6 +44,13 @@ def whole_number(name: str, value: Any, least: int, of: str = "") -> int:
     return int(value)
 
 
+def true_or_false(name: str, value: Any) -> bool:
+    """A bool, NumPy's too, or an error that names the parameter."""
+    if not isinstance(value, bool | np.bool_):
+        raise ConfigurationError(f"{name} is True or False, got {value!r}")
+    return bool(value)
+
+
 def name_list(name: str, given: Any, of: str = "names", also: str = "", least: int = 1) -> list[str]:
     """A list of at least `least` names; `of` and `also` say in messages what they are and what else is allowed."""
     listed = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) and len(given) >= least

@@ -145,8 +145,6 @@ WHOLE_BODY_CONE_MARGIN: Final = _key("whole_body/cone_margin", "float64")
 share of the robot's weight; negative outside, 0 without contacts."""
 WHOLE_BODY_ZMP_MARGIN: Final = _key("whole_body/zmp_margin", "float64", unit="m")
 """Least distance of the zero moment point from the edge of the support polygon in that forecast; 0 without one."""
-WHOLE_BODY_SUPPORTED: Final = _key("whole_body/supported", "float64")
-"""Share of the forecast's instants with a support polygon: three contact points of one plane."""
 
 # Tasks, every step: the env's own truth, never the filter's plant ------------------------------------------
 COST: Final = _key("cost", "float64", chunk="sum", log="cost")
@@ -176,9 +174,6 @@ MAP_SCALE: Final = _key("map/scale", "float64", chunk="min", log="map_scale")
 unchanged; NaN: there was no admitted anchor, and the filter was given the policy's action."""
 
 # ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
-HANDOVER_SEAM_JUMP: Final = _key("handover/seam_jump", "float64", shape="(3,)", unit="action")
-"""The largest first, second and third difference of the executed commands whose newest command is in a blend or one
-of the three after it."""
 HANDOVER_PEAK_JERK: Final = _key("handover/peak_jerk", "float64", unit="action/s", log="peak_jerk")
 """The largest rate of change between neighbouring executed commands, of any component."""
 HANDOVER_BLEND_TIME: Final = _key("handover/blend_time", "float64", unit="s", log="blend_time")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import html
 import importlib
 import json
 from collections.abc import Collection, Iterator, Mapping
@@ -155,7 +154,7 @@ library_name: stable-baselines3
 tags: [{json.dumps(arm.env.id)}, reinforcement-learning, deep-reinforcement-learning, safe-wrappers]
 ---
 
-# {arm.algorithm} on {html.escape(_line(arm.env.id), quote=False)}
+# {arm.algorithm} on {_code(arm.env.id)}
 
 Arm {_code(arm.name)}, seed {seed}, trained for {config["timesteps"]:,} steps, filter `{arm.filter.kind}`, learner
 `{arm.learner.kind}`; with {_code(json.dumps(config["versions"]))}.
@@ -183,13 +182,10 @@ def _cell(row: Mapping[str, Any], key: str) -> str:
     return number(float(row[key])) if key in row else missing
 
 
-def _line(value: object) -> str:
-    return " ".join(str(value).split()).replace("`", "'")
-
-
 def _code(value: object) -> str:
     """In one line, as it is but for what would end the code."""
-    return f"`{_line(value)}`"
+    line = " ".join(str(value).split()).replace("`", "'")
+    return f"`{line}`"
 
 
 def upload(folder: Path, repo_id: str) -> list[str]:

@@ -143,7 +143,7 @@ class Space:
         if words[-2] == "total_steps":
             raise ConfigurationError(f"{place}: trials are compared at the same steps; leave it out.")
         ends = given.get("choices") or [given.get("low"), given.get("high")]
-        integers = all(isinstance(end, int) for end in ends)
+        integers = all(isinstance(value, int) for value in given.values())
         try:
             found: optuna.distributions.BaseDistribution
             if "choices" in given:  # as JSON, since a study keeps no lists and mappings
@@ -157,7 +157,7 @@ class Space:
                 self.trial("trial", {key: value})
         except ConfigurationError as error:
             raise type(error)(f"{place}: {error}") from None
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ZeroDivisionError) as error:
             raise ConfigurationError(
                 f"{place}: expected {{low: 0.1, high: 0.5}}, with log and step if wanted, or {{choices: [...]}}; got"
                 f" {dict(given)}: {error}"
@@ -212,13 +212,12 @@ def run_trial(experiment: ExperimentConfig, progress: Progress) -> None:
 
     Args:
         experiment: As `Space.trial` returns it.
-        progress: Where steps of all seeds together are reported to.
+        progress: Where training steps are reported to, from 0 for each seed.
     """
-    arm = experiment.arms[0]
-    for at, seed in enumerate(experiment.seeds):
-        folder, before = experiment.run_folder(arm, seed), at * whole_rollouts(arm)
-        train_run(arm, seed, folder, replace(progress, steps=lambda n, b=before: progress.steps(b + n)))
-        quiet = replace(progress, steps=lambda _: None)
+    arm, quiet = experiment.arms[0], replace(progress, steps=lambda _: None)
+    for seed in experiment.seeds:
+        folder = experiment.run_folder(arm, seed)
+        train_run(arm, seed, folder, progress)
         evaluate_run(arm, seed, folder, experiment.evaluation, experiment.evaluation_filter, quiet)
 
 
@@ -250,7 +249,7 @@ def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: st
             failed.add(name)
             continue
         write_text(experiment.folder / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
-        steps = len(experiment.seeds) * whole_rollouts(experiment.arms[0])
+        steps = whole_rollouts(experiment.arms[0])
         jobs.append(Job(name, steps, "steps", run_trial, (experiment,)))
     try:
         run_jobs(jobs, space.experiment.workers, console, "Trials", on=on)

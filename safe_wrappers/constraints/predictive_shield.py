@@ -51,7 +51,7 @@ class PredictiveShield(Constraint):
         sees: Whether `h`, `terminal` and `backup` take the "observation", as the env inside the filter returns it,
             the unwrapped "env", or a "view" (`safe_wrappers.plants.View`), which has both, and info.
         candidates: How many neighbours of a refused action are tried. With discrete actions all are.
-        value: Chooses among those that are admitted, such as `safe_wrappers.sb3.critic_value(model)`. None: the
+        value: Chooses among those that are admitted, such as the critic of a learner. None: the
             nearest is taken, and no more are tried.
         margin: Kept free, in the unit of h.
         max_decrease: The most that h can fall within the horizon, whatever is done, in its unit; from a state with

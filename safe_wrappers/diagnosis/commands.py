@@ -1,10 +1,7 @@
-"""Commands that spike at switches and seams; and energy that a late link makes."""
-
-from typing import Any
+"""Commands that spike at switches and seams."""
 
 import numpy as np
 
-from safe_wrappers import info as keys
 from safe_wrappers.checks import Array
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording, box
@@ -12,8 +9,6 @@ from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom,
 from safe_wrappers.errors import SafeWrappersError
 from safe_wrappers.plants import RigidModelCheck, rigid_model_check
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
-from safe_wrappers.wrappers.teleop import Link
-from safe_wrappers.wrappers.teleop_channel import TeleopChannel
 
 RATE = 0.05
 """Share of the range of commands by which the proposed handover lets them change in a control step."""
@@ -75,36 +70,6 @@ def treatment_of_steps(env: Env, recording: Recording) -> Treatment:
     )  # fmt: skip
 
 
-def measure_energy(env: Env, recording: Recording) -> Measured:
-    """The most energy that operator and machine together had got out of a `TeleopChannel` in an episode, J."""
-    created = recording.of_info(keys.TELEOP_CREATED_J)
-    if np.isnan(created).all():
-        raise NotMeasuredError("no TeleopChannel accounts for the energy at a port of this env")
-    figure = float(np.nanmax(created))
-    seconds = len(created) * recording.control_dt
-    return Measured(figure, [Evidence("energy made per second of the run", figure / seconds, "W")])
-
-
-def treatment_of_energy(env: Env, recording: Recording) -> Treatment:
-    """The same link with waves, where it is the outermost wrapper and has no ceiling."""
-    advice = "Passive is not harmless: waves bound neither force nor displacement; a RoundTripCeiling bounds the way."
-    ceiling = np.isfinite(recording.of_info(keys.TELEOP_CEILING_S)).any()
-    if not isinstance(env, TeleopChannel) or env.port is None or ceiling:
-        return Treatment(advice=f'Give the TeleopChannel coding="wave" and an impedance. {advice}')
-    waves: dict[str, Any] = {
-        name: given.delay_s if given == Link(given.delay_s) else given
-        for name, given in (("uplink", env.uplink), ("downlink", env.downlink))
-    }
-    # The damper of the coupling as impedance reflects least.
-    waves |= {"coding": "wave", "impedance": env.port.feedthrough or 1.0}
-
-    def wrap(outer: Any) -> Env:
-        return TeleopChannel(outer.env, **waves)
-
-    code = wrapped(TeleopChannel, **waves).code.replace("(env,", "(env.env,")
-    return Treatment(code, wrap, advice)
-
-
 STEPS = Symptom(
     "commands that spike at switches or chunk seams",
     0.2,
@@ -112,7 +77,4 @@ STEPS = Symptom(
     measure_steps,
     treatment_of_steps,
     True,
-)
-ENERGY = Symptom(
-    "energy made by a late link: contacts that chatter", 0.1, "J", measure_energy, treatment_of_energy, True
 )

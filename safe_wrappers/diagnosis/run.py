@@ -31,7 +31,6 @@ SYMPTOMS: Final[dict[str, Symptom]] = {
     "contact_forces": contacts.FORCES,
     "wheel_slip": wheel_slip.SYMPTOM,
     "balance": contacts.BALANCE,
-    "port_energy": commands.ENERGY,
 }
 """By name."""
 POLICY: Final = "policy"

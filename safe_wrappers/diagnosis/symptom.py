@@ -9,7 +9,6 @@ import mujoco
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording, physics
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.teleop import Link
 
 
 class NotMeasuredError(Exception):
@@ -59,13 +58,9 @@ class Treatment:
 
 def wrapped(wrapper: Callable[..., Env], advice: str = "", **arguments: Any) -> Treatment:
     """A wrapper of the package, or `protect`, with arguments whose `repr` is how they are typed."""
-    words = "".join(f", {name}={_typed(value)}" for name, value in arguments.items())
+    words = "".join(f", {name}={value!r}" for name, value in arguments.items())
     code = f"env = sw.{wrapper.__name__}(env{words})"
     return Treatment(code, lambda env: wrapper(env, **arguments), advice)
-
-
-def _typed(value: Any) -> str:
-    return f"sw.teleop.{value!r}" if isinstance(value, Link) else repr(value)
 
 
 def filtered(constraint: Callable[..., Any], **arguments: Any) -> Treatment:

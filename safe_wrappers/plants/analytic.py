@@ -141,23 +141,22 @@ class AnalyticPlant(Plant):
     @property
     def f(self) -> Array:
         if self._drift is None:
-            self._drift, expected = np.asarray(self._f(self.state), dtype=np.float64), self.state.shape
-            if self._drift.shape != expected:
-                found = self._drift.shape
-                raise ConfigurationError(f"f must return the shape of the state {expected}, got {found}")
+            self._drift = self._checked("f", self._f, self.state.shape)
         return self._drift
 
     @property
     def g(self) -> Array:
         if self._effect is None:
-            self._effect, expected = (
-                np.asarray(self._g(self.state), dtype=np.float64),
-                (self.state.size, self.lower.size),
-            )
-            found = self._effect.shape
-            if found != expected:
-                raise ConfigurationError(f"g must return shape (states, controls) = {expected}, got {found}")
+            self._effect = self._checked("g", self._g, (self.state.size, self.lower.size))
         return self._effect
+
+    def _checked(self, name: str, function: Callable[[Array], ArrayLike], shape: tuple[int, ...]) -> Array:
+        found = np.asarray(function(self.state), dtype=np.float64)
+        if found.shape != shape:
+            raise ConfigurationError(
+                f"{name} must return shape {shape}, of states and controls, got {found.shape}"
+            )
+        return found
 
     def attribute(self, name: str) -> Any:
         return read_attribute(self._env, name)

@@ -12,7 +12,6 @@ from safe_wrappers.sb3.callbacks import (
     LagrangianMultiplier,
     MarginCurriculum,
 )
-from safe_wrappers.sb3.critic_value import critic_value
 from safe_wrappers.sb3.gymnasium_vec_env import GymnasiumVecEnv
 from safe_wrappers.sb3.replay_buffers import (
     ExecutedActionDictReplayBuffer,
@@ -29,5 +28,4 @@ __all__ = [
     "InterventionEvalCallback",
     "LagrangianMultiplier",
     "MarginCurriculum",
-    "critic_value",
 ]

@@ -69,7 +69,7 @@ class Admission:
             return bool(admits(end, position, velocity, duration_s, v_max, a_max, jerk, acceleration).all())
         here = 0.0 if acceleration is None else acceleration
         least_s = jerk_limited_time((position, velocity, here), (end, 0.0, 0.0), self._limits)
-        return bool(least_s <= duration_s)
+        return least_s <= duration_s
 
     def _state(self) -> tuple[ArrayLike, ArrayLike, ArrayLike | None]:
         if self._measured is None:

@@ -10,7 +10,7 @@ import numpy as np
 from safe_wrappers import info as keys
 from safe_wrappers.checks import OF_NUMBERS, Array, numbers_of, settings_from, shown
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
+from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
@@ -77,8 +77,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             the energy that a step of torque leaves in the springs, and smoothsteps that the next seam comes before
             the end of fade out beside the next one.
 
-    Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
-    ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``.
+    Info, at every step (see `safe_wrappers.info`): ``handover/peak_jerk``, ``handover/blend_time``,
+    ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``.
     The inner layers' info is merged over the control steps.
 
     Raises:
@@ -97,7 +97,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     layer: ClassVar = Layer.HANDOVER
 
-    _executed: Array
+    _executed: list[Array]
 
     def __init__(
         self,
@@ -187,8 +187,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             observation, reward, terminated, truncated, info = self.env.step(command.control)
             executed = np.array(info.get(keys.EXECUTED_ACTION, command.control), dtype=np.float64)
             self._fallback.executed(executed)
-            self._executed = np.concatenate([self._executed, executed[None]])
-            self._in_seam.append(self._seams_at(now, command))
+            self._executed.append(executed)
             total = total + reward_numbers(reward)
             infos.append(dict(info))  # the env may use the same one again
             commands.append(command)
@@ -257,15 +256,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     def _start(self) -> None:
         self._observed_s = 0.0
-        self._executed = np.zeros((0, self._controls))
-        self._in_seam: list[bool] = []
-        self._seam_until = -1
-
-    def _seams_at(self, now: int, command: Command) -> bool:
-        """Whether this control step's differences are a seam's: from its first command to three after its blend."""
-        if command.seam:
-            self._seam_until = now + command.blend_steps + DIFFERENCES - 1  # it ends a blend under way
-        return now <= self._seam_until
+        self._executed = []
 
     def _warn_clipped(self, chunk: Array) -> None:
         """The first chunk that leaves the action space is warned of."""
@@ -276,22 +267,15 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             )
 
     def _measured(self, commands: list[Command], refused: bool, latency: int) -> dict[str, Any]:
-        counted = np.array(self._in_seam, dtype=bool)
-        jump, peak = np.zeros(DIFFERENCES), 0.0
-        for order in range(1, DIFFERENCES + 1):
-            steps = np.abs(np.diff(self._executed, n=order, axis=0))[-len(counted) :].max(axis=1, initial=0.0)
-            at_seam = steps[counted[len(counted) - len(steps) :]]
-            jump[order - 1] = at_seam.max(initial=0.0)
-            if order == 1:
-                peak = float(steps.max(initial=0.0)) / self.control_dt
-        self._executed, self._in_seam = self._executed[-DIFFERENCES:], []
+        executed = np.array(self._executed).reshape(-1, self._controls)
+        peak = float(np.abs(np.diff(executed, axis=0)).max(initial=0.0)) / self.control_dt
+        self._executed = self._executed[-1:]
         blends = [c.blend_steps for c in commands if c.blend_steps]
         limited = sum(c.limited for c in commands)
         if limited:
             message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
             self._warn_once("limited", message)
         return {
-            keys.HANDOVER_SEAM_JUMP: jump,
             keys.HANDOVER_PEAK_JERK: peak,
             keys.HANDOVER_BLEND_TIME: (max(blends) + 1) * self.control_dt if blends else 0.0,
             keys.HANDOVER_STARVED: sum(c.starved for c in commands),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.control.handover.curves import hermite_spline
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, Seam, drawn_out, join
+from safe_wrappers.control.handover.seams import BLENDS, LOOK_BACK, Seam, drawn_out, join
 from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE, shortest_latched_blend, smoothstep
 from safe_wrappers.control.handover.vibration import shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
@@ -35,7 +35,6 @@ class Command(NamedTuple):
     limited: bool  # held back beyond the blend to keep the rate limit
     took_over: bool  # a chunk took over with it
     refused: bool  # a chunk that has arrived was refused
-    seam: bool  # there is a seam before it: another chunk, another source, or the fallback began
     blend_steps: int  # control steps of the blend that begins with this command; 0 if none does
 
 
@@ -142,19 +141,17 @@ class ChunkQueue:
         if control is None:
             control = np.clip(fallback(), self._low, self._high)
         acting = None if starved else self._in_force
-        if acting != self._acting and len(self._sent):
+        if acting != self._acting and len(self._sent) and not seam and self._blend in BLENDS:
             # A longer chunk that takes over blends by itself; everything else starts from the last command.
-            if not seam and self._blend in BLENDS:
-                blend_steps = self._fade_steps(control)
-                self._fade = (self._sent[-1], blend_steps, 0)
-            seam = True
+            blend_steps = self._fade_steps(control)
+            self._fade = (self._sent[-1], blend_steps, 0)
         self._acting = acting
         sent, held = self._sendable(self._faded(control))
-        self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], sent[None].astype(np.float64)])
+        self._sent = np.concatenate([self._sent[-LOOK_BACK + 1 :], sent[None].astype(np.float64)])
         self.now += 1
         took_over = self._observed > newest
         held |= limited
-        return Command(sent, self._observed, starved, held, took_over, refused, seam, blend_steps)
+        return Command(sent, self._observed, starved, held, took_over, refused, blend_steps)
 
     def _admitted(self, admits: Callable[[Array], bool]) -> tuple[Chunk | None, bool]:
         """The chunk of the newest observation that may take over now, if any; and whether one was refused."""

@@ -93,11 +93,9 @@ class ContactMonitor(StepMonitor):
         against: Names of what they touch, "world" among them; None is everything. A contact counts if one of its
             bodies is in each list.
 
-    Info, at every step (0 and False after a reset; not finite where the simulation's contacts are not):
-    ``contact/peak_force`` (N), the largest normal force between two bodies, summed over their contacts;
-    ``contact/impulse`` (N s) of all watched contacts; ``contact/penetration`` (m), the deepest; ``contact/residual``
-    (N m), the largest ``|gap * force|``, 0 for rigid contacts; ``contact/partial`` (bool): not replayed, the figures
-    are those of the contacts left behind, for one substep.
+    Info, at every step: ``contact/peak_force`` (N), ``contact/impulse`` (N s), ``contact/penetration`` (m),
+    ``contact/residual`` (N m; 0 for rigid contacts), NaN where the simulation's contacts are not finite, and
+    ``contact/partial`` (bool), see `safe_wrappers.info`. After a reset they are 0 and False.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model.
@@ -200,12 +198,9 @@ class BalanceMonitor(StepMonitor):
         inset: Kept inside the support polygon, m.
         bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves.
 
-    Info, at every step (0 and False after a reset): of the robot after the step ``balance/linear_momentum`` (kg m/s)
-    and ``balance/angular_momentum`` about its centre of mass (kg m^2/s), arrays (3,); ``balance/friction_used``, the
-    largest ``|f_t| / (friction_share mu f_n)`` of a contact that carries at least 1 % of the weight;
-    ``balance/zmp_margin`` (m), from the edge of the support polygon minus the inset, NaN without a polygon;
-    ``balance/airborne``, the share of the evaluations without a contact;
-    ``balance/partial`` (bool): not replayed, the figures are those of the contacts left behind (0 if not finite).
+    Info, at every step: ``balance/linear_momentum`` (kg m/s), ``balance/angular_momentum`` (kg m^2/s), arrays (3,),
+    ``balance/friction_used``, ``balance/zmp_margin`` (m), ``balance/airborne``, and ``balance/partial`` (bool), see
+    `safe_wrappers.info`. After a reset they are 0 and False, the margin NaN.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.

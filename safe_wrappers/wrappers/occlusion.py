@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.control.estimation.covariance import checked_covariance, checked_noise
 from safe_wrappers.control.estimation.dead_reckoning import (
     DeadReckoning,
@@ -56,17 +56,13 @@ class Imu:
         check_fields(self, non_negative, ["accelerometer_std"], "m/s^2")
         check_fields(self, non_negative, ["gyro_std"], "rad/s")
         check_fields(self, positive, ["fix_every_s"], "s")
-        if not isinstance(self.lever_arm, bool | np.bool_):
-            raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
-        self.lever_arm = bool(self.lever_arm)
+        self.lever_arm = true_or_false("lever_arm", self.lever_arm)
 
 
-class EgoMotion:
+class EgoMotion(DeadReckoning):
     """Where a sensor's body is taken to be, by dead reckoning from the readings of its `Imu`.
 
     Attributes:
-        position: Of the body's origin, shape (3,), m.
-        velocity: Shape (3,), m/s.
         specific_force: Mean of the accelerometer's readings over the last step, in the axes of its middle, shape
             (3,), m/s².
         rate: The gyroscope's reading at its end, shape (3,), rad/s.
@@ -86,43 +82,27 @@ class EgoMotion:
         axes = np.zeros(9)
         mujoco.mju_quat2Mat(axes, model.site_quat[self._site])
         arm = model.site_pos[self._site] if imu.lever_arm else np.zeros(3)
-        self._gravity = np.array(model.opt.gravity)
-        self._reckoning = DeadReckoning(rigid_transform(axes.reshape(3, 3), arm), self._gravity)
+        super().__init__(rigid_transform(axes.reshape(3, 3), arm), model.opt.gravity)
         self.specific_force = self.rate = np.zeros(3)
         self._since_fix_s = 0.0
         self._at_site = np.zeros(3), np.eye(3)
 
     @property
-    def position(self) -> Array:
-        """Of the body's origin, shape (3,), m, world axes."""
-        return self._reckoning.position
-
-    @property
-    def velocity(self) -> Array:
-        """Of the body's origin, shape (3,), m/s, world axes."""
-        return self._reckoning.velocity
-
-    @property
-    def angular_velocity(self) -> Array:
-        """Shape (3,), rad/s, world axes."""
-        return self._reckoning.angular_velocity
-
-    @property
     def rotation(self) -> Array:
         """The body's axes as columns, shape (3, 3)."""
-        return np.asarray(self._reckoning.orientation.as_matrix())
+        return np.asarray(self.orientation.as_matrix())
 
-    def fix(self) -> None:
+    def fix_now(self) -> None:
         """Take the body's true motion, at the state that was read last."""
         sight = self._sight
         self._at_site = self._read()
         linear, _ = sight.velocity(sight.body)
         position = np.array(sight.data.xpos[sight.body])
         body = rigid_transform(np.array(sight.data.xmat[sight.body]).reshape(3, 3), position)
-        self._reckoning.fix(position, linear, body.rotation, self.rate)
+        self.fix(position, linear, body.rotation, self.rate)
         self._since_fix_s = 0.0
 
-    def advance(self, time_s: float, noise: Array) -> None:
+    def read(self, time_s: float, noise: Array) -> None:
         """Read what the step to the present state did, and reckon on.
 
         Args:
@@ -136,14 +116,14 @@ class EgoMotion:
         turned = rigid_transform(axes.T @ new_axes, np.zeros(3)).rotation
         turn = turned.as_rotvec()
         middle = axes @ type(turned).from_rotvec(0.5 * turn).as_matrix()
-        force = ((after - velocity) / time_s - self._gravity) @ middle
+        force = ((after - velocity) / time_s - self.gravity) @ middle
         self.specific_force = force + self.imu.accelerometer_std * noise[:3]
         turn = turn + self.imu.gyro_std * time_s * noise[3:6]
         self.rate = self.rate + self.imu.gyro_std * noise[6:]
-        self._reckoning.advance(self.specific_force, turn, self.rate, time_s)
+        self.advance(self.specific_force, turn, self.rate, time_s)
         self._since_fix_s += time_s
         if self.imu.fix_every_s is not None and self._since_fix_s >= self.imu.fix_every_s - 1e-9:
-            self.fix()
+            self.fix_now()
 
     def _read(self) -> tuple[Array, Array]:
         """Velocity of the site (3,), m/s, and its axes (3, 3) in the world; the gyroscope's reading without noise."""
@@ -205,9 +185,7 @@ class Sensor:
             self.occluder_groups = _groups(self.occluder_groups)
         if self.position_std is None and self.velocity_std is None:
             raise ConfigurationError("the sensor measures nothing: give position_std, velocity_std or both")
-        if not isinstance(self.lever_arm, bool | np.bool_):
-            raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
-        self.lever_arm = bool(self.lever_arm)
+        self.lever_arm = true_or_false("lever_arm", self.lever_arm)
         if self.imu is not None:
             self.imu = settings_from(Imu, self.imu, "imu")
         for name in ("position_std", "velocity_std"):

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive, true_or_false
 from safe_wrappers.control.estimation.observability import unobservable_directions
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
@@ -111,11 +111,10 @@ class OcclusionPenalty(LayerWrapper):
         self.sigmas = positive("sigmas", sigmas, "standard deviations")
         if axes not in ("xy", "xyz"):
             raise ConfigurationError(f"axes is 'xy' or 'xyz', got {axes!r}")
-        if not isinstance(observe, bool | np.bool_):
-            raise ConfigurationError(f"observe is True or False, got {observe!r}")
+        self.observe = true_or_false("observe", observe)
         plain = {name: getattr(self, name) for name in ("tolerance", "weight", "sigmas")}
         parts = {"tracks": [t.data() for t in self.tracks], "sensor": self.sensor.data()}
-        self._record(arguments, **parts, **plain, observe=bool(observe))
+        self._record(arguments, **parts, **plain, observe=self.observe)
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
         self._control_dt = control_interval(raw)
         self._matrix, self._noise = self.sensor.matrices(self._d)
@@ -128,8 +127,7 @@ class OcclusionPenalty(LayerWrapper):
         self._state_names = [*axes, *(f"v{axis}" for axis in axes)]
         self.last_seen_positions = np.zeros((len(self.track_names), self._d))
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
-        self.observe = bool(observe)
-        if observe:
+        if self.observe:
             self.observation_space = _with_tracks(env.observation_space, 3 * self._d * len(self.track_names))
 
     def _look_at(self, model: mujoco.MjModel) -> None:
@@ -185,7 +183,7 @@ class OcclusionPenalty(LayerWrapper):
         self._time = float(self._raw.data.time)
         self._sight.read(self._raw.data)
         if self.ego_motion is not None:
-            self.ego_motion.fix()
+            self.ego_motion.fix_now()
         self._start()
         info.update(self._look())
         info[keys.OCCLUSION_PENALTY] = 0.0
@@ -198,7 +196,7 @@ class OcclusionPenalty(LayerWrapper):
         self.tracking.advance(elapsed)
         self._sight.read(self._raw.data)
         if self.ego_motion is not None:
-            self.ego_motion.advance(elapsed, self._random.draw.standard_normal(9))
+            self.ego_motion.read(elapsed, self._random.draw.standard_normal(9))
         info.update(self._look())
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
         info[keys.OCCLUSION_PENALTY] = penalty

@@ -105,7 +105,7 @@ class WholeBodyFilter(CBFActionFilter):
         fallback: As of `CBFActionFilter`.
 
     Info, at every step: the keys of `CBFActionFilter`, ``whole_body/contacts``, ``whole_body/cone_margin``, and for
-    forecasts with a `zmp_inset` ``whole_body/zmp_margin`` and ``whole_body/supported``.
+    forecasts with a `zmp_inset` ``whole_body/zmp_margin``.
 
     Raises:
         ConfigurationError: A share outside (0, 1], a negative tolerance, or a body that does not move.

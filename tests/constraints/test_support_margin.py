@@ -54,11 +54,9 @@ def test_the_distance_is_that_of_the_moments():
         assert limit.slacks(np.array([push]))[0] == pytest.approx(expected - 0.01, abs=2e-3)
         assert limit.info(None, None) == {
             "whole_body/zmp_margin": 0.0,
-            "whole_body/supported": 0.0,
         }  # nothing was decided yet
         info = limit.info(np.array([push]), np.array([push]))
         assert info["whole_body/zmp_margin"] == pytest.approx(expected, abs=2e-3)
-        assert info["whole_body/supported"] == 1.0
 
 
 def hull_distance(contacts):

@@ -12,10 +12,8 @@ from safe_wrappers.control.contact.impact import (
     braked_deflection,
     complementarity_residuals,
     in_series,
-    normal_impulse,
     peak_force,
     pushed_peak_force,
-    restitution_velocity,
     speed_limit,
     time_to_peak,
 )
@@ -95,66 +93,26 @@ def test_springs_and_masses_in_series():
     assert in_series(np.ones((2, 1)), np.ones(3)).shape == (2, 3)
 
 
-@given(masses, masses, st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(0.0, 1.0))
-def test_momentum_and_the_energy_of_two_bodies_balance(m1, m2, v1, v2, e):
-    # Body 1 above body 2: they close when v1 < v2.
-    relative = v1 - v2
-    assume(relative < 0.0)
-    mass = in_series(m1, m2)
-    impulse = normal_impulse(mass, relative, e)
-    after1, after2 = v1 + impulse / m1, v2 - impulse / m2
-    assert impulse >= 0.0
-    assert after1 - after2 == pytest.approx(restitution_velocity(relative, e), abs=1e-9)
-    lost = 0.5 * (m1 * (v1**2 - after1**2) + m2 * (v2**2 - after2**2))
-    assert lost == pytest.approx(0.5 * mass * (1.0 - e**2) * relative**2, abs=1e-7)
-    assert normal_impulse(mass, -relative, e) == 0.0 and restitution_velocity(-relative, e) == -relative
-
-
-def dropped(mass, stiffness, damping, height, step=2e-5):
-    """A ball dropped on a plane whose contact is a spring: normal velocities around the contact, impulse, peak force.
-
-    Negative solref asks for a stiffness and a damping per mass; an impedance near 1 leaves them as they are.
-    """
+def test_a_drop_in_mujoco_has_the_peak_force_of_its_spring():
+    """Negative solref asks for a stiffness per mass; an impedance near 1 leaves it as it is."""
+    mass, stiffness, height = 2.0, 2e5, 0.3
     model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="{step}" gravity="0 0 -9.81" integrator="Euler" cone="elliptic"/>
+        f"""<mujoco><option timestep="2e-5" gravity="0 0 -9.81" integrator="Euler" cone="elliptic"/>
         <worldbody><geom type="plane" size="1 1 .1" friction="0 0 0" condim="1"
         solref="-1 -1" solimp=".9999 .9999 .001"/>
         <body pos="0 0 {0.1 + height}"><freejoint/><geom size=".1" mass="{mass}" condim="1" friction="0 0 0"
         solref="-1 -1" solimp=".9999 .9999 .001"/></body></worldbody></mujoco>"""
     )
-    model.geom_solref[:] = -stiffness / mass, -damping / mass
+    model.geom_solref[:] = -stiffness / mass, 0.0
     data = mujoco.MjData(model)
-    before, impulse, peak, wrench = None, 0.0, 0.0, np.zeros(6)
-    while data.time < 5.0:
-        speed = data.qvel[2]
+    peak, wrench = 0.0, np.zeros(6)
+    while data.time < 0.35:
         mujoco.mj_step(model, data)
-        touching = data.ncon > 0 and data.contact[0].efc_address >= 0
-        if touching:
-            before = speed if before is None else before
+        if data.ncon and data.contact[0].efc_address >= 0:
             mujoco.mj_contactForce(model, data, 0, wrench)
-            impulse, peak = impulse + wrench[0] * step, max(peak, wrench[0])
-        elif before is not None:
-            return before, data.qvel[2], impulse, peak
-    raise AssertionError("it did not come off the ground")
-
-
-@pytest.mark.parametrize("damping", [0.0, 200.0])
-def test_a_drop_in_mujoco_bounces_as_its_restitution_says(damping):
-    mass, stiffness, height = 2.0, 2e5, 0.3
-    before, after, impulse, peak = dropped(mass, stiffness, damping, height)
-    ratio = damping / (2.0 * np.sqrt(stiffness * mass))
-    # The spring and damper let go when their force is zero: e = exp(-zeta phi / sqrt(1 - zeta^2)).
-    root = np.sqrt(1.0 - ratio**2)
-    phi = np.arctan2(2.0 * ratio * root, 2.0 * ratio**2 - 1.0) if ratio else np.pi
-    e = np.exp(-ratio * phi / root)
-    assert before == pytest.approx(-np.sqrt(2.0 * 9.81 * height), rel=1e-3)
-    assert after == pytest.approx(float(restitution_velocity(before, e)), rel=0.01)
-    held = mass * 9.81 * np.pi * np.sqrt(mass / stiffness)  # what the weight adds during the contact, about
-    assert impulse == pytest.approx(float(normal_impulse(mass, before, e)) + held, rel=0.01)
-    if not damping:
-        assert peak == pytest.approx(
-            float(pushed_peak_force(-before, mass, stiffness, 9.81 * mass)), rel=5e-3
-        )
+            peak = max(peak, wrench[0])
+    fall = np.sqrt(2.0 * 9.81 * height)
+    assert peak == pytest.approx(float(pushed_peak_force(fall, mass, stiffness, 9.81 * mass)), rel=5e-3)
 
 
 def test_residuals_are_zero_for_ideal_contacts_and_name_what_is_missed():
@@ -172,7 +130,6 @@ def test_residuals_are_zero_for_ideal_contacts_and_name_what_is_missed():
         (lambda: peak_force(np.nan, 1.0, 1.0), "speed must be finite"),
         (lambda: peak_force(1.0, 1.0, np.nan), "stiffness must be positive"),
         (lambda: braked_deflection(0.8, 12.0, 25e3, -1.0), "latency and braking must be 0 or more"),
-        (lambda: restitution_velocity(-1.0, 1.1), "restitution must be between 0 and 1"),
         (lambda: complementarity_residuals(np.nan, 1.0), "gap must be finite"),
     ],
 )

@@ -36,8 +36,6 @@ def test_an_update_is_bayes_rule_on_the_joint_normal(seed, n, m):
     )
     expected = cov - cross @ np.linalg.solve(marginal, cross.T)
     np.testing.assert_allclose(updated.cov, expected, rtol=1e-7, atol=1e-9 * np.abs(cov).max())
-    np.testing.assert_allclose(updated.innovation, measured - c @ mean, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(updated.innovation_cov, marginal, rtol=1e-10, atol=1e-12)
 
 
 @given(seeds, st.integers(1, 4), st.floats(-8, 8))
@@ -112,7 +110,7 @@ def errors_over_time(believed_intensity, seed):
         mean, cov = predict(mean, cov, *step, drift)
         if k < SIGHT:
             measured = truth[:, :1] + rng.normal(0.0, np.sqrt(NOISE), (RUNS, 1))
-            mean, cov, *_ = update(mean, cov, measured, C, R)
+            mean, cov = update(mean, cov, measured, C, R)
         error = truth - mean
         yield (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(axis=-1)
 

@@ -9,18 +9,10 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from safe_wrappers.envs.teleop_operator import TeleopOperator
 
 Policy = Callable[[Any], Any]
 Made = tuple[gym.Env[Any, Any], Policy | None]
 gym.register_envs(gymnasium_robotics)
-
-
-class Operating(TeleopOperator):
-    """The scripted operator as a policy."""
-
-    def __call__(self, observation: Any) -> Any:
-        return self.act(observation)
 
 
 def waving(env: gym.Env[Any, Any], share: float = 0.3, period: float = 60.0, seam: int = 0) -> Policy:
@@ -108,9 +100,6 @@ PLANTED: dict[str, tuple[str, int, Callable[[], Made]]] = {
     "hazards": ("limits", 1000, lambda: _with(gym.make("SafePointGoal1-v0"))),
     "a speed limit": (
         "limits", 300, lambda: _with(gym.make("SafeSwimmerVelocity-v0"), lambda env: waving(env, 1.0, 25.0)),
-    ),
-    "a plain channel, 0.1 s each way": (
-        "port_energy", 2600, lambda: (sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1), Operating()),
     ),
 }  # fmt: skip
 """What is planted, for how many steps it is looked at, and the env and its policy."""

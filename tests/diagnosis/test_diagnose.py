@@ -22,7 +22,7 @@ from safe_wrappers.diagnosis.recording import (
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 pytest.importorskip("gymnasium_robotics")
-from tests.diagnosis.planted import CART, HEALTHY, PLANTED, STOPPED, Bench, Operating, waving
+from tests.diagnosis.planted import CART, HEALTHY, PLANTED, STOPPED, Bench, waving
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -247,14 +247,6 @@ def test_joints_that_ring_get_a_rate_that_their_slowest_resonance_follows():
     rates = [float(each) for each in finding.code.partition("rate_limit=[")[2].partition("]")[0].split(",")]
     assert rates == pytest.approx([0.5 * slowest * 0.05 * 6.0, 0.5 * slowest * 0.05 * 2.0], rel=1e-3)
     assert 'flexible="auto"' in finding.advice
-
-
-def test_a_channel_is_told_of_waves_where_no_line_can_be_run():
-    env = sw.RecordInterventions(sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1))
-    finding = diagnose(env, Operating(), steps=2600, symptoms=["port_energy"]).findings[0]
-    assert finding.present and not finding.code and 'coding="wave"' in finding.advice
-    bare = diagnose(gym.make("TeleopContact-v0"), Operating(), steps=10, symptoms=["port_energy"])
-    assert "no TeleopChannel" in bare.findings[0].missing
 
 
 def test_what_presses_all_the_time_is_no_impact():

@@ -9,10 +9,8 @@ from fake_task import HAZARD, FakeFilter
 from gymnasium.spaces import Discrete
 from test_run import Reports, run_killed_after
 
-from safe_wrappers import ActionShield
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train.config import EvaluationConfig
 from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, algorithm_class
@@ -21,7 +19,6 @@ from safe_wrappers.train.experiment import training_jobs
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, resume
-from safe_wrappers.train.run.folder import finished_facts
 from safe_wrappers.train.run.model import _constructor_arguments as constructor_arguments
 from safe_wrappers.train.run.model import check_task
 from safe_wrappers.train.run.stack import make_stack, make_vec_env
@@ -122,19 +119,6 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
         assert len(read_rows(evaluation_folder(folder) / f"{condition}.csv")) == 2
 
 
-def test_dqn_learns_cart_pole_through_its_shield(fake_experiment):
-    """protect's filter for discrete actions is an ActionShield."""
-    (arm,) = one_arm(
-        fake_experiment, "DQN", "filter: {protect: {}}", "env=CartPole-v1", "total_steps=64"
-    ).arms
-    env = make_stack(arm.env, arm.filter)
-    check_task(arm, env)
-    assert any(isinstance(inner, ActionShield) for inner in wrappers_of(env))
-    folder = fake_experiment().output / "dqn"
-    train_run(arm, 0, folder, Reports().progress)
-    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 64
-
-
 @pytest.mark.parametrize(
     ("algorithm", "env", "message"),
     [
@@ -174,14 +158,6 @@ def test_a_deterministic_policy_needs_a_word_on_noise(fake_experiment, algorithm
 
 
 @pytest.mark.parametrize(
-    "noise", ["0.1", "{normal: 0}", "{normal: -1}", "{normal: .nan}", "{normal: [1, 2]}", "{}"]
-)
-def test_noise_that_is_none_is_refused(fake_experiment, noise):
-    with pytest.raises(ConfigurationError, match=r"^hyperparameters\.action_noise"):
-        one_arm(fake_experiment, "TD3", FILTERED, f"hyperparameters.action_noise={noise}")
-
-
-@pytest.mark.parametrize(
     ("algorithm", "hyperparameters", "steps"),
     [
         ("PPO", "{n_steps: 64, batch_size: 64, n_epochs: 1}", 256),
@@ -204,7 +180,7 @@ def test_the_steps_that_are_announced_and_reported_are_those_that_are_trained(
     (arm,), folder = experiment.arms, experiment.run_folder(experiment.arms[0], 0)
     (job,) = training_jobs(experiment)
     train_run(arm, 0, folder, Reports().progress)
-    trained = finished_facts(folder)["timesteps"]
+    trained = json.loads((folder / "finished.json").read_text())["timesteps"]
     assert f", {trained:,} steps, " in about(experiment)
     if steps is not None:  # of whole episodes nobody knows the steps beforehand
         assert trained == steps == job.total

@@ -3,13 +3,11 @@
 import io
 import re
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
 from test_run import Reports
 
-from safe_wrappers.train.acting import enjoy_command
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.videos import HEIGHT, STRIP, WIDTH
@@ -53,29 +51,3 @@ def test_what_cannot_be_drawn_is_refused(run, tmp_path, capsys):
     assert "has no render mode human; it has: rgb_array" in capsys.readouterr().err
     assert main(["enjoy", str(tmp_path)]) == 1
     assert "is no run's folder" in capsys.readouterr().err
-
-
-def test_a_window_is_the_task_s_own(run, monkeypatch):
-    asked = []
-    make = gym.make
-
-    def making(env_id, **kwargs):
-        asked.append(kwargs.pop("render_mode", None))
-        env = make(env_id, **kwargs)
-        env.unwrapped.metadata = {**env.unwrapped.metadata, "render_modes": ["human"]}
-        return env
-
-    monkeypatch.setattr(gym, "make", making)
-    from rich.console import Console
-
-    enjoy_command(str(run), 1, "trained", True, None, Console())
-    assert asked == [None, "human"]
-
-
-@pytest.mark.parametrize(
-    "words", [[], ["a", "b"], ["a", "--render", "--output", "b"], ["a", "--filter", "nun"]]
-)
-def test_what_it_does_not_take_is_refused(words, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["enjoy", *words])
-    assert stop.value.code == 2 and "usage: safe-wrappers enjoy" in capsys.readouterr().err

@@ -30,10 +30,6 @@ def test_where_nothing_is_filtered_it_is_the_first_arms(fake_experiment):
     assert shown_episode(experiment).episode_seed == 102
 
 
-def test_before_any_evaluation_there_is_none(fake_experiment):
-    assert shown_episode(fake_experiment()) is None
-
-
 def names(experiment):
     return [(pair.bare.name, pair.filtered.name) for pair in compared_pairs(experiment)]
 

@@ -87,24 +87,6 @@ def test_a_kill_between_the_conditions_leaves_nothing_that_looks_done(fake_exper
     assert len(read_rows(folder / "filter_off.csv")) == len(read_rows(folder / "filter_on.csv")) == 3
 
 
-def test_deterministic(fake_experiment):
-    experiment = fake_experiment()
-    folder = evaluate(experiment, 1)
-    first = (folder / "filter_on.csv").read_text()
-    (folder / "evaluation.json").unlink()
-    evaluate(experiment, 1)
-    assert (folder / "filter_on.csv").read_text() == first
-
-
-def test_without_any_filter_only_one_condition(fake_experiment):
-    folder = evaluate(fake_experiment("arms={unfiltered: {filter: none}}"), 0)
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "evaluation.json",
-        "filter_off.csv",
-        "filter_off_steps.npz",
-    ]
-
-
 def test_evaluation_reaches_tensorboard(fake_experiment):
     folder = evaluate(fake_experiment(), 1)
     events = EventAccumulator(str(folder.parent / "tensorboard"))

@@ -104,20 +104,6 @@ def test_fewer_than_three_seeds_have_no_interval(fake_experiment, seeds, spread,
         assert "lie apart" not in said and "overlap" not in said and "95 %" not in said
 
 
-def test_more_return_through_training_with_the_filter_is_said_too(fake_experiment):
-    experiment = fake_experiment("seeds=[0]")
-    write_evaluation(experiment, 0, 0, "filter_on", [episode(**{"return": 1})])
-    write_evaluation(experiment, 0, 0, "filter_off", [episode(**{"return": 3})])
-    write_evaluation(experiment, 1, 0, "filter_on", [episode(**{"return": 2})])
-    said = " ".join(verdict(experiment, summarize(experiment)))
-    assert "the policy trained through it returned more" in said
-    # What has not been evaluated is not told.
-    assert (
-        "Trained through the filter, filter on 2 [n/a]" in said
-        and "through the filter, filter off" not in said
-    )
-
-
 def test_a_task_without_a_cost_has_no_violations_to_count(fake_experiment):
     experiment = fake_experiment()
     said = told(experiment, off=SILENT, on=SILENT | {"unsafe": 3})
@@ -132,14 +118,6 @@ def test_without_an_arm_that_has_none_the_filter_is_switched_off(fake_experiment
     said = told(experiment, off={"violations": 5}, on={})
     # The evaluation only: both sides trained with it. 2 episodes of 100 steps for 2 seeds.
     assert "none of 400 steps was in violation; without it 20 of 400 steps (5 %) were" in said
-
-
-def test_an_arm_of_another_env_is_not_compared_with(fake_experiment):
-    experiment = fake_experiment(
-        "arms.unfiltered.env=fake_task:FilmedGoal-v0", "arms.third={filter: none}", "seeds=[0]"
-    )
-    fill(experiment, off={"violations": 5}, on={})
-    assert verdict(experiment, summarize(experiment))[0].startswith("There is no filter to compare with yet.")
 
 
 def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_experiment):

@@ -70,5 +70,5 @@ def test_no_word_becomes_markup_in_the_card(fake_experiment, tmp_path):
         outside = outside.replace(part, "")
     told = outside.splitlines()
     assert told[0] == "---" == told[3] and "\n# PPO on " in card  # what is between them is JSON
-    assert "<" not in "".join(told[4:]) and "&lt;script" in outside and "script" in "".join(code)
+    assert "<" not in "".join(told[4:]) and "script" in "".join(code)
     assert "```" not in "".join(told[4:]).replace("```python", "", 1).replace("```", "", 1)

@@ -138,14 +138,6 @@ SETTINGS = {
 }
 
 
-def test_all_arms_have_the_judge_of_the_config():
-    of_cost = parse_experiment(SETTINGS | {"env": {"id": "Reacher-v5", "cost": "a:b"}})
-    assert [arm.env.cost for arm in of_cost.arms] == ["a:b", "a:b"]
-    of_limits = parse_experiment(SETTINGS | {"env": {"id": "Reacher-v5", "judge": "constraints"}})
-    own = FilterConfig(factory=f"{HERE}:slow_joints")  # a lease keeps no limit
-    assert [arm.env.judge for arm in of_limits.arms] == [own, own]
-
-
 def test_limits_cannot_judge_where_there_is_no_filter():
     settings = SETTINGS | {"env": {"id": "Reacher-v5", "judge": "constraints"}, "arms": {"bare": {}}}
     with pytest.raises(

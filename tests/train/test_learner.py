@@ -223,20 +223,6 @@ def test_a_killed_run_goes_on_with_its_two_transitions(fake_experiment, monkeypa
     assert json.loads((folder / "finished.json").read_text())["timesteps"] == 256
 
 
-def test_another_learner_is_another_run(fake_experiment):
-    experiments = [one_arm(fake_experiment, learner) for learner in KINDS.values()]
-    experiments.append(one_arm(fake_experiment, "{kind: both, penalty: 999.0, per_correction: 1.0}"))
-    seen = [json.dumps(e.arms[0].fingerprint(), sort_keys=True) for e in experiments]
-    assert len(set(seen)) == 5
-    first, second = experiments[0], experiments[3]
-    folder = first.run_folder(first.arms[0], 0)
-    train_run(first.arms[0], 0, folder, Reports().progress)
-    with pytest.raises(
-        sw.SafeWrappersError, match=r"learner.kind: 'naive' in the folder, 'both' in the config"
-    ):
-        train_run(second.arms[0], 0, folder, Reports().progress)
-
-
 @pytest.mark.parametrize(
     ("learner", "overrides", "message"),
     [
@@ -267,7 +253,7 @@ def test_the_stack_puts_the_penalty_outside_recorder_and_monitor(fake_experiment
     (arm,) = one_arm(fake_experiment, KINDS["both"]).arms
     env = make_stack(arm.env, arm.filter, arm.learner)
     assert isinstance(env, sw.AdaptionPenalty)
-    assert {name: getattr(env, name) for name in arm.learner.penalties} == arm.learner.penalties
+    assert (env.penalty, env.per_correction) == (arm.learner.penalty, arm.learner.per_correction)
     assert isinstance(env.env, Monitor) and isinstance(env.env.env, sw.RecordInterventions)
     assert isinstance(make_stack(arm.env, arm.filter), Monitor)
     with pytest.raises(ConfigurationError, match="AdaptionPenalty needs a CBFActionFilter inside"):

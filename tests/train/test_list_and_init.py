@@ -47,11 +47,6 @@ def test_envs_can_be_made_and_those_with_a_recipe_protected(capsys):
     assert "MountainCar-v0" not in found and recipe_of("MountainCar-v0") is None
 
 
-def test_an_unknown_kind_is_refused(capsys):
-    assert main(["list", "env"]) == 1
-    assert "list: unknown name 'env'. Did you mean 'envs'?" in capsys.readouterr().err
-
-
 # init ----------------------------------------------------------------------------------------------------------
 
 

@@ -1,15 +1,13 @@
 """The page: whole, alone, in words for everybody, and of what was measured."""
 
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_up import SILENT as JUDGES_NOTHING
-from made_up import episode, fill, steps, write_evaluation, write_training
+from made_up import fill, steps
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train import videos
@@ -21,7 +19,6 @@ from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.videos import record_videos
 
 HERE = Path(__file__).parent
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SILENT = Progress(lambda steps: None, pytest.fail)
 
 
@@ -183,39 +180,7 @@ def test_a_task_without_a_cost_shows_none(fake_experiment):
         assert left_out not in said.partition("How to read this")[0], left_out
 
 
-def test_arms_of_several_tasks_are_reported_without_being_mixed_up(fake_experiment):
-    experiment = fake_experiment("seeds=[0]", "arms.filtered.env=Pendulum-v1", "arms.filtered.total_steps=64")
-    for arm, names in ((0, ["x (m)", "y (m)", "z (m)"]), (1, ["a", "b", "c"])):
-        flags = np.arange(200) % 2 == 0
-        log = steps(intervened=flags, coordinate_names=np.array(names), constraint_names=np.array([names[0]]))
-        write_training(experiment, arm, 0, [episode(timesteps=100)])
-        for condition in ("filter_off", "filter_on"):
-            write_evaluation(experiment, arm, 0, condition, [episode()] * 2, log)
-    said = reported(experiment)
-    assert "PPO on fake_task:FakeGoal-v0, PPO on Pendulum-v1, 64 to 512 steps" in said
-    assert "The policy, filter off" in said and "Trained without the filter" not in said
-
-
 def test_nothing_to_report_yet(fake_experiment):
     experiment = fake_experiment()
     with pytest.raises(RunStateError, match=r"Nothing to report in .* yet; run `safe-wrappers compare`"):
         write_report(experiment, summarize(experiment))
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the report is not opened in a browser")
-@pytest.mark.parametrize("width", [1200, 600])
-def test_a_browser_draws_it_without_an_error_and_inside_its_window(report, tmp_path, width):
-    page = tmp_path / "page.html"
-    more = "<script>document.title = document.documentElement.scrollWidth</script>"
-    page.write_text(report.read_text() + more)
-    flags = [
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--enable-logging=stderr",
-        f"--window-size={width},900",
-    ]
-    command = [CHROMIUM, *flags, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0 and "CONSOLE" not in done.stderr
-    assert int(re.search(r"<title>(\d+)</title>", done.stdout)[1]) <= width

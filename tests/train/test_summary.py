@@ -10,7 +10,6 @@ from safe_wrappers.train.evaluation.summary import (
     estimate,
     interquartile_mean,
     learning_curve,
-    number,
     summarize,
     write_summary,
 )
@@ -66,14 +65,6 @@ def test_the_interval_covers_as_often_as_it_says():
     assert 0.82 <= np.mean(hits) <= 1.0
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0, "0"), (12345.6, "12,346"), (3.0, "3"), (0.12345, "0.123"), (-1.5, "-1.5"), (99.94, "99.9")],
-)
-def test_numbers(value, text):
-    assert number(value) == text
-
-
 def test_summary_of_rows(fake_experiment):
     experiment = fake_experiment()
     for seed, cost in ((0, 2.0), (1, 4.0)):
@@ -127,22 +118,6 @@ def test_spin_outs_are_a_total_and_a_rate_over_all_steps(fake_experiment):
     assert not {"spin_outs", "spin_outs_per_million"} & table["filtered"]["training"].keys()
 
 
-def test_collisions_sight_and_expiries_of_a_task_whose_things_are_tracked(fake_experiment):
-    experiment = fake_experiment()
-    seen = [
-        episode(collisions=2, seen=0.25, expiries=3, length=40),
-        episode(seen=0.75, expiries=1, length=10),
-    ]
-    write_training(experiment, 0, 0, seen)
-    write_training(experiment, 1, 0, [episode(collisions="", seen="", expiries="")])
-    table = summarize(experiment).table
-    tracked = {key: value.iqm for key, value in table["unfiltered"]["training"].items()}
-    assert (tracked["collisions"], tracked["seen"], tracked["expiries"]) == (2.0, 0.5, 4.0)
-    assert tracked["collisions_per_million"] == 1e6 * 2 / 50 and tracked["expiries_per_1000"] == 80.0
-    names = {"collisions", "collisions_per_million", "seen", "expiries", "expiries_per_1000"}
-    assert not names & table["filtered"]["training"].keys()
-
-
 def test_learning_curve(fake_experiment):
     experiment = fake_experiment()
     for seed in (0, 1):
@@ -159,10 +134,3 @@ def test_learning_curve(fake_experiment):
     curve = learning_curve(experiment, experiment.arms[0], "cost")
     assert len(curve.steps) == 2
     assert learning_curve(experiment, experiment.arms[1], "cost") is None
-
-
-def test_learning_curve_of_one_seed_has_no_band(fake_experiment):
-    experiment = fake_experiment("seeds=[0]")
-    write_training(experiment, 0, 0, [episode(timesteps=t, cost=t) for t in range(1, 9)])
-    curve = learning_curve(experiment, experiment.arms[0], "cost")
-    assert (curve.low, curve.high) == (None, None)

@@ -1,8 +1,6 @@
 """A sweep over the fake task, and over trials whose outcome is made up."""
 
 import csv
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -151,12 +149,6 @@ def test_a_violation_ranks_below_every_return_at_cost_zero():
     assert made.best_trial.number == 3  # Optuna's own opinion
 
 
-def test_the_help_does_not_import_optuna():
-    code = "import sys; from safe_wrappers.train.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
-    code += "assert not {'optuna', 'ray'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
-
-
 # What may be searched -----------------------------------------------------------------------------
 
 
@@ -174,7 +166,8 @@ ENVS = {"n_envs": {"low": 1, "high": 2}}
         ({"arms.filterd.filter": {"choices": ["none", "protect"]}}, r"Did you mean 'filtered'"),
         ({MARGIN: {"low": 0.1}}, r"expected .*low"),
         ({MARGIN: {"low": 0, "high": 1, "log": True}}, r"expected .*low"),
-        ({MARGIN: {"low": 0, "high": 4, "step": 0.5}}, r"step"),
+        ({MARGIN: {"low": 0, "high": 4, "step": 0}}, r"expected .*low"),
+        ({MARGIN: {"low": 0, "high": 4, "step": "x"}}, r"expected .*low"),
         ({"total_steps": {"low": 100, "high": 500}}, r"compared at the same steps"),
         ({"n_envs": {"low": 0, "high": 5}}, r"n_envs: .*greater than or equal to 1"),
         (
@@ -186,11 +179,6 @@ ENVS = {"n_envs": {"low": 1, "high": 2}}
 def test_parameters_that_do_not_exist_or_are_refused(parameters, said):
     with pytest.raises(ConfigurationError, match=said):
         space(parameters)
-
-
-def test_an_arm_without_a_filter_anywhere_cannot_be_ranked():
-    with pytest.raises(ConfigurationError, match="return with the filter on, and there is no filter"):
-        space(ENVS, "arms={unfiltered: {filter: none}}")
 
 
 def test_a_trial_is_the_ranked_arm(tmp_path):

@@ -139,16 +139,6 @@ def test_a_crash_while_filming_does_not_fail_the_evaluation(evaluated, inline, m
     assert load_video(video_path(again, again.arms[0], "filter_off")) is None
 
 
-def test_nothing_is_filmed_that_the_config_does_not_want(evaluated, inline):
-    experiment = evaluated("evaluation.films=false")
-    assert said(experiment) == "" and inline == []
-
-
-def test_nothing_is_filmed_before_the_evaluation(fake_experiment, inline):
-    assert said(fake_experiment(ENV)) == ""
-    assert inline == []
-
-
 @pytest.mark.slow
 def test_in_processes_of_its_own_without_a_screen(evaluated, monkeypatch):
     experiment = evaluated("arms={unfiltered: {filter: none}}")

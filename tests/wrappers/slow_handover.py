@@ -226,19 +226,7 @@ class Slow:
         return plan
 
 
-def measured(commands, ticks, hold):
-    """Per control step: the three differences that end there, and whether they are a seam's."""
-    until, found = -1, []
-    for t, tick in enumerate(ticks):
-        if tick.seam:
-            until = t + tick.blend_steps + 2  # what was left of a blend before is not executed
-        orders = []
-        for order in (1, 2, 3):
-            if t < order:
-                orders.append(0.0)
-                continue
-            past = [np.asarray(c, dtype=np.float64) for c in commands[t - order : t + 1]]
-            weights = [(-1) ** (order - j) * math.comb(order, j) for j in range(order + 1)]
-            orders.append(float(np.abs(sum(w * c for w, c in zip(weights, past, strict=True))).max()))
-        found.append((orders, t <= until, orders[0] / hold))
-    return found
+def measured(commands, hold):
+    """Per control step the rate of the change that ends there."""
+    past = [np.asarray(c, dtype=np.float64) for c in commands]
+    return [0.0, *(float(np.abs(b - a).max()) / hold for a, b in itertools.pairwise(past))]

@@ -79,7 +79,6 @@ class LearnerConfig(Section):
 
     text_is: ClassVar[str] = "kind"
     _PENALISED: ClassVar = ("adaption_penalty", "both")
-    _PENALTIES: ClassVar = ("penalty", "per_correction")
 
     kind: Literal["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"] = "naive"
     """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ. `safe_set_map` is a
@@ -109,11 +108,6 @@ class LearnerConfig(Section):
         if given and not self.penalised:
             raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
         return self
-
-    @property
-    def penalties(self) -> dict[str, float]:
-        """The arguments of the AdaptionPenalty."""
-        return {name: getattr(self, name) for name in self._PENALTIES}
 
     @property
     def penalised(self) -> bool:
@@ -315,8 +309,8 @@ class SweepConfig(Section):
 
     parameters: Annotated[dict[str, Options], Field(min_length=1)]
     """The settings that are searched, by the keys of the command line (`hyperparameters.learning_rate`,
-    `arms.filtered.filter.protect.margin`), each with its range, `{low: 1e-5, high: 1e-3, log: true}` (two integers
-    give integers; `step` as Optuna has it), or its choices, `{choices: [...]}`."""
+    `arms.filtered.filter.protect.margin`), each with its range, `{low: 1e-5, high: 1e-3, log: true}` (integers
+    alone give integers; `step` as Optuna has it), or its choices, `{choices: [...]}`."""
     trials: Count = 20
     """How many are tried. May be raised later: the same command goes on."""
     at_once: Count = 1

@@ -268,7 +268,9 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
     end = max(run[-1, 0] for run in runs)
     for bins in range(_MOST_BINS, 0, -1):
         edges = np.linspace(0, end, bins + 1)
-        means = np.array([_means(edges, *run.T) for run in runs])
+        # A bin's right end is its own; steps are whole numbers.
+        binned = [stats.binned_statistic(run[:, 0] - 0.5, run[:, 1], "mean", edges) for run in runs]
+        means = np.array([bins_of_run.statistic for bins_of_run in binned])
         if np.isfinite(means).all():
             break
     low = high = None
@@ -277,8 +279,3 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
     elif len(means) > 1:
         low, high = means.min(axis=0), means.max(axis=0)
     return Curve((edges[:-1] + edges[1:]) / 2, interquartile_mean(means, axis=0), low, high, means)
-
-
-def _means(edges: Array, at: Array, values: Array) -> Array:
-    """Means of the values in each bin, whose right end is its own; NaN in an empty one. Steps are whole numbers."""
-    return np.asarray(stats.binned_statistic(at - 0.5, values, "mean", edges).statistic)

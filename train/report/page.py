@@ -24,8 +24,8 @@ from ..evaluation.summary import (
     learning_curve,
     over_seeds,
 )
-from ..files import write_text
-from ..run.folder import finished_facts
+from ..files import read_json, write_text
+from ..run.folder import FINISHED_FILE
 from ..videos import load_video, video_path
 from .figures import CONDITIONS, Picture, curve_picture, data_uri, place_pictures, refusals
 from .tables import SHORT, every_metric, short_rows
@@ -139,7 +139,7 @@ def about(experiment: ExperimentConfig) -> str:
     """What was trained on what, for how long, and how it was judged."""
     kinds = ", ".join(dict.fromkeys(f"{arm.algorithm} on {arm.env.id}" for arm in experiment.arms))
     steps = sorted(  # whole rollouts, which may be more than `total_steps`
-        int(finished_facts(experiment.run_folder(arm, seed)).get("timesteps", arm.total_steps))
+        int(read_json(experiment.run_folder(arm, seed) / FINISHED_FILE).get("timesteps", arm.total_steps))
         * arm.action_repeat
         for arm in experiment.arms
         for seed in experiment.seeds

@@ -22,18 +22,9 @@ EPISODES: Final = "episodes.csv"
 TENSORBOARD: Final = "tensorboard"
 
 
-def finished_facts(folder: Path) -> dict[str, Any]:
-    """What a run noted when it was finished: `timesteps` and times; empty before that.
-
-    Raises:
-        RunStateError: The note is unreadable.
-    """
-    return read_json(folder / FINISHED_FILE)
-
-
 def is_finished(arm: ArmConfig, folder: Path) -> bool:
     """Whether the run has made its steps."""
-    return int(finished_facts(folder).get("timesteps", -1)) >= arm.total_steps
+    return int(read_json(folder / FINISHED_FILE).get("timesteps", -1)) >= arm.total_steps
 
 
 def check_finished(arm: ArmConfig, folder: Path) -> None:

@@ -46,7 +46,7 @@ class SupportMargin(Constraint):
 class BoundSupportMargin(BoundSlacks):
     """SupportMargin on a plant."""
 
-    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_ZMP_MARGIN, keys.WHOLE_BODY_SUPPORTED)
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_ZMP_MARGIN,)
     spec: SupportMargin
 
     def __init__(self, spec: SupportMargin, plant: Plant) -> None:
@@ -74,10 +74,9 @@ class BoundSupportMargin(BoundSlacks):
         return np.array([min(left, default=0.0)])
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info keys `whole_body/zmp_margin` and `whole_body/supported`: forecast for the executed control."""
-        least, share = 0.0, 0.0
+        """The info key `whole_body/zmp_margin`: forecast for the executed control."""
+        least = 0.0
         if executed is not None:
             found = self.plant.contact_forecast(executed)
-            distances = self._distances(found) if found.finite else []
-            least, share = min(distances, default=0.0), len(distances) / found.steps
-        return {keys.WHOLE_BODY_ZMP_MARGIN: least, keys.WHOLE_BODY_SUPPORTED: share}
+            least = min(self._distances(found), default=0.0) if found.finite else 0.0
+        return {keys.WHOLE_BODY_ZMP_MARGIN: least}

@@ -5,7 +5,7 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, positive
+from safe_wrappers.checks import Array, check_fields, positive, true_or_false
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory
@@ -56,8 +56,7 @@ class SpeedLimit(RolloutConstraint):
     def __post_init__(self) -> None:
         self._check_shared()
         check_fields(self, positive, ("limit", "look_ahead_below"), "m/s")
-        if not isinstance(self.euler_look_ahead, bool):
-            raise ConfigurationError(f"euler_look_ahead is True or False, got {self.euler_look_ahead!r}")
+        self.euler_look_ahead = true_or_false("euler_look_ahead", self.euler_look_ahead)
         if self.margin >= self.limit:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
         if self.direction not in DIRECTIONS:

@@ -1,4 +1,4 @@
-"""Contacts: residuals of rigid ones; restitution and impulse; peak force and the use of brakes of elastic ones.
+"""Contacts: residuals of rigid ones; peak force and the use of brakes of elastic ones.
 
 Source: appendix "Rigid Body Contact Mechanics", "Non-smooth collision manifolds and velocity jumps" and
 "Elastodynamic impact force and compliance deformation". The elastic part is one mass on one massless linear spring
@@ -48,26 +48,6 @@ def in_series(*parts: ArrayLike) -> Array:
     """
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / sum(1.0 / _positive("what is in series", part) for part in parts))
-
-
-def restitution_velocity(velocity: ArrayLike, restitution: ArrayLike) -> Array:
-    """Normal velocity after a frictionless impact against a plane at rest, `v+ = -e v-`, shape (...), m/s.
-
-    Args:
-        velocity: Normal velocity v- before, m/s, shape (...), of two free bodies the relative one: negative
-            approaches; what separates is returned as it is.
-        restitution: e, from 0 (plastic) to 1 (elastic), shape (...).
-    """
-    v, e = finite_arrays(velocity=velocity, restitution=restitution)
-    if not ((e >= 0.0) & (e <= 1.0)).all():
-        raise ConfigurationError(f"restitution must be between 0 and 1, got {e}")
-    return np.asarray(np.where(v < 0.0, -e * v, v))
-
-
-def normal_impulse(mass: ArrayLike, velocity: ArrayLike, restitution: ArrayLike) -> Array:
-    """Impulse of that impact, `P = m (v+ - v-)`, shape (...), N s; the effective mass m along the normal in kg."""
-    m, v = finite_arrays(mass=_positive("mass", mass), velocity=velocity)
-    return np.asarray(m * (restitution_velocity(v, restitution) - v))
 
 
 def peak_force(speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike) -> Array:

@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, finite_array
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from scipy.spatial.transform import RigidTransform
+    from scipy.spatial.transform import RigidTransform, Rotation
 
-GRAVITY: Final = (0.0, 0.0, -9.81)
-"""m/s², in a world whose z points up: MuJoCo's default."""
-
-_ROTATION_TOLERANCE = 1e-6
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+_SHARES, _PARTS = 0.5 * (_NODES + 1.0)[:, None], 0.5 * _WEIGHTS
+"""Gauss's nodes, shape (3, 1), and weights, (3,), on an interval of length 1."""
 
 
-def lever_arm_acceleration(
+def centre_acceleration(
     acceleration: Array, angular_velocity: Array, angular_acceleration: Array, arm: Array
 ) -> Array:
-    """Acceleration of P, m/s², from that of O.
+    """Acceleration of O, m/s², from that of P: a_O = a_P - α x r - ω x (ω x r).
 
     Args:
-        acceleration: Of O, shape (..., 3), m/s²: the derivative of its velocity, free of gravity's sign conventions.
+        acceleration: Of P, shape (..., 3), m/s²: the derivative of its velocity, free of gravity's sign conventions.
         angular_velocity: Of the body, shape (..., 3), rad/s.
         angular_acceleration: Of the body, shape (..., 3), rad/s².
         arm: P - O, shape (..., 3), m, in the same axes as the others.
@@ -35,56 +33,15 @@ def lever_arm_acceleration(
         ConfigurationError: Vectors that are not of three finite numbers.
     """
     check_vectors(acceleration, angular_velocity, angular_acceleration, arm)
-    extra = _lever_terms(angular_velocity, angular_acceleration, arm)
-    return finite_result(acceleration + extra, acceleration, angular_velocity, angular_acceleration, arm)
-
-
-def centre_acceleration(
-    acceleration: Array, angular_velocity: Array, angular_acceleration: Array, arm: Array
-) -> Array:
-    """Acceleration of O, m/s², from that of P: the inverse of `lever_arm_acceleration`."""
-    check_vectors(acceleration, angular_velocity, angular_acceleration, arm)
-    extra = _lever_terms(angular_velocity, angular_acceleration, arm)
+    extra = cross(angular_acceleration, arm) + cross(angular_velocity, cross(angular_velocity, arm))
     return finite_result(acceleration - extra, acceleration, angular_velocity, angular_acceleration, arm)
 
 
-def rigid_transform(rotation: ArrayLike, position: ArrayLike) -> RigidTransform:
-    """A pose as SciPy's transform, refused if it is none (SciPy would turn any matrix into a rotation near it).
-
-    Args:
-        rotation: Shape (3, 3), or (n, 3, 3): columns are the frame's axes in the outer frame.
-        position: Of its origin there, shape (3,) or (n, 3), m.
-
-    Raises:
-        ConfigurationError: Not a rotation (not orthonormal, or a reflection), other shapes, not finite.
-    """
-    matrix = finite_array("rotation", rotation)
-    origin = finite_array("position", position)
-    if matrix.ndim not in (2, 3) or matrix.shape[-2:] != (3, 3) or origin.shape != matrix.shape[:-1]:
-        raise ConfigurationError(
-            f"expected a rotation (3, 3) and a position (3,), or n of each, got {matrix.shape} and {origin.shape}"
-        )
-    uneven = np.abs(matrix @ matrix.swapaxes(-1, -2) - np.eye(3)).max(initial=0.0)
-    if uneven > _ROTATION_TOLERANCE or (np.linalg.det(matrix) < 0.0).any():
-        raise ConfigurationError(
-            f"expected a rotation: columns of length 1 at right angles (here off by up to {uneven:.3g}) and "
-            f"determinant +1 (here {np.linalg.det(matrix).tolist()}); got {matrix.tolist()}"
-        )
+def rigid_transform(rotation: Array, position: Array) -> RigidTransform:
+    """A pose as SciPy's transform: the frame's axes as columns of a rotation (3, 3), and its origin (3,), m."""
     from scipy.spatial.transform import RigidTransform, Rotation  # here: SciPy takes a while to import
 
-    return RigidTransform.from_components(origin, Rotation.from_matrix(matrix))
-
-
-def _lever_terms(angular_velocity: Array, angular_acceleration: Array, arm: Array) -> Array:
-    return cross(angular_acceleration, arm) + cross(angular_velocity, cross(angular_velocity, arm))
-
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import RigidTransform, Rotation
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
-_SHARES, _PARTS = 0.5 * (_NODES + 1.0)[:, None], 0.5 * _WEIGHTS
-"""Gauss's nodes, shape (3, 1), and weights, (3,), on an interval of length 1."""
+    return RigidTransform.from_components(position, Rotation.from_matrix(rotation))
 
 
 class DeadReckoning:
@@ -100,8 +57,8 @@ class DeadReckoning:
         orientation: Of the body.
     """
 
-    def __init__(self, extrinsics: RigidTransform, gravity: ArrayLike = GRAVITY) -> None:
-        self.extrinsics, self.gravity = extrinsics, np.array(gravity, dtype=np.float64)
+    def __init__(self, extrinsics: RigidTransform, gravity: Array) -> None:
+        self.extrinsics, self.gravity = extrinsics, gravity.copy()
         self.position, self.velocity, self._rate = np.zeros(3), np.zeros(3), np.zeros(3)
         self.orientation: Rotation = extrinsics.rotation
 

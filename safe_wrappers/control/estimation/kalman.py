@@ -15,15 +15,10 @@ from safe_wrappers.checks import Array
 
 
 class Updated(NamedTuple):
-    """Mean (..., n) and covariance (..., n, n) after a measurement, innovation (..., m) and its covariance.
-
-    The innovation is the measured minus the expected measurement.
-    """
+    """Mean (..., n) and covariance (..., n, n) after a measurement."""
 
     mean: Array
     cov: Array
-    innovation: Array
-    innovation_cov: Array
 
 
 def predict(
@@ -70,6 +65,4 @@ def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> Upda
     return Updated(
         mean + (gain @ innovation[..., None])[..., 0],
         0.5 * (kept + np.swapaxes(kept, -1, -2)),
-        innovation,
-        innovation_cov,
     )

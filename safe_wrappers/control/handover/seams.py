@@ -20,8 +20,8 @@ from safe_wrappers.control.handover.smoothstep import smoothstep
 Blend = Literal["smoothstep", "quintic"]
 BLENDS: Final = ("smoothstep", "quintic")
 
-DIFFERENCES: Final = 3
-"""Orders of differences by which seams are measured: first, second, third."""
+LOOK_BACK: Final = 3
+"""Commands before a seam that its blend continues: position, first and second difference."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 
 State = tuple[ArrayLike, ArrayLike, ArrayLike]
-"""Position (m), velocity (m/s), acceleration (m/s^2), each of shape (..., axes) or scalar."""
+"""Position (m), velocity (m/s), acceleration (m/s^2), each of shape (axes,) or scalar."""
 
 _ROUNDING = 32.0 * float(np.finfo(np.float64).eps)
 """Relative bound on the accumulated rounding below."""
@@ -139,65 +139,45 @@ def admits(
         return np.asarray((lowest - slack <= way) & (way <= highest + slack) & np.isfinite(way))
 
 
-def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
-    """The shortest time, s, shape (...), in which all axes arrive at their end state together.
+def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> float:
+    """The shortest time, s, in which all axes arrive at their end state together.
 
     A start outside the limits is first brought back inside. inf where a state is not finite, and where the end state
     violates the limits: too fast, too strongly accelerated, or reached only from above the speed limit.
 
     Args:
-        start: Position, velocity, acceleration.
-        end: Likewise; the last axis holds the axes of the machine (a scalar is one axis), those before it the batch.
+        start: Position, velocity, acceleration, of each axis.
+        end: Likewise.
         limits: Of every axis.
 
     Raises:
         ConfigurationError: Where the shapes do not fit together, or ruckig finds no profile for other reasons.
     """
-    a_max, v_max, jerk = limits.arrays
-    given = [np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (*start, *end, a_max, v_max, jerk)]
+    given = [np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (*start, *end, *limits.arrays)]
     try:
-        p0, v0, a0, p1, v1, a1, a_lim, v_lim, j_lim = np.broadcast_arrays(*given)
+        p0, v0, a0, p1, v1, a1, a_max, v_max, jerk = np.broadcast_arrays(*given)
     except ValueError:
         shapes = ", ".join(str(x.shape) for x in given)
         raise ConfigurationError(f"states, limits need shapes that fit together, got {shapes}") from None
-    possible = np.all([np.isfinite(x) for x in (p0, v0, a0, p1, v1, a1)], axis=0)
     with np.errstate(invalid="ignore", over="ignore"):
         # With an end acceleration against the motion, the speed before was higher.
-        before = np.where(v1 * a1 < 0.0, 0.5 * a1 * (a1 / j_lim), 0.0)
-        possible &= (np.abs(v1) + before <= v_lim) & (np.abs(a1) <= a_lim)
-    whole = possible.all(axis=-1)
-    times = np.full(whole.shape, np.inf)
-    for i in np.ndindex(whole.shape):
-        if whole[i]:
-            states = ((p0[i], v0[i], a0[i]), (p1[i], v1[i], a1[i]))
-            times[i] = jerk_limited_profile(*states, (a_lim[i], v_lim[i], j_lim[i])).duration
-    return times
-
-
-def jerk_limited_profile(
-    start: tuple[Array, ...],
-    end: tuple[Array, ...],
-    limits: tuple[Array, ...],
-    interface: ruckig.ControlInterface = ruckig.ControlInterface.Position,
-) -> ruckig.Trajectory:
-    """Ruckig's profile between two finite states, axes along the only axis of the arrays."""
-    axes = len(start[0])
-    request = ruckig.InputParameter(axes)
-    request.control_interface = interface
-    request.current_position, request.current_velocity, request.current_acceleration = start
-    request.target_position, request.target_velocity, request.target_acceleration = end
-    request.max_acceleration, request.max_velocity, request.max_jerk = limits
-    trajectory = ruckig.Trajectory(axes)
+        before = np.where(v1 * a1 < 0.0, 0.5 * a1 * (a1 / jerk), 0.0)
+        possible = (np.abs(v1) + before <= v_max) & (np.abs(a1) <= a_max)
+    if not (possible.all() and all(np.isfinite(x).all() for x in (p0, v0, a0, p1, v1, a1))):
+        return math.inf
+    request, trajectory = ruckig.InputParameter(p0.size), ruckig.Trajectory(p0.size)
+    request.current_position, request.current_velocity, request.current_acceleration = p0, v0, a0
+    request.target_position, request.target_velocity, request.target_acceleration = p1, v1, a1
+    request.max_acceleration, request.max_velocity, request.max_jerk = a_max, v_max, jerk
     try:
-        ruckig.Ruckig(axes).calculate(request, trajectory)
+        ruckig.Ruckig(p0.size).calculate(request, trajectory)
     except ruckig.RuckigError as error:
         reason = str(error).strip().splitlines()[0]
-        told = [str(tuple(np.round(v, 6).tolist() for v in values)) for values in (start, end, limits)]
         raise ConfigurationError(
-            "ruckig found no profile from (position, velocity, acceleration) {} to {} within (acceleration, speed, "
-            "jerk) {}: {}".format(*told, reason)
+            f"ruckig found no profile from {start} to {end} (position, velocity, acceleration) within {limits}: "
+            f"{reason}"
         ) from error
-    return trajectory
+    return float(trajectory.duration)
 
 
 def checked_limits(

@@ -88,6 +88,14 @@ class Actuators(NamedTuple):
 
 
 @compiled
+def _gain(act: Actuators, i: int, length: Array, velocity: Array) -> float:
+    gain = act.gain[i, 0]
+    if act.gain_type[i] == _AFFINE_GAIN:
+        gain += act.gain[i, 1] * length[i] + act.gain[i, 2] * velocity[i]
+    return float(gain)
+
+
+@compiled
 def _acting_range(
     act: Actuators, length: Array, velocity: Array, control_dt: float, least: Array, most: Array
 ) -> None:
@@ -96,9 +104,7 @@ def _acting_range(
         low, high = -math.inf, math.inf
         if act.control_limited[i]:
             low, high = act.control_range[i, 0], act.control_range[i, 1]
-        scale, offset = act.gain[i, 0], 0.0
-        if act.gain_type[i] == _AFFINE_GAIN:
-            scale += act.gain[i, 1] * length[i] + act.gain[i, 2] * velocity[i]
+        scale, offset = _gain(act, i, length, velocity), 0.0
         if act.bias_type[i] == _AFFINE_BIAS:
             offset = act.bias[i, 0] + act.bias[i, 1] * length[i] + act.bias[i, 2] * velocity[i]
         least[i], most[i] = low, high
@@ -181,9 +187,7 @@ def _respond(
     for k in range(controls):
         if most[k] <= least[k]:
             continue
-        scale, acting = act.gain[k, 0], min(max(control[k], least[k]), most[k])
-        if act.gain_type[k] == _AFFINE_GAIN:
-            scale += act.gain[k, 1] * length[k] + act.gain[k, 2] * velocity[k]
+        scale, acting = _gain(act, k, length, velocity), min(max(control[k], least[k]), most[k])
         for place in range(starts[k], starts[k] + counts[k]):
             j = columns[place]
             for i in range(n):

@@ -69,11 +69,6 @@ def given_and_functions(model: Any, data: Any) -> tuple[Any, tuple[Any, Any]]:
     return own, (None if own is not None else model, data)
 
 
-def source_of(raw: Any, model: ModelOf | None, data: DataOf | None) -> Any:
-    """What has the unwrapped env's `.model` and `.data`: the env itself, where no function says otherwise."""
-    return raw if model is None and data is None else Accessed(raw, model, data)
-
-
 def checked_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
     """The env's own model, or a copy of the given one; or an error that says why a plant cannot use it."""
     if not isinstance(getattr(source, "model", None), mujoco.MjModel) or not hasattr(source, "data"):

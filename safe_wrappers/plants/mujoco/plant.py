@@ -90,7 +90,8 @@ class MujocoPlant(Plant):
         raw: Any = env.unwrapped
         env_checks.refuse_second_env(self._raw, env)
         env_checks.refuse_changed_actions(env)
-        self._source = binding.source_of(raw, *self._functions)
+        found_elsewhere = any(function is not None for function in self._functions)
+        self._source: Any = binding.Accessed(raw, *self._functions) if found_elsewhere else raw
         bound_before, self._raw, self._env = self._raw is not None, raw, env
         self._env_model = self.model = None
         self._take_model()
@@ -128,7 +129,8 @@ class MujocoPlant(Plant):
         self._idle = self.controls(np.clip(0.0, self.lower, self.upper))
         self.control_dt = env_checks.check_timing(self._env, self.substeps * float(model.opt.timestep))
         if moved:
-            self._new_snapshot()
+            self._nq, self._nv = int(model.nq), int(model.nv)
+            self._snapshot: Array = np.zeros(mujoco.mj_stateSize(model, STATE))
         self.frames = of_model.Frames(model, self.data)
         self._delay_steps = int(np.ceil(self.delay_s / model.opt.timestep - 1e-9))
         self._pending = deque(self._pending, maxlen=max(1, -(-self._delay_steps // self.substeps)))
@@ -241,10 +243,6 @@ class MujocoPlant(Plant):
             self._recorder.act(self.data, control)
             mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
         self._keep()
-
-    def _new_snapshot(self) -> None:
-        self._nq, self._nv = int(self.model.nq), int(self.model.nv)
-        self._snapshot: Array = np.zeros(mujoco.mj_stateSize(self.model, STATE))
 
     def _keep(self) -> None:
         """Make the data's state the present one."""

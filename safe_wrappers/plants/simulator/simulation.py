@@ -237,7 +237,11 @@ def other_noise(env: Env, seed: int) -> Iterator[None]:
     before = [_state(one) for one in generators]
     try:
         for number, one in enumerate(generators):
-            _reseed(one, np.random.SeedSequence([0x5AFE, seed, number]))
+            fresh = np.random.SeedSequence([0x5AFE, seed, number])
+            if isinstance(one, np.random.Generator):
+                one.bit_generator.state = type(one.bit_generator)(fresh).state
+            else:
+                one.seed(int(fresh.generate_state(1)[0]))
         yield
     finally:
         for one, state in zip(generators, before, strict=True):
@@ -259,17 +263,6 @@ def _set_state(generator: Any, state: Any) -> None:
         generator.setstate(state)
     else:
         generator.set_state(state)
-
-
-def _reseed(generator: Any, seed: np.random.SeedSequence) -> None:
-    if isinstance(generator, random.Random):
-        generator.seed(int(seed.generate_state(1)[0]))
-        return
-    state = _state(generator)
-    fresh = getattr(np.random, state["bit_generator"])(seed).state
-    # A RandomState keeps half of a pair of Gaussian numbers beside its bits.
-    gauss = {"has_gauss": 0, "gauss": 0.0} if isinstance(generator, np.random.RandomState) else {}
-    _set_state(generator, fresh | gauss)
 
 
 _LONGEST = 10  # steps that are simulated ahead before the env makes them
