@@ -98,6 +98,16 @@ def test_from_inside_a_disc_both_searches_lead_out():
         np.testing.assert_allclose(decisions[0].control, decisions[1].control, atol=1e-9)
         changed += decisions[0].changed
     assert changed > 5
+    with pytest.warns(sw.UnsafeStateWarning):
+        env.reset(seed=0, options={"layout": layout})
+    values = []
+    for _ in range(60):  # the backup alone leads out, too, and stays out
+        env.filter.observe()
+        control = env.filter.bound[0].backup()
+        values.append(float(env.filter.bound[0].value()[0]))
+        env.env.step(control)
+        env.filter.executed(control)
+    assert values[0] < -0.2 and values[-1] > 0.05 and np.diff(values).min() > -1e-3
 
 
 def together(scenes, bounds, single):
