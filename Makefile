@@ -21,11 +21,11 @@ endif
 
 # First the policies that ship with the repository, each in a process of its own, then two that are trained here.
 ENJOY = $(BIN)/safe-wrappers enjoy configs/policies/
-ALL = --filter both --episodes 20 --output runs/demo/shipped_
+FILM = --episodes 20 --output runs/demo/shipped_
 demo: .venv/installed
 	@echo "1 of 2: two policies that ship with the repository (configs/policies), each trained for 1,000,000 control steps:"
-	@$(ENJOY)unfiltered $(ALL)unfiltered.webp & unfiltered=$$!; \
-		$(ENJOY)filtered $(ALL)filtered.webp; filtered=$$?; wait $$unfiltered && exit $$filtered
+	@($(ENJOY)unfiltered --filter none $(FILM)unfiltered.webp && $(ENJOY)unfiltered --filter protect $(FILM)afterwards.webp) & \
+		unfiltered=$$!; $(ENJOY)filtered $(FILM)filtered.webp; filtered=$$?; wait $$unfiltered && exit $$filtered
 	@echo "2 of 2: two policies that are trained here, for two minutes each, then evaluated over 20 episodes:"
 	@$(BIN)/safe-wrappers compare configs/demo.yaml --report
 	@echo "This verdict is of the policies that were trained here; those of 1,000,000 control steps are at the top."

@@ -112,7 +112,8 @@ class CBFActionFilter(LayerWrapper):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take a state of `__getstate__`."""
-        vars(self).update(state)
+        super().__setstate__(state)
+        self.started = self.started and not isinstance(self.unwrapped, gym.utils.EzPickle)
         self._deciding = threading.Lock()
 
     def _take_action_space(self, env: Env) -> None:
@@ -153,10 +154,14 @@ class CBFActionFilter(LayerWrapper):
         self.filter.take_over(before[0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env and forget the episode: commands in flight, the last action, the warning."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self.plant.received(observation, info)
-        return observation, info | self.start_report()
+        """Reset the env and forget the episode: commands in flight, the last action, the warning.
+
+        Another thread's step is waited for, as another reset.
+        """
+        with self._deciding:
+            observation, info = self.env.reset(seed=seed, options=options)
+            self.plant.received(observation, info)
+            return observation, info | self.start_report()
 
     def start_report(self) -> dict[str, Any]:
         """Take the state that a reset has left: the info keys of a new episode."""

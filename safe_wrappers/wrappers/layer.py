@@ -41,6 +41,14 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         innermost = not any(isinstance(inner, LayerWrapper) for inner in wrappers_of(env))
         self._passes_numbers = innermost and isinstance(env.action_space, gym.spaces.Box)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a copy's state; one whose env is made anew by its constructor (EzPickle) awaits a reset."""
+        vars(self).update(state)
+        if isinstance(self.unwrapped, gym.utils.EzPickle):
+            for env in wrappers_of(self):
+                if isinstance(env, gym.wrappers.OrderEnforcing):
+                    env._has_reset = False
+
     def _pass_on(self, action: Any) -> Step:
         """Step the env with an action that this wrapper only passes on, to the env itself if it is finite."""
         self._refuse_what_is_not_finite(action)
