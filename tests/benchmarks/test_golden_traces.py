@@ -61,7 +61,7 @@ def test_every_env_is_recorded_and_most_are_filtered():
 
 
 def test_a_bit_that_differs_is_found(monkeypatch):
-    make, driver = runs()["Reacher-v5"]
+    make, driver, _ = runs()["Reacher-v5"]
     monkeypatch.setattr(golden_traces, "STEPS", 100)
     before = golden_traces.trace(make, driver["random"], 0)
 
