@@ -5,6 +5,7 @@ belongs to a wrapper of a later release and is left out here.
 """
 
 import warnings
+from unittest import mock
 
 import gymnasium as gym
 import numpy as np
@@ -395,3 +396,15 @@ def test_reset_forgets_the_last_action_and_the_commands_in_flight():
     with pytest.warns(UserWarning, match="not finite"):
         info = filtered.step(np.array([np.nan]))[4]
     np.testing.assert_array_equal(info["executed_action"], [0.0])
+
+
+def test_after_a_reset_that_a_constraint_refuses_no_step_is_made():
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
+    refuses = mock.patch.object(env.filter.bound[0], "check", side_effect=ConfigurationError("not from here"))
+    for _ in range(2):
+        with refuses, pytest.raises(ConfigurationError):
+            env.reset(seed=0)
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(env.action_space.low)
+        env.reset(seed=0)
+        env.step(env.action_space.low)
