@@ -103,7 +103,7 @@ class CBFActionFilter(LayerWrapper):
         self.filter = self._filter()
         self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
-        self._deciding = threading.Lock()
+        self._deciding = threading.RLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the lock, which no copy shares."""
@@ -112,7 +112,7 @@ class CBFActionFilter(LayerWrapper):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take a state of `__getstate__`."""
         super().__setstate__(state)
-        self._deciding = threading.Lock()
+        self._deciding = threading.RLock()
 
     def _take_action_space(self, env: Env) -> None:
         space = check_actions(env)
@@ -189,10 +189,10 @@ class CBFActionFilter(LayerWrapper):
             self.filter_calls += 1
             observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
             self.plant.received(observation, info)
-        info |= report
-        info[keys.CBF_MISMATCH] = self.deviates()
-        if self.filter.reporting:
-            info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
+            info |= report
+            info[keys.CBF_MISMATCH] = self.deviates()
+            if self.filter.reporting:
+                info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
         return observation, reward, terminated, truncated, info
 
     def observe(self) -> None:
