@@ -93,7 +93,7 @@ def closing(model, qpos, qvel, normal, point):
     return float(normal @ jacobian @ qvel)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(6))
 def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     env, rng = Scene(ARM), np.random.default_rng(seed)
     env.data.qpos[:3], env.data.qvel[:3] = rng.uniform(-0.8, 0.8, 3), rng.uniform(-3.0, 3.0, 3)
