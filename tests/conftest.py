@@ -1,7 +1,11 @@
 """Hypothesis draws the same examples in every run; `make fuzz` draws others."""
 
 import gc
+import os
+import subprocess
+import sys
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 # The newcomer's command must not depend on luck. No time limits: machines differ, are busy, and may stall.
@@ -33,6 +37,18 @@ BEGIN = (
     "test_rendering",
 )
 """Files in the order in which parallel workers begin them; the others follow."""
+
+
+@pytest.fixture(scope="session")
+def gl() -> dict[str, str]:
+    """Environment variables with which another process draws frames here; this one may have been told not to."""
+    draw = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 32, 32).render()"
+    for choice in ("egl", "osmesa"):
+        environ = {**os.environ, "MUJOCO_GL": choice}
+        done = subprocess.run([sys.executable, "-c", draw], env=environ, capture_output=True, timeout=120)
+        if done.returncode == 0:
+            return environ
+    pytest.skip("neither EGL nor OSMesa draws a frame here (apt install libosmesa6)")
 
 
 def pytest_collection_finish() -> None:

@@ -93,6 +93,15 @@ def test_far_from_everything_nothing_is_forecast():
     assert constraint.value() == pytest.approx(2.8)
 
 
+def test_a_reach_that_is_broken_is_dropped_with_a_warning():
+    _, constraint, _ = bound([[0.2055, 0.0]], max_decrease=0.001)
+    with pytest.warns(UserWarning, match=r"farther than the declared max_decrease of 0\.001 m"):
+        assert not constraint.admits(FULL)
+    with warnings.catch_warnings(action="error"):
+        assert not constraint.admits(FULL)
+    assert constraint.max_decrease is None
+
+
 def test_the_outline_counts_where_it_should():
     """Beside a vase that its front corner would touch, the car may not turn to it; its origin is far enough."""
     vases = [[0.18, 0.16 + 0.1415 + 0.008]]

@@ -131,6 +131,30 @@ def test_what_is_left_is_what_mujoco_leaves():
     assert agreed > 8 and refused > 2, (agreed, refused)
 
 
+def test_discs_that_move_go_straight_on_and_standing_ones_stay():
+    class Published(gym.Wrapper):
+        balls = np.array([[0.0, 0.0, 7.0]])
+        rolling = np.array([[0.0, -1.0, 7.0]])
+        __slots__ = ()
+
+    def met(obstacle):
+        raw, plant, clearance = bound([obstacle], env=Published(gym.make("OccludedCrossing-v0")))
+        anew(raw, plant, clearance, np.array([0, -2.0, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
+        return clearance.value()[0], clearance.admits(np.zeros(3))
+
+    distance, admitted = met(sw.constraints.Discs("balls", 0.3, velocity_attribute="rolling"))
+    assert distance == pytest.approx(2.0 - 0.3 - RADIUS) and admitted
+    raw, plant, clearance = bound(
+        [sw.constraints.Discs("balls", 0.3, velocity_attribute="rolling")],
+        env=Published(gym.make("OccludedCrossing-v0")),
+    )
+    anew(raw, plant, clearance, np.array([0, -0.7, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
+    forward, aside = clearance.slack([0, 1, 0]), clearance.slack([1, 0, 0])
+    assert forward < aside  # it does not stand still: away to the side is the way
+    with pytest.raises(ConfigurationError, match="3-dimensional obstacles cannot meet a 2-dimensional point"):
+        met(sw.constraints.Discs("balls", 0.3))  # a ball that stands somewhere in the air
+
+
 def test_candidates_and_the_backup_are_admitted_and_the_nearest_comes_first():
     raw, plant, clearance = bound([TRUE_CARS, PILLARS])
     tried = 0

@@ -93,7 +93,27 @@ def closing(model, qpos, qvel, normal, point):
     return float(normal @ jacobian @ qvel)
 
 
-@pytest.mark.parametrize("seed", range(3))
+def value_at(env, constraint, speed, gap=None):
+    if gap is not None:
+        env.data.qpos[0] = env.data.qpos[0] + env.model.body("wall").pos[0] - 0.1 - gap - env.data.qpos[0]
+    env.data.qvel[0] = speed
+    return asked(env, constraint).value()
+
+
+def test_the_value_is_the_limit_less_the_peak_at_the_present_speed():
+    touching = value_at(slide(), limit(margin=5.0), 0.3, gap=-1e-7)
+    assert touching == pytest.approx(LIMIT - 0.3 * np.sqrt(K * MASS), abs=1e-2)  # 45 N
+    assert value_at(slide(), limit(), 3.0, gap=-1e-7) == pytest.approx(
+        LIMIT - 3.0 * np.sqrt(K * MASS), abs=1e-2
+    )
+    assert value_at(slide(), limit(), 0.3, gap=0.1) == pytest.approx(LIMIT - 0.3 * np.sqrt(K * MASS))
+    assert value_at(slide(), limit(), 3.0, gap=0.1) == 0.0  # whether it brakes in time the forecast says
+    assert value_at(slide(), limit(), -3.0, gap=0.1) == LIMIT
+    pressed = value_at(slide(), limit(), 0.0, gap=-0.005)
+    assert pressed == pytest.approx(LIMIT - K * 0.005)
+
+
+@pytest.mark.parametrize("seed", range(6))
 def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     env, rng = Scene(ARM), np.random.default_rng(seed)
     env.data.qpos[:3], env.data.qvel[:3] = rng.uniform(-0.8, 0.8, 3), rng.uniform(-3.0, 3.0, 3)
@@ -144,13 +164,6 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
 
 
 # What the world is like ---------------------------------------------------------------------------------------
-
-
-def value_at(env, constraint, speed, gap=None):
-    if gap is not None:
-        env.data.qpos[0] = env.data.qpos[0] + env.model.body("wall").pos[0] - 0.1 - gap - env.data.qpos[0]
-    env.data.qvel[0] = speed
-    return asked(env, constraint).value()
 
 
 def test_a_region_brings_its_spring_its_mass_and_its_limit():

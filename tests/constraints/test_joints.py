@@ -1,6 +1,7 @@
 """Limits on all joints: what an action moves without an actuator on the joint is not left out in silence."""
 
 import re
+import warnings
 
 import gymnasium as gym
 import mujoco
@@ -320,6 +321,47 @@ def test_no_step_that_is_not_flagged_leaves_the_range(env_id, driver):
 
 def test_far_inside_the_actions_pass_bit_for_bit():
     check_inactive("Reacher-v5", sw.constraints.JointPositionLimit(-6.0, 6.0, ["joint0"]), 1.0, 50)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "joint", "warned"),
+    [
+        (-90, 90, "joint0", True),
+        (None, 170.0, "joint1", True),
+        (-np.pi, np.pi, "joint0", False),
+        (-7.0, np.inf, "joint0", True),
+        (-90, 90, "slider", False),
+    ],
+)
+def test_bounds_of_a_hinge_beyond_a_full_turn_are_warned_of_as_degrees(lower, upper, joint, warned):
+    env = gym.make("InvertedPendulum-v5" if joint == "slider" else "Reacher-v5")
+    limit = sw.constraints.JointPositionLimit(lower, upper, [joint])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sw.CBFActionFilter(env, [limit])
+    said = [str(one.message) for one in caught]
+    assert any("np.deg2rad" in one and repr(joint) in one for one in said) == warned
+
+
+def test_a_hinge_that_the_model_lets_turn_often_is_not_warned_of():
+    env = gym.make("Reacher-v5")
+    env.unwrapped.model.jnt_limited[0], env.unwrapped.model.jnt_range[0] = 1, (-30.0, 30.0)
+    with warnings.catch_warnings(action="error"):
+        sw.CBFActionFilter(env, [sw.constraints.JointPositionLimit(-20.0, 30.1, ["joint0"])])
+
+
+def test_a_start_that_is_too_fast_slows_down():
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
+    filtered.reset(seed=0)
+    raw = filtered.unwrapped
+    raw.set_state(raw.data.qpos.copy(), np.array([9.0, -7.0, 0.0, 0.0]))
+    speeds = [9.0]
+    with pytest.warns(sw.UnsafeStateWarning):
+        for _ in range(40):
+            filtered.step(np.array([1.0, -1.0], np.float32))
+            speeds.append(np.abs(raw.data.qvel[:2]).max())
+    assert speeds[-1] <= 4.0 + 1e-6
+    assert speeds[1] < speeds[0]
 
 
 @pytest.mark.parametrize("start", [[1.7, 0.5], [-1.7, -1.65]])

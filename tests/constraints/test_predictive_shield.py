@@ -148,6 +148,79 @@ def test_a_set_that_is_not_reached_does_not_admit():
     assert not found.admits(np.zeros(1)) and -1e-12 < found.slack(np.zeros(1)) < 0.0
 
 
+def test_a_start_without_a_way_out_is_flagged():
+    env = sw.CBFActionFilter(Cart((WALL - 0.1, 2.0)), [shield()])
+    env.reset(seed=0)
+    info = env.step(np.ones(1))[4]
+    assert info["cbf/infeasible"] and info["cbf/fallback"] and info["executed_action"][0] == -TOP
+
+
+def test_the_survivor_of_the_last_step_is_asked_first():
+    calls = []
+
+    def named(name, action):
+        return lambda observation: calls.append(name) or [action]
+
+    constraint = shield(backup=[named("go", 1.0), named("stop", -1.0)], terminal=None, horizon=12)
+    found = asked(constraint, (WALL - 0.8, 1.0))
+    assert found.admits(np.zeros(1)) and calls[0] == "go" and calls[-1] == "stop"
+    found.executed(np.zeros(1))
+    found.plant.observe()
+    calls.clear()
+    found.admits(np.array([-1.0]))
+    assert set(calls) == {"stop"}  # it survives: nobody else is asked
+
+
+class Settable(gym.Env):
+    """The state is the last action."""
+
+    observation_space = gym.spaces.Box(-9.0, 9.0, (2,), np.float64)
+
+    def __init__(self, space):
+        self.action_space = space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2), {}
+
+    def step(self, action):
+        return np.ravel(action).astype(float)[:2], 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("backup", [[0, 0, 1.0], [0, 0, 1], (0.0, 0.0, 1.0), np.array([0, 0, 1])])
+def test_numbers_as_many_as_the_action_has_are_one_backup(backup):
+    space = gym.spaces.Box(-1.0, 1.0, (3,), np.float64)
+    found = asked(shield(h=lambda o: 1.0, backup=backup, terminal=None), env=Settable(space))
+    np.testing.assert_array_equal(found.backup(), [0.0, 0.0, 1.0])
+
+
+def test_whole_numbers_are_one_action_of_many_parts_or_several_of_one():
+    parts = gym.spaces.MultiDiscrete([2, 3])
+    several = shield(h=lambda o: 1.0 if o[0] == 1.0 else -1.0, backup=[0, 1], terminal=None)
+    env = sw.ActionShield(Settable(gym.spaces.Discrete(3)), [several])
+    env.reset(seed=0)
+    assert env.step(2)[4]["executed_action"] == [1]
+    one = sw.ActionShield(Settable(parts), [shield(h=lambda o: float(o[1]), backup=[0, 2], terminal=None)])
+    one.reset(seed=0)
+    np.testing.assert_array_equal(one.filter.bound[0].backup(), [0.0, 2.0])
+
+
+def test_margin_and_max_decrease():
+    assert asked(shield(margin=0.5), (0.0, 0.0)).slack(np.zeros(1)) == pytest.approx(4.5)
+    env = sw.CBFActionFilter(Cart(), [shield()], margin=0.25)
+    assert env.constraints[0].margin == 0.25
+    counted = []
+    far = asked(shield(h=lambda o: counted.append(o) or wall(o), max_decrease=2.0, terminal=None))
+    assert far.admits(np.ones(1)) and len(counted) == 1
+    reserved = asked(
+        shield(h=lambda o: counted.append(o) or wall(o), max_decrease=2.0, margin=0.5), (2.8, 0.0)
+    )
+    counted.clear()
+    assert reserved.admits(np.zeros(1)) and len(counted) == 2
+    near = asked(shield(h=lambda o: counted.append(o) or wall(o), max_decrease=2.0), (3.5, 0.0))
+    assert near.admits(np.zeros(1)) and len(counted) > 2
+
+
 def test_an_episode_that_ends_has_survived():
     short = gym.wrappers.TimeLimit(Cart((0.0, 2.0)), 4)
     assert asked(shield(horizon=5), env=short).admits(np.zeros(1))  # it does not come to rest in four steps

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 from asking import asked, bound
-from judged_loops import DRIVERS, Scene, drive
+from judged_loops import DRIVERS, Judge, Scene, drive
 
 import safe_wrappers as sw
 from safe_wrappers.control.filtering.manipulability import validated_threshold
@@ -196,6 +196,24 @@ def check_closed_loop(case, driver, steps, seeds, plant=None, **more):
 @pytest.mark.parametrize("case", CASES)
 def test_no_step_that_is_not_flagged_goes_below_the_threshold(case, driver):
     check_closed_loop(case, driver, 45, [1])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_from_the_stretched_start_it_comes_back_and_says_so(case):
+    _, threshold, _, room = CASES[case]
+    env = filtered(case)
+    judge = Judge(env, room(threshold))
+    with pytest.warns(sw.UnsafeStateWarning):
+        env.reset(seed=0)
+        rooms, unsafe = [judge.at(judge.raw.data)], []
+        assert rooms[0] < -0.5
+        for _ in range(30):
+            _, end, _, info = judge.step(env, np.zeros(env.action_space.shape, np.float32))
+            rooms.append(end)
+            unsafe.append(info["cbf/unsafe"])
+    inside = int(np.argmax(np.array(rooms) >= -1e-6))
+    assert 0 < inside <= 25 and min(rooms[inside:]) >= -1e-6
+    assert all(unsafe[: inside - 1]) and not any(unsafe[inside + 1 :])
 
 
 def test_far_above_the_threshold_the_actions_pass_bit_for_bit():

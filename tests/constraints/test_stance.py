@@ -146,6 +146,20 @@ def test_an_inset_of_the_zero_moment_point_is_kept_by_the_forces():
     assert verdicts == [True, False]
 
 
+def test_joints_are_predicted_to_stay_in_range():
+    env = table(range_='limited="true" range="-.1 .1"')
+    inside, alone = sw.constraints.Stance(1.0, joint_tolerance=0.0), sw.constraints.Stance(1.0, **STANCE)
+    env.start = np.r_[0, 0, 3, 1, 0, 0, 0, np.zeros(4)], np.zeros(10)
+    for speed, fits in ((0.5, True), (30.0, False)):
+        answers = []
+        for spec in (inside, alone):
+            stance = settled(env, spec, STILL, 0)
+            env.data.qvel[6:] = speed  # in the air; 0.01 s to go
+            stance.plant.observe()
+            answers.append(stance.admits(np.zeros(4)))
+        assert answers == [fits, True]
+
+
 @pytest.mark.parametrize("env_id", ["Humanoid-v5", "Ant-v5", "HalfCheetah-v5"])
 @pytest.mark.parametrize("cone", ["pyramid", "exact"])
 def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):

@@ -72,6 +72,22 @@ def hull_distance(contacts):
     return -float((hull.equations @ [*centre, 1.0]).max())
 
 
+@pytest.mark.parametrize(
+    "env",
+    [
+        table([(-0.2, 0.0), (0.2, 0.0)]),  # a line
+        table([(0.0, 0.0)]),  # a point
+        table(step=0.05),  # two heights
+        table(gravity="0 0 0.1"),  # in the air
+    ],
+)
+def test_where_there_is_no_polygon_nothing_is_asked(env):
+    limit = settled(env, sw.constraints.SupportMargin(0.1), np.zeros(1), 20)
+    for push in (-1.0, 0.0, 1.0):
+        assert limit.admits(np.array([push]))
+        assert limit.info(np.zeros(1), np.array([push])) == {"whole_body/zmp_margin": 0.0}
+
+
 def test_at_every_evaluation_it_is_the_distance_to_the_hull_of_all_contact_points():
     env = gym.make("Ant-v5")
     judge, plant = ConeJudge(env, 1.0), bound(env)

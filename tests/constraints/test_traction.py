@@ -168,6 +168,13 @@ def test_refused_at_construction(arguments, error, says):
         sw.SlipLimiter(env, **{"wheels": list(env.unwrapped.wheels)} | arguments)
 
 
+def test_twice_in_one_list_is_refused():
+    env = gym.make("SafeRover-v0")
+    front, rear = (sw.constraints.Traction([f"{axle}_left", f"{axle}_right"]) for axle in ("front", "rear"))
+    with pytest.raises(ConfigurationError, match="2 times"):
+        sw.CBFActionFilter(env, [front, rear])
+
+
 def test_an_env_without_a_model_is_refused():
     with pytest.raises(UnsupportedEnvError):
         sw.SlipLimiter(gym.make("Pendulum-v1"), wheels=["left"])

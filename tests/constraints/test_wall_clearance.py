@@ -1,5 +1,7 @@
 """WallClearance against MuJoCo itself: what is admitted stays clear, and is as close to what was asked as can be."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -127,6 +129,23 @@ def test_the_nearest_admitted_control_is_found():
                 assert np.linalg.norm(best - action) <= distance[found] + 1e-6
                 checked += 1
             env.step(action.astype(np.float32))
+
+
+@pytest.mark.parametrize("options", [{"velocity_clip": 5.0}, {}])
+@pytest.mark.parametrize("asked", [(1.0, 0.0), (0.0, 0.0), (-1.0, 0.3)])
+@pytest.mark.parametrize(
+    ("gap", "lost"), [(0.03, False), (0.001, True)], ids=["inside the margin", "at the wall"]
+)
+def test_from_outside_it_comes_back_and_stays(options, asked, gap, lost):
+    env = filtered(margin=0.05, **options)
+    placed(env, (2.0 - RADIUS - gap, -1.2))
+    with warnings.catch_warnings(action="ignore"):
+        infos = [env.step(np.array(asked, np.float32))[4] for _ in range(200)]
+    margins = np.array([info["cbf/margin"] for info in infos])
+    assert infos[0]["cbf/unsafe"] == lost and not infos[-1]["cbf/unsafe"]
+    assert margins.min() >= margins[0] - 1e-9 and margins[-1] >= 0.05 - 1e-6
+    back = int(np.argmax(margins >= 0.05 - 1e-6))
+    assert back < 120 and margins[back:].min() >= 0.05 - 1e-6
 
 
 def test_far_from_walls_actions_pass_bit_for_bit():

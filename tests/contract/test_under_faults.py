@@ -20,8 +20,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 from episodes import actions, plain, trace
-from wrapper_examples import CHUNKED, EXAMPLES, EXPORTED, ONLY_LOOKING, build
+from wrapper_examples import CHUNKED, EXAMPLES, EXPORTED, FILTERS, INSIDE, ONLY_LOOKING, build
 
+import safe_wrappers as sw
+from safe_wrappers import info as keys
 from safe_wrappers.errors import SafeWrappersError
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
@@ -30,14 +32,18 @@ BEFORE, LONG = 7, 25
 OURS = (SafeWrappersError, gym.error.ResetNeeded)
 PASSING = (*ONLY_LOOKING, "LeaseExpiry", "TeleopChannel")
 """They judge no action: what is finite goes on as it is."""
+FILTERED = (*FILTERS, *INSIDE, "ActionShield")
+"""They are filters, or have one inside."""
+READ_A_PLANT = (*FILTERED, "FilterObservation", "LeaseExpiry")
+"""They ask one for its state at every step, or before it."""
 FLAGS = (
-    "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/clipped", "cbf/intervened",
-    "handover/refused", "handover/starved", "handover/limited", "handover/clipped", "lease/refused", "lease/braking",
-    "lease/expired", "lease/clipped", "teleop/revoked", "teleop/lost", "teleop/clipped", "contact/partial",
-    "balance/partial", "occlusion/expired",
+    "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/intervened", "handover/refused",
+    "handover/starved", "handover/limited", "lease/refused", "lease/braking", "lease/expired", "teleop/revoked",
+    "contact/partial", "balance/partial", "occlusion/expired",
 )  # fmt: skip
 LESS_KNOWN = {"lease/remaining_s": -1, "teleop/round_trip_s": 1, "handover/latency": -1, "cbf/correction": 1}
 """Figures that say that something is not as usual, and in which direction."""
+assert {*FLAGS, *LESS_KNOWN} <= set(keys.KEYS)
 GATES = {}
 """By the id of a `Bottom`: events that a step is inside, and that it may go on. A copy has none."""
 
@@ -224,14 +230,16 @@ def test_a_solver_that_fails(session, kind):
 
 
 def test_a_plant_that_raises(session):
-    layer, found = session.env, None
-    while found is None and layer is not session.bottom:
-        found, layer = vars(layer).get("plant"), layer.env
-    if found is None:
-        pytest.skip("it has no plant")
-    with mock.patch.object(type(found), "observe", mock.Mock(side_effect=BrokenError("no state"))):
-        _, error, _, reached = session.step(session.actions[BEFORE])
-    assert isinstance(error, BrokenError) and (not reached or session.name == "FilterObservation")
+    broken = mock.Mock(side_effect=BrokenError("no state"))
+    with (
+        mock.patch.object(sw.MujocoPlant, "observe", broken),
+        mock.patch.object(sw.SimulatorPlant, "observe", broken),
+    ):
+        answer = session.step(session.actions[BEFORE])
+    assert broken.called == (session.name in READ_A_PLANT)
+    check(session, answer, allowed=(BrokenError,))
+    assert not broken.called or isinstance(answer[1], BrokenError)
+    assert not (broken.called and answer[3]) or session.name == "FilterObservation", "it reads after the step"
 
 
 @pytest.mark.parametrize("where", ["step", "reset"])
@@ -256,10 +264,10 @@ def test_a_clock_that_is_set(session, by_s):
     check(session, session.step(session.actions[BEFORE]), allowed=OURS)
 
 
+@pytest.mark.parametrize("session", FILTERED, indirect=True)
 @pytest.mark.parametrize("call", ["step", "reset"])
 def test_a_second_thread_waits_for_the_step_that_was_judged(session, call):
-    if filter_inside(session.env) is None:
-        pytest.skip("no filter: nothing is judged")
+    assert filter_inside(session.env) is not None
     gate = GATES[id(session.bottom)] = threading.Event(), threading.Event()
     again = {
         "step": lambda: session.env.step(session.actions[BEFORE]),

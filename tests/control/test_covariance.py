@@ -91,9 +91,9 @@ def test_a_drift_carries_as_integrated(seed, n, time, singular):
 
 
 def test_a_drift_over_a_long_time_settles():
-    for time, second in ((1.0, 2.0 * -np.expm1(-0.5)), (1e6, 2.0)):
+    for time, second in ((1.0, 2.0 * -np.expm1(-0.5)), (1e9, 2.0)):
         carried = discretise_drift(np.diag([-100.0, -0.5]), [3.0, 1.0], time)
-        np.testing.assert_allclose(carried, [0.03, second], rtol=1e-9)
+        np.testing.assert_allclose(carried, [0.03, second], rtol=1e-12)
 
 
 # Blind ------------------------------------------------------------------------------------------------------------

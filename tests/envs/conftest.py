@@ -1,6 +1,3 @@
-import subprocess
-import sys
-
 import gymnasium as gym
 import pytest
 
@@ -8,14 +5,6 @@ from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS, register_envs
 
 if not all(env_id in gym.registry for env_id in POINT_GOAL_IDS + CAR_GOAL_IDS):
     register_envs()
-
-
-@pytest.fixture(scope="session")
-def gl():
-    """Skips where frames cannot be drawn; asked in another process, which a broken GL may end."""
-    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 32, 32).render()"
-    if subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode:
-        pytest.skip("no working GL here (libosmesa6 and MUJOCO_GL=osmesa, or MUJOCO_GL=egl, are enough)")
 
 
 @pytest.fixture(params=POINT_GOAL_IDS + CAR_GOAL_IDS)

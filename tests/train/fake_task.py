@@ -104,7 +104,6 @@ def count(steps, progress):
 
     for at in range(0, steps + 1, max(steps // 4, 1)):
         progress.steps(at)
-        time.sleep(0.05)
     progress.say("a line to read")
     assert torch.get_num_threads() == 1
     assert os.environ["OMP_NUM_THREADS"] == "1"
@@ -126,8 +125,11 @@ def vanish(progress):
 
 
 def until_stopped(progress):
-    """A job that works until it is to stop."""
+    """A job that works until it is to stop; it says when it has begun."""
+    progress.say("working")
+    end = time.monotonic() + 60.0
     while not progress.stopping():
+        assert time.monotonic() < end, "nobody stopped it"
         time.sleep(0.05)
     raise RunStoppedError("stopped")
 

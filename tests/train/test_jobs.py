@@ -3,7 +3,6 @@
 import io
 import os
 import signal
-import threading
 
 import fake_task
 import pytest
@@ -48,10 +47,16 @@ def test_lines_in_a_file_and_failures_among_others():
 
 
 def test_a_signal_asks_jobs_to_stop_and_the_rest_do_not_begin():
-    text = io.StringIO()
+    class Signals(io.StringIO):
+        """A signal comes when the first job tells that it works."""
+
+        def write(self, text):
+            if "waits: working" in text:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return super().write(text)
+
+    text = Signals()
     jobs = [job("waits", fake_task.until_stopped), job("unwanted", fake_task.fail)]
-    timer = threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGTERM))
-    timer.start()
     with pytest.raises(Interrupted) as stopped:
         run_jobs(jobs, 1, Console(file=text, width=100), "Waiting")
     assert stopped.value.signum == signal.SIGTERM

@@ -78,17 +78,21 @@ def test_a_node_is_lost_and_its_run_goes_on_from_its_checkpoint_elsewhere(cluste
     kept = {}
 
     def lose_a_node():
+        end = time.monotonic() + 240.0
         while not all(list(folder.glob("checkpoints/step_*/state.json")) for folder in folders):
+            if time.monotonic() > end:
+                return  # nothing is kept: the test fails
             time.sleep(0.1)
         for folder in folders:
             at = max(int(path.name[5:]) for path in folder.glob("checkpoints/step_*"))
             kept[folder] = [row for row in read_rows(folder / "episodes.csv") if row["timesteps"] <= at]
         made.remove_node(nodes[0], allow_graceful=False)
 
-    loses = threading.Thread(target=lose_a_node)
+    loses = threading.Thread(target=lose_a_node, daemon=True)
     loses.start()
     train_experiment(experiment, console(), "ray")
     loses.join()
+    assert set(kept) == set(folders)
     for folder in folders:
         assert json.loads((folder / "finished.json").read_text())["timesteps"] == 8192
         rows = read_rows(folder / "episodes.csv")

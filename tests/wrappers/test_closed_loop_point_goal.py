@@ -160,4 +160,20 @@ def alone(hazards, agent=(0.0, 0.0, 0.0), **options):
     return env
 
 
-# Refusals -----------------------------------------------------------------------------------------------------
+def closest(env, action, steps):
+    near = math.inf
+    for _ in range(steps):
+        info = env.step(np.asarray(action, np.float32))[4]
+        assert info["cost_substep"] == 0.0
+        gaps = np.linalg.norm(env.unwrapped._path[:, None] - env.unwrapped.hazard_positions, axis=2)
+        near = min(near, gaps.min())
+    return near - 0.2
+
+
+def test_a_larger_margin_and_state_error_keep_it_farther_away():
+    plain, wide, unsure = (
+        closest(alone([[1.5, 0.0]], **o), [1.0, 0.0], 400)
+        for o in ({}, {"margin": 0.102}, {"state_error": 0.1})
+    )
+    assert wide == pytest.approx(plain + 0.1, abs=0.01)
+    assert unsure == pytest.approx(plain + 0.1, abs=0.01)

@@ -1,5 +1,6 @@
 """Limits on the positions and the speeds of hinges and slides, and which joints a constraint means."""
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -14,7 +15,7 @@ from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, SCALAR_JOINTS
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, HINGE, SCALAR_JOINTS
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
@@ -195,11 +196,27 @@ class BoundJointPositionLimit(BoundRollout):
                 f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {self._low[j]:g} to "
                 f"{self._high[j]:g} with a margin of {self.spec.margin:g} at both ends"
             )
+        self._warn_of_degrees(own)
         self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
         if not (self._below.any() or self._above.any()):
             named = ", ".join(repr(model.joint(j).name) for j in ids)
             raise ConfigurationError(
                 f"none of these joints has a range in the model: pass lower and upper ({named})"
+            )
+
+    def _warn_of_degrees(self, own: Array) -> None:
+        """Warn of a bound beyond a full turn and beyond twice the hinge's own range, shape (n, 2)."""
+        model: mujoco.MjModel = self.plant.model
+        given = np.column_stack([self._low, self._high])
+        known, farthest = (
+            np.abs(np.where(np.isfinite(ends), ends, 0.0)).max(axis=1) for ends in (own, given)
+        )
+        hinges = model.jnt_type[self._ids] == HINGE
+        for i in np.flatnonzero(hinges & (farthest > 2.0 * np.maximum(known, np.pi))):
+            warnings.warn(
+                f"JointPositionLimit keeps the hinge {model.joint(self._ids[i]).name!r} between {self._low[i]:g} and "
+                f"{self._high[i]:g} rad, and a full turn is 6.28 rad. If these are degrees, give np.deg2rad of them",
+                stacklevel=2,
             )
 
     def now(self) -> Array:

@@ -2,10 +2,10 @@
 
 Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1.
 
-An admissible nominal is returned bit for bit. One row is answered in closed form, several by daqp. Where daqp has no
-answer that passes the check, least distance programming by SciPy's non-negative least squares decides (Lawson and
-Hanson, "Solving Least Squares Problems", 1974, chapter 23): it is exact to rounding in thin wedges, and "infeasible"
-is believed only with multipliers that prove it. Calls share no state.
+An admissible nominal is returned bit for bit. Otherwise daqp answers. Where it has no answer that passes the check,
+least distance programming by SciPy's non-negative least squares decides (Lawson and Hanson, "Solving Least Squares
+Problems", 1974, chapter 23): it is exact to rounding in thin wedges, and "infeasible" is believed only with
+multipliers that prove it. Calls share no state.
 """
 
 import functools
@@ -283,9 +283,6 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
     if asking < 0:
         return _without_program(p, asking)
     clipped = p.control.copy()
-    if asking <= 1:
-        _, within, violation = _judge(p, unit, *_along_one_row(p, unit))
-        return Projection(p.control, _status(within), violation)
     closest, within, violation = _judge(p, unit, *_by_daqp(p))
     if closest:
         return Projection(p.control, _status(within), violation)
@@ -322,36 +319,6 @@ def _without_program(p: _Problem, code: int) -> Projection:
 
 _Answer = tuple[Array, Array]
 """Of the program: the control, shape (m,), and multipliers of the box (below 0: of lower bounds) and the rows."""
-
-
-def _along_one_row(p: _Problem, unit: float) -> _Answer:
-    """The first point of `clip(u - t row)`, t >= 0, that keeps the only row that asks; else the corner against it."""
-    u, m, multipliers = p.target, p.u.size, np.zeros(len(p.upper))
-    lo, hi = p.lo / unit, p.hi / unit
-    if not p.rows[_LENGTH].any():
-        return np.clip(u, lo, hi), multipliers
-    which = int(p.rows[_LENGTH].argmax())
-    row, offset = p.normals[which], p.upper[m + which]
-    x = u - max(row @ u - offset, 0.0) * row
-    if bool(((x >= lo) & (x <= hi) & (u >= lo) & (u <= hi)).all()):
-        return x, multipliers
-    with np.errstate(all="ignore"):
-        ends = np.concatenate([(u - lo) / row, (u - hi) / row])
-    # Where a component leaves a bound or ends at one.
-    ends = np.append(0.0, np.unique(ends[np.isfinite(ends) & (ends > 0.0)]))
-    points = np.clip(u - ends[:, None] * row, lo, hi)
-    first = int(np.append(points @ row <= offset, True).argmax())
-    if not first:
-        return points[0], multipliers
-    middle = 0.5 * (ends[first - 1] + ends[first]) if first < len(ends) else ends[-1] + 1.0
-    x = u - middle * row
-    moving = (x > lo) & (x < hi) & (row != 0.0)
-    x = np.clip(x, lo, hi)
-    if moving.any():
-        part = row[moving]
-        time = (row[~moving] @ x[~moving] + part @ u[moving] - offset) / (part @ part)
-        x[moving] = u[moving] - time * part
-    return x, multipliers
 
 
 def _by_daqp(p: _Problem, sense: int = 0) -> _Answer:
