@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import fcntl
 import io
 import json
 import os
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from filelock import FileLock, Timeout
 from rich.console import Console
 
 from safe_wrappers.errors import RunStateError
@@ -108,16 +107,11 @@ def only_writer(folder: Path) -> Iterator[None]:
         RunStateError: Another process holds it for more than 5 s.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    end = time.monotonic() + _PATIENCE_S
-    with (folder / ".lock").open("a") as file:
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > end:
-                    raise RunStateError(
-                        f"Another process is working in {str(folder)!r}; wait for it, or end it first."
-                    ) from None
-                time.sleep(0.05)
+    try:
+        held = FileLock(folder / ".lock").acquire(_PATIENCE_S)
+    except Timeout:
+        raise RunStateError(
+            f"Another process is working in {str(folder)!r}; wait for it, or end it first."
+        ) from None
+    with held:
         yield
