@@ -20,7 +20,7 @@ from .evaluation.evaluate import typical_seed
 from .files import say, write_bytes, write_text
 from .policies import load_policy
 from .run.stack import make_env
-from .videos import drawing_without_a_screen, film_episode, for_film
+from .videos import drawing_without_a_screen, film_episode, for_film, without_gl
 
 Policy = Callable[[Any], Any]
 
@@ -54,11 +54,13 @@ def enjoy_command(
     mode = "human" if window else "rgb_array" if film is not None else None
     if mode is not None:
         with closing(trained.make_env("none")) as bare:
-            modes = bare.unwrapped.metadata.get("render_modes") or ()
+            modes, blind = bare.unwrapped.metadata.get("render_modes") or (), without_gl(bare)
         if mode not in modes:
             raise ConfigurationError(
                 f"{trained.arm.env.id} has no render mode {mode}; it has: {', '.join(modes)}"
             )
+        if blind is not None:
+            raise ConfigurationError(f"{'--render' if window else '--output'}: {blind}")
     found: list[dict[str, Any]] = []
     with closing(trained.make_env(action_filter, "human" if window else None)) as env:
         for seed in range(episodes):

@@ -63,6 +63,13 @@ def drawing_without_a_screen() -> Iterator[None]:
         yield
 
 
+def without_gl(env: gym.Env[Any, Any]) -> str | None:
+    """Says that MuJoCo is to draw an env and may not; None otherwise."""
+    if find_renderer(env) is None or hasattr(mujoco, "GLContext"):
+        return None
+    return f"MUJOCO_GL={os.environ.get('MUJOCO_GL')} has MuJoCo draw nothing."
+
+
 def for_film(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     """An env of which no frame was asked yet, as films show it: the robot in sight, and what its filter does."""
     set_size(env, WIDTH, HEIGHT)
@@ -198,14 +205,16 @@ def record_videos(experiment: ExperimentConfig, console: Console) -> None:
         folder = experiment.run_folder(arm, shown.seed)
         with contextlib.closing(make_env(arm.env.id, arm.env.kwargs)) as env:
             draws = "rgb_array" in (env.unwrapped.metadata.get("render_modes") or ())
+            blind = None if draws else f"{arm.env.id} draws no frames (it has no render mode rgb_array)."
+            blind = blind or without_gl(env)
         for condition, used in conditions(arm, experiment.evaluation_filter).items():
             path = video_path(experiment, arm, condition)
             state = _state(arm, used, shown, finished_checkpoint(arm, shown.seed, folder).timesteps)
             if read_json(path.with_suffix(".json")).get("state") == state and path.exists():
                 continue
             path.unlink(missing_ok=True)  # it shows another policy or episode
-            if not draws:
-                cannot.add(f"No videos: {arm.env.id} draws no frames (it has no render mode rgb_array).")
+            if blind is not None:
+                cannot.add(f"No videos: {blind}")
                 continue
             name = f"video {arm.name} {condition.replace('_', ' ')}"
             jobs.append(Job(name, 1, "episodes", record_video, (arm, shown, folder, used, path)))

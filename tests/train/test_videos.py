@@ -71,6 +71,7 @@ def said(experiment):
 
 
 def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(evaluated, inline, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disabled")  # the task paints its frames blue under EGL
     experiment = evaluated("arms.filtered.filter.kwargs.margin=0.6")  # so wide that it acts at once
     assert said(experiment) == ""
     shown = shown_episode(experiment)
@@ -99,7 +100,7 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             assert dot == pytest.approx((start.astype(int) + 0.5) * HEIGHT / 60, abs=4)
             assert frames.n_frames == 20
             frames.seek(19)
-            background = np.asarray(frames.convert("RGB"))[10, 10]
+            background = np.asarray(frames.convert("RGB"), dtype=int)[10, 10]
             assert background == pytest.approx([5 * 19] * 3, abs=6)
     assert changed > 0
 
@@ -122,6 +123,15 @@ def test_a_task_without_frames_is_not_asked_for_any(evaluated, inline):
     experiment = evaluated("env=fake_task:FakeGoal-v0")
     line = "fake_task:FakeGoal-v0 draws no frames (it has no render mode rgb_array)."
     assert said(experiment) == f"No videos: {line}\n"
+    assert inline == []
+
+
+def test_where_mujoco_may_not_draw_one_line_says_so_and_nothing_is_tried(evaluated, inline, monkeypatch):
+    experiment = evaluated()
+    monkeypatch.setattr(videos, "find_renderer", lambda env: object())
+    monkeypatch.delattr("mujoco.GLContext", raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "disabled")
+    assert said(experiment) == "No videos: MUJOCO_GL=disabled has MuJoCo draw nothing.\n"
     assert inline == []
 
 
