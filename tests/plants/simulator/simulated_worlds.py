@@ -100,14 +100,6 @@ class CloneCart(LockedCart):
         self.x, self.v = state
 
 
-class PickyCart(gym.utils.EzPickle, Cart):
-    """A copy by its own rules is a new cart."""
-
-    def __init__(self, start=(0.0, 0.0)):
-        gym.utils.EzPickle.__init__(self, start)
-        Cart.__init__(self, start)
-
-
 GRID = ["S..#", ".#..", "...#", "#..G"]
 MOVES = ((0, -1), (1, 0), (0, 1), (-1, 0))
 
