@@ -56,11 +56,11 @@ class InterventionEvalCallback(EvalCallback):
 
 
 def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:
-    """Adds one step of every env to the logger's running means."""
+    """Adds one step of every env to the logger's running means; NaN is no report."""
     for info in infos:
         for key in keys.KEYS.values():
-            if key.log and key.name in info:
-                logger.record_mean(f"interventions/step_{key.log}", key.number(info[key.name]))
+            if key.log and key.name in info and (number := key.number(info[key.name])) == number:
+                logger.record_mean(f"interventions/step_{key.log}", number)
 
 
 def log_episode(logger: Logger, info: Mapping[str, Any], prefix: str) -> None:

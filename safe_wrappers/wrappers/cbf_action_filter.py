@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
@@ -60,7 +59,7 @@ class CBFActionFilter(LayerWrapper):
         added_margin: Added to every constraint's own; `set_margin` changes it.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         warned: What has been warned of: "nonfinite", "clipped", "mismatch", and "unsafe" until the next reset.
-        started: Whether there was a reset.
+        started: Whether there is an episode: the last reset has not failed.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
     Raises:
@@ -102,9 +101,9 @@ class CBFActionFilter(LayerWrapper):
         self.plant.bind(env)
         self._fallback = fallback
         self.filter = self._filter()
-        self.started = self._observed = False
+        self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
-        self._deciding = threading.Lock()
+        self._deciding = threading.RLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the lock, which no copy shares."""
@@ -113,8 +112,7 @@ class CBFActionFilter(LayerWrapper):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take a state of `__getstate__`."""
         super().__setstate__(state)
-        self.started = self.started and not isinstance(self.unwrapped, gym.utils.EzPickle)
-        self._deciding = threading.Lock()
+        self._deciding = threading.RLock()
 
     def _take_action_space(self, env: Env) -> None:
         space = check_actions(env)
@@ -159,6 +157,7 @@ class CBFActionFilter(LayerWrapper):
         Another thread's step is waited for, as another reset.
         """
         with self._deciding:
+            self.started = False
             observation, info = self.env.reset(seed=seed, options=options)
             self.plant.received(observation, info)
             return observation, info | self.start_report()
@@ -166,7 +165,7 @@ class CBFActionFilter(LayerWrapper):
     def start_report(self) -> dict[str, Any]:
         """Take the state that a reset has left: the info keys of a new episode."""
         self.warned.discard("unsafe")
-        self.started, self._observed = True, False
+        self.started = self._observed = False
         self.filter.start()
         margin, unsafe = self._margin()
         report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
@@ -177,7 +176,9 @@ class CBFActionFilter(LayerWrapper):
         report[keys.PROPOSED_ACTION] = np.zeros(self._shape)
         report[keys.EXECUTED_ACTION] = np.zeros(self._shape)
         report[keys.CBF_STAGE] = int(Stage.PROPOSAL)
-        return report | self.filter.info(None, None)
+        report |= self.filter.info(None, None)
+        self.started = True
+        return report
 
     def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed; another thread waits meanwhile."""
@@ -188,10 +189,10 @@ class CBFActionFilter(LayerWrapper):
             self.filter_calls += 1
             observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
             self.plant.received(observation, info)
-        info |= report
-        info[keys.CBF_MISMATCH] = self.deviates()
-        if self.filter.reporting:
-            info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
+            info |= report
+            info[keys.CBF_MISMATCH] = self.deviates()
+            if self.filter.reporting:
+                info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
         return observation, reward, terminated, truncated, info
 
     def observe(self) -> None:
@@ -217,8 +218,7 @@ class CBFActionFilter(LayerWrapper):
 
         The env must be stepped with it next. The constraints' own keys are not among these.
         """
-        if not self.started:
-            raise gym.error.ResetNeeded("call reset before step")
+        self._refuse_without_reset()
         proposed: Array = action_array(action, self._shape, np.float64)
         if not self._observed:
             self.filter.observe()

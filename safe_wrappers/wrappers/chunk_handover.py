@@ -159,16 +159,19 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget all chunks; the delays' random numbers start anew with a seed."""
+        self.started = False
         observation, info = self.env.reset(seed=seed, options=options)
         self._random.reset(self.env, seed)
         self._fallback.reset()
         self._queue.reset()
         self._start()
         info.update(self._measured([], False, -1))
+        self.started = True
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Execute the next `execution_horizon` control steps, with this chunk from when it is there."""
+        self._refuse_without_reset()
         chunk = self._checked(action)
         self._warn_clipped(chunk)
         refused = not self._submit(chunk)

@@ -90,15 +90,18 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env, and what is on its way; the random numbers start anew with a seed."""
+        self.started = False
         observation, info = self.env.reset(seed=seed, options=options)
         self.random.reset(self.env, seed)
         self._start()
         self.begin()
         info[keys.FAULT_ACTIVE] = False
+        self.started = True
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Carry the action, or not, and step the env with what arrives."""
+        self._refuse_without_reset()
         self._refuse_what_is_no_action(action)
         given = None if self._observed_s is None else Carried(copy.copy(action), self._observed_s)
         arrived = self.carry(given, self.now_s)

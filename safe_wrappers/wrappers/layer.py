@@ -32,6 +32,8 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
     """A wrapper with a place in the stack, whose arguments are recorded in the env's spec."""
 
     layer: ClassVar[Layer]
+    started: bool = False
+    """Of those that remember commands: whether there is an episode, since the last reset has not failed."""
 
     def __init__(self, env: Env) -> None:
         refuse_vector_env(env, type(self).__name__)
@@ -45,9 +47,15 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         """Take a copy's state; one whose env is made anew by its constructor (EzPickle) awaits a reset."""
         vars(self).update(state)
         if isinstance(self.unwrapped, gym.utils.EzPickle):
+            self.started = False
             for env in wrappers_of(self):
                 if isinstance(env, gym.wrappers.OrderEnforcing):
                     env._has_reset = False
+
+    def _refuse_without_reset(self) -> None:
+        """Commands of another episode, or of none, are not executed."""
+        if not self.started:
+            raise gym.error.ResetNeeded("call reset before step; the last one may have failed")
 
     def _pass_on(self, action: Any) -> Step:
         """Step the env with an action that this wrapper only passes on, to the env itself if it is finite."""

@@ -128,12 +128,14 @@ class LeaseExpiry(CommandGate):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env; no command is in force."""
+        self.started = False
         observation, info = self.env.reset(seed=seed, options=options)
         self._fallback.reset()
         self._budget.reset()
         self._start(info)
         info[keys.LEASE_REMAINING_S] = 0.0
         info.update(dict.fromkeys((keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
+        self.started = True
         return observation, info
 
     def _start(self, info: dict[str, Any]) -> None:
@@ -146,6 +148,7 @@ class LeaseExpiry(CommandGate):
 
     def step(self, action: Any) -> Step:
         """Execute the action under its lease, the command in force under its own, or the fallback."""
+        self._refuse_without_reset()
         given = action_array(action, self._shape)
         self._warn_outside(given, "policy's")
         now = self.now_s

@@ -118,6 +118,7 @@ class TeleopChannel(CommandGate):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env; nothing is on its way, and the links' random numbers start anew with a seed."""
+        self.started = False
         observation, info = self.env.reset(seed=seed, options=options)
         self._up.reset(self.env, seed, first=None)
         self._down.reset(self.env, seed, first=Down(_copy(observation), 0.0, None))
@@ -129,10 +130,12 @@ class TeleopChannel(CommandGate):
         self._start(info)
         self._images: list[float] = [0.0]  # when the image was taken that was shown after each step
         self._report(info, 0.0, self._ceiling_s)
+        self.started = True
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Send the action, step the env with what has arrived, and return what has come back."""
+        self._refuse_without_reset()
         now_s = self.now_s
         self._send_up(self._sendable(action), now_s)
         arrived = self._up.receive(now_s)

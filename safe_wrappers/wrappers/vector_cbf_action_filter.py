@@ -126,6 +126,8 @@ class VectorCBFActionFilter(_Wrapper):
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all envs, or those of ``options["reset_mask"]``."""
         mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
+        for i in np.flatnonzero(mask).tolist():
+            self.filters[i].started = False
         # The vector env takes the mask out of its options.
         observations, infos = self.env.reset(seed=seed, options=options and dict(options))  # type: ignore[arg-type]
         self._ended[mask] = False
@@ -135,8 +137,8 @@ class VectorCBFActionFilter(_Wrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Filter the actions, shape (n, m), and step the envs with what may be executed."""
-        if not self.filters[0].started:
-            raise gym.error.ResetNeeded("call reset before step")
+        if not all(single.started for single in self.filters):
+            raise gym.error.ResetNeeded("call reset before step; the last one may have failed")
         started = time.perf_counter()
         given = action_array(actions, (self.num_envs, *self._low.shape))
         judged = ~self._ended if self._next_step else np.ones(self.num_envs, dtype=bool)

@@ -10,6 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import InterventionCallback, InterventionEvalCallback
+from safe_wrappers.sb3.callbacks import log_steps
 from safe_wrappers.wrappers.faults import DroppedRefreshes
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
@@ -137,3 +138,10 @@ def test_evaluation_reaches_tensorboard_at_its_own_step(tmp_path):
     assert (event.step, event.value) == (20, 0.25)
     assert np.isclose(events.Scalars("eval/interventions/cost")[0].value, 4.0)
     assert events.Scalars("eval/mean_reward")[0].step == 20
+
+
+def test_a_step_without_a_judgement_does_not_hide_the_mean_of_the_others(tmp_path):
+    logger = configure(str(tmp_path), ["tensorboard"])
+    log_steps(logger, [{keys.MAP_SCALE: 0.5}, {keys.MAP_SCALE: keys.NOT_JUDGED}, {keys.MAP_SCALE: 1.0}])
+    assert logger.name_to_value["interventions/step_map_scale"] == 0.75
+    logger.close()

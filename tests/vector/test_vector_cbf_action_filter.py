@@ -6,6 +6,7 @@ The oracle is Gymnasium's own vector env around `CBFActionFilter`s.
 import copy
 import dataclasses
 import functools
+from unittest import mock
 
 import gymnasium as gym
 import gymnasium_robotics
@@ -15,6 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_worlds import AtHazard, ScheduledCart, drift, push, read, slow
 
 import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.faults import Outages
 
 gym.register_envs(gymnasium_robotics)
@@ -273,3 +275,22 @@ def test_the_last_step_of_an_episode_is_reported_beside_envs_that_go_on():
     np.testing.assert_array_equal(finals["_executed_action"], [True, False])
     assert finals["cbf/intervened"][0] and finals["executed_action"][0] != 0.0
     assert_same(infos, others)
+
+
+def test_after_a_reset_that_one_env_refuses_no_step_is_made():
+    envs = sw.VectorCBFActionFilter(
+        gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="sync"),
+        [sw.constraints.JointSpeedLimit(limit=4.0)],
+    )
+    envs.reset(seed=0)
+    actions = np.zeros((2, 2), dtype=np.float32)
+    envs.step(actions)
+    refuses = mock.patch.object(
+        envs.filters[1].filter.bound[0], "check", side_effect=ConfigurationError("no")
+    )
+    with refuses, pytest.raises(ConfigurationError):
+        envs.reset(seed=0)
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.step(actions)
+    envs.reset(seed=0)
+    envs.step(actions)

@@ -4,7 +4,9 @@ The bugs seen in other filters are tested by their numbers in the names. The ten
 belongs to a wrapper of a later release and is left out here.
 """
 
+import threading
 import warnings
+from unittest import mock
 
 import gymnasium as gym
 import numpy as np
@@ -392,3 +394,56 @@ def test_reset_forgets_the_last_action_and_the_commands_in_flight():
     with pytest.warns(UserWarning, match="not finite"):
         info = filtered.step(np.array([np.nan]))[4]
     np.testing.assert_array_equal(info["executed_action"], [0.0])
+
+
+def test_after_a_reset_that_a_constraint_refuses_no_step_is_made():
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
+    refuses = mock.patch.object(env.filter.bound[0], "check", side_effect=ConfigurationError("not from here"))
+    for _ in range(2):
+        with refuses, pytest.raises(ConfigurationError):
+            env.reset(seed=0)
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(env.action_space.low)
+        env.reset(seed=0)
+        env.step(env.action_space.low)
+
+
+def test_a_step_is_compared_with_its_forecast_before_another_threads_step_begins():
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
+    env.reset(seed=0)
+    deviation, calls, others = env.plant.deviation, [], []
+
+    def look():
+        if not others:
+            others.append(threading.Thread(target=env.step, args=(env.action_space.low,)))
+            others[0].start()
+            others[0].join(0.2)
+            calls.append(env.filter_calls)
+        return deviation()
+
+    with mock.patch.object(env.plant, "deviation", look):
+        info = env.step(env.action_space.high)[4]
+        others[0].join(20.0)
+    assert calls == [1] and env.filter_calls == 2
+    assert not info["cbf/mismatch"]
+
+
+class Restarting(gym.Wrapper):
+    """An env that begins a new episode within a step, through the outermost wrapper."""
+
+    outermost = None
+
+    def step(self, action):
+        answer = self.env.step(action)
+        self.outermost.reset(seed=0)
+        return answer
+
+
+def test_an_env_may_reset_its_filter_within_a_step():
+    inner = Restarting(gym.make("Reacher-v5"))
+    env = inner.outermost = sw.CBFActionFilter(inner, [sw.constraints.JointSpeedLimit(limit=4.0)])
+    env.reset(seed=0)
+    step = threading.Thread(target=env.step, args=(env.action_space.low,), daemon=True)
+    step.start()
+    step.join(20.0)
+    assert not step.is_alive()

@@ -1,5 +1,6 @@
 """LeaseExpiry against a book-keeping written from its words, on carts that are driven at walls."""
 
+import copy
 import math
 import warnings
 
@@ -7,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from braked_cart import Book, BrakedCart, cart_plant, lease, lease_by_bisection, read_cart, stop, worst_way
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -432,3 +434,19 @@ def test_a_fallback_that_is_not_finite_or_outside_the_box_is_made_so():
         env.set_observation_time(None)
         env.step(FULL)
         assert cart.given[-1].tolist() == wanted
+
+
+def test_a_copy_of_an_env_that_is_made_anew_does_not_go_on_under_the_lease():
+    """Also where Gymnasium's OrderEnforcing is not around the env."""
+    rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
+    clearance = sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0)
+    env = sw.LeaseExpiry(InvertedPendulumEnv(), sw.StoppingBudget(clearance, acceleration=30.0))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(env.action_space.high)
+    env.reset(seed=0)
+    env.step(env.action_space.high)
+    copied = copy.deepcopy(env)
+    with pytest.raises(gym.error.ResetNeeded):
+        copied.step(env.action_space.high)
+    copied.reset(seed=0)
+    copied.step(env.action_space.high)
