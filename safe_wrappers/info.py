@@ -173,6 +173,11 @@ MAP_SCALE: Final = _key("map/scale", "float64", chunk="min", log="map_scale")
 """By what the distance of the policy's action from the anchor was multiplied, from 0 to 1; 1: the action is
 unchanged; NaN: there was no admitted anchor, and the filter was given the policy's action."""
 
+# LeaseExpiry and TeleopChannel without a filter inside, ChunkHandover: every step --------------------------------
+ACTION_CLIPPED: Final = _key("action/clipped", "float64", unit="action", chunk="max")
+"""L2 norm by which the action left the action space (of a chunk, of the entry that left it farthest); what is
+executed was clipped to the space. A filter inside counts that in `cbf/correction`."""
+
 # ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
 HANDOVER_PEAK_JERK: Final = _key("handover/peak_jerk", "float64", unit="action/s", log="peak_jerk")
 """The largest rate of change between neighbouring executed commands, of any component."""
@@ -204,6 +209,8 @@ TELEOP_ROUND_TRIP_S: Final = _key("teleop/round_trip_s", "float64", unit="s")
 """Age of the image that the command in force was made from; before the first one, since the reset."""
 TELEOP_CEILING_S: Final = _key("teleop/ceiling_s", "float64", unit="s")
 """The longest admissible round trip when this step was decided, from 0 to `longest_s`; inf without a ceiling."""
+TELEOP_LOST: Final = _key("teleop/lost", "int64", chunk="sum")
+"""Packets of this step that got lost, both ways; actions that are not finite, or from the future, count as lost."""
 TELEOP_REVOKED: Final = _key("teleop/revoked", "bool", chunk="any")
 """The operator had no authority, the local brake acted."""
 TELEOP_ENERGY_IN_J: Final = _key("teleop/energy_in_j", "float64", unit="J")

@@ -78,8 +78,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             the end of fade out beside the next one.
 
     Info, at every step (see `safe_wrappers.info`): ``handover/peak_jerk``, ``handover/blend_time``,
-    ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``.
-    The inner layers' info is merged over the control steps.
+    ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``,
+    ``action/clipped``. The inner layers' info is merged over the control steps.
 
     Raises:
         ConfigurationError: Sizes that do not fit together, a time or limit that is not positive, nothing to blend
@@ -165,7 +165,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback.reset()
         self._queue.reset()
         self._start()
-        info.update(self._measured([], False, -1))
+        info.update(self._measured([], False, -1, 0.0))
         self.started = True
         return observation, info
 
@@ -173,7 +173,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         """Execute the next `execution_horizon` control steps, with this chunk from when it is there."""
         self._refuse_without_reset()
         chunk = self._checked(action)
-        self._warn_clipped(chunk)
+        clipped = self._clipped(chunk)
         refused = not self._submit(chunk)
         total: Any = 0.0
         infos, commands, latency = [], [], -1
@@ -198,7 +198,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
                 break
         self._observed_s = self.now_s
         info = keys.merged(infos)
-        info.update(self._measured(commands, refused, latency))
+        info.update(self._measured(commands, refused, latency, clipped))
         return observation, total, terminated, truncated, info
 
     @property
@@ -261,15 +261,20 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._observed_s = 0.0
         self._executed = []
 
-    def _warn_clipped(self, chunk: Array) -> None:
-        """The first chunk that leaves the action space is warned of."""
+    def _clipped(self, chunk: Array) -> float:
+        """By how much the entry left the action space that left it farthest; the first chunk is warned of."""
         space: Any = self.action_space
-        if (((chunk < space.low) | (chunk > space.high)) & np.isfinite(chunk)).any():
-            self._warn_once(
-                "clipped", "the policy's action left the action space; its entries are clipped to it"
-            )
+        finite = np.where(np.isfinite(chunk), chunk, 0.0)
+        beyond = np.clip(finite, space.low, space.high) - finite
+        clipped = max(math.hypot(*entry) for entry in beyond)
+        if clipped > 0.0:
+            message = f"the policy's action left the action space by {clipped:.3g} (action/clipped)"
+            self._warn_once("clipped", f"{message}; its entries are clipped to it")
+        return clipped
 
-    def _measured(self, commands: list[Command], refused: bool, latency: int) -> dict[str, Any]:
+    def _measured(
+        self, commands: list[Command], refused: bool, latency: int, clipped: float
+    ) -> dict[str, Any]:
         executed = np.array(self._executed).reshape(-1, self._controls)
         peak = float(np.abs(np.diff(executed, axis=0)).max(initial=0.0)) / self.control_dt
         self._executed = self._executed[-1:]
@@ -285,4 +290,5 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             keys.HANDOVER_LIMITED: limited,
             keys.HANDOVER_REFUSED: refused,
             keys.HANDOVER_LATENCY: latency,
+            keys.ACTION_CLIPPED: clipped,
         }

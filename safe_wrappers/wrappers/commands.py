@@ -1,5 +1,6 @@
 """What decides between a command and the fallback: `CommandGate` and `FallbackController`."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -88,8 +89,10 @@ class CommandGate(LayerWrapper, CommandReceiver):
         """Begin an episode, in which nothing has been executed yet."""
         self._steps_done = 0
         self._observed_s = 0.0
+        self._clipped = 0.0
         if not self._filtered:
             info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
+            info[keys.ACTION_CLIPPED] = 0.0
 
     def _boxed(self, control: Any) -> Array:
         """Clipped to the action box, shape (m,)."""
@@ -106,12 +109,18 @@ class CommandGate(LayerWrapper, CommandReceiver):
             self._warn_once("nonfinite", f"the {whose} action is not finite ({action}); {consequence}")
         return finite
 
-    def _warn_outside(self, action: NDArray[Any], whose: str) -> None:
-        """The first action outside the space is warned of, where no filter inside boxes it."""
-        beyond = (action < self._low) | (action > self._high)
-        if not self._filtered and (beyond & np.isfinite(action)).any():
-            message = f"the {whose} action left the action space, and no CBFActionFilter inside boxes it"
-            self._warn_once("outside", f"{message}: {action}")
+    def _inside(self, action: NDArray[Any], whose: str) -> NDArray[Any]:
+        """The action itself, or clipped to the space where no filter inside does that; the first one is warned of."""
+        self._clipped = 0.0
+        if self._filtered or not np.isfinite(action).all():
+            return action
+        boxed = self._boxed(action)
+        self._clipped = math.hypot(*(boxed - action).ravel())  # 1e300 does not overflow in it
+        if not self._clipped:
+            return action
+        message = f"the {whose} action left the action space by {self._clipped:.3g}; it is clipped"
+        self._warn_once("outside", f"{message} (action/clipped)")
+        return boxed.astype(self._dtype)
 
     def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:
         """Step the env; returns what was executed, which a filter inside may have changed, and the env's answer."""
@@ -123,6 +132,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
             executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)
         else:
             info[keys.EXECUTED_ACTION] = executed.copy()
+            info[keys.ACTION_CLIPPED] = self._clipped
         if self._fallback is not None:
             self._fallback.executed(executed)
         self._steps_done += 1

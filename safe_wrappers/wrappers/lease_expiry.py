@@ -55,7 +55,7 @@ class LeaseExpiry(CommandGate):
         control_dt: Control interval, s; None reads the env's `dt`.
 
     Info, at every step: ``lease/remaining_s`` (float), ``lease/expired``, ``lease/refused``, ``lease/braking``
-    (bool), and ``executed_action``.
+    (bool); without a filter inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
         ConfigurationError: A missing or negative bound or time, a clearance that is neither, or a wrong order.
@@ -149,8 +149,7 @@ class LeaseExpiry(CommandGate):
     def step(self, action: Any) -> Step:
         """Execute the action under its lease, the command in force under its own, or the fallback."""
         self._refuse_without_reset()
-        given = action_array(action, self._shape)
-        self._warn_outside(given, "policy's")
+        given = self._inside(action_array(action, self._shape), "policy's")
         now = self.now_s
         arrived, fresh, refused = self._accept(given, now)
         if fresh:

@@ -58,7 +58,7 @@ class TeleopChannel(CommandGate):
 
     Info, at every step: ``teleop/round_trip_s``, ``teleop/ceiling_s``, ``teleop/energy_in_j``,
     ``teleop/energy_out_j``, ``teleop/in_flight_j``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
-    and ``executed_action``.
+    ``teleop/lost`` (int); without a filter inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
         ConfigurationError: A link, a port, an impedance or a ceiling that cannot be, or a wrong order.
@@ -128,6 +128,7 @@ class TeleopChannel(CommandGate):
             self._watch.reset()
         self._coding.reset(observation)
         self._start(info)
+        self._lost = 0
         self._images: list[float] = [0.0]  # when the image was taken that was shown after each step
         self._report(info, 0.0, self._ceiling_s)
         self.started = True
@@ -136,7 +137,7 @@ class TeleopChannel(CommandGate):
     def step(self, action: Any) -> Step:
         """Send the action, step the env with what has arrived, and return what has come back."""
         self._refuse_without_reset()
-        now_s = self.now_s
+        now_s, self._lost = self.now_s, 0
         self._send_up(self._sendable(action), now_s)
         arrived = self._up.receive(now_s)
         command = self._in_force()
@@ -165,14 +166,17 @@ class TeleopChannel(CommandGate):
         return self._watch is not None and self._watch.revoked
 
     def _sendable(self, action: Any) -> NDArray[Any] | None:
-        """A copy of the action; None where it is not finite."""
-        given = action_array(action, self._shape)
-        self._warn_outside(given, "operator's")
-        return given if self._is_finite(given, "operator's", "it is not sent") else None
+        """The action, inside the space; None, which counts as lost, where it is not finite."""
+        given = self._inside(action_array(action, self._shape), "operator's")
+        if self._is_finite(given, "operator's", "it is not sent"):
+            return given
+        self._lost += 1
+        return None
 
     def _send_up(self, action: NDArray[Any] | None, now_s: float) -> None:
         observed_s, self._observed_s = self._observed_s, self.now_s + self.control_dt
         if observed_s is None or observed_s > now_s + self._same_s:
+            self._lost += action is not None and observed_s is not None
             action = None
         self._moved = flow = None if action is None else self._flow_of(action)
         extra = self._coding.near(flow)
@@ -181,6 +185,7 @@ class TeleopChannel(CommandGate):
         step = min(max(math.floor(observed_s / self.control_dt + SAME_STEP), 0), len(self._images) - 1)
         sequence, lost = self._up.send(Up(action, self._images[step], extra), now_s)
         self._coding.sent(True, sequence, extra, lost)
+        self._lost += lost
 
     def _in_force(self) -> Any:
         """The command for this step as far as it is plain: the newest that has arrived, at first zero."""
@@ -188,7 +193,7 @@ class TeleopChannel(CommandGate):
         if newest is None:
             return self._rest()
         command = newest.action.copy()
-        # What is judged is what is executed; without a ceiling nothing is judged, and nothing changed.
+        # What is judged is what is executed, by a filter inside too.
         if self._watch is not None and ((command < self._low) | (command > self._high)).any():
             command = self._boxed(command).astype(self._dtype)
         return command
@@ -210,6 +215,7 @@ class TeleopChannel(CommandGate):
         extra, given = coding.settle(flow, observation, obeyed)
         sequence, lost = self._down.send(Down(_copy(observation), now_s, extra), now_s)
         coding.sent(False, sequence, extra, lost)
+        self._lost += lost
         arrived = self._down.receive(now_s)
         newest = self._down.newest.load
         self._images.append(max(self._images[-1], newest.taken_s))
@@ -226,6 +232,7 @@ class TeleopChannel(CommandGate):
     def _report(self, info: dict[str, Any], round_trip_s: float, ceiling_s: float) -> None:
         info[keys.TELEOP_ROUND_TRIP_S] = round_trip_s
         info[keys.TELEOP_CEILING_S] = ceiling_s
+        info[keys.TELEOP_LOST] = self._lost
         info[keys.TELEOP_REVOKED] = self.revoked
         info[keys.TELEOP_ENERGY_IN_J] = self._coding.energy_in_j
         info[keys.TELEOP_ENERGY_OUT_J] = self._coding.energy_out_j

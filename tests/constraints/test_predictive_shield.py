@@ -19,7 +19,7 @@ from safe_wrappers.constraints import PredictiveShield
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
-from simulated_worlds import DT, TOP, WALL, Cart, Grid, LockedCart
+from simulated_worlds import DT, TOP, WALL, Cart, Grid, WaitingCart
 
 
 def brake(observation):
@@ -327,7 +327,7 @@ def test_backups_that_do_not_fit_are_refused():
     with pytest.raises(UnsupportedEnvError, match=r"take plant=SimulatorPlant\(\)"):
         sw.CBFActionFilter(gym.make("Reacher-v5"), [shield()], plant=sw.MujocoPlant())
     with pytest.raises(UnsupportedEnvError, match="cannot be copied"):
-        sw.CBFActionFilter(LockedCart(), [shield()])
+        sw.CBFActionFilter(WaitingCart(), [shield()])
     with pytest.raises(UnknownNameError):
         shield(sees="all")
 

@@ -234,24 +234,6 @@ def test_far_above_the_threshold_the_actions_pass_bit_for_bit():
         assert a[0].tobytes() == b[0].tobytes() and not b[4]["cbf/intervened"]
 
 
-# Fetch --------------------------------------------------------------------------------------------------------
-
-
-AWAY = np.array([[2.5, 0.75, 0.5], [1.3, 1.9, 0.5], [1.3, 0.75, 1.8], [1.9, 0.75, 1.0], [2.0, 1.5, 0.6]])
-"""Places that the arm cannot reach but stretched."""
-
-
-def stretched(env, k):
-    """Full speed to somewhere far away, and after 30 steps elsewhere."""
-    raw = env.unwrapped
-    away = AWAY[(k // 30) % len(AWAY)] - raw.data.site("robot0:grip").xpos
-    return np.append(np.clip(away / 0.05, -1.0, 1.0), 0.0).astype(np.float32)
-
-
-def turned(env, k):
-    return np.sign(np.random.default_rng(k // 12).normal(size=4)).astype(np.float32)
-
-
 # Plain data, and what is refused ------------------------------------------------------------------------------
 
 

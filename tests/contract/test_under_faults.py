@@ -30,8 +30,6 @@ from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 BEFORE, LONG = 7, 25
 """Steps before the fault, and of an episode."""
 OURS = (SafeWrappersError, gym.error.ResetNeeded)
-PASSING = (*ONLY_LOOKING, "LeaseExpiry", "TeleopChannel")
-"""They judge no action: what is finite goes on as it is."""
 FILTERED = (*FILTERS, *INSIDE, "ActionShield")
 """They are filters, or have one inside."""
 READ_A_PLANT = (*FILTERED, "FilterObservation", "LeaseExpiry")
@@ -39,6 +37,7 @@ READ_A_PLANT = (*FILTERED, "FilterObservation", "LeaseExpiry")
 FLAGS = (
     "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/intervened", "handover/refused",
     "handover/starved", "handover/limited", "lease/refused", "lease/braking", "lease/expired", "teleop/revoked",
+    "teleop/lost", "action/clipped",
     "contact/partial", "balance/partial", "occlusion/expired",
 )  # fmt: skip
 LESS_KNOWN = {"lease/remaining_s": -1, "teleop/round_trip_s": 1, "handover/latency": -1, "cbf/correction": 1}
@@ -153,7 +152,7 @@ def check(session, answer, allowed=()):
     space = session.bottom.action_space
     for given in reached:
         assert given.dtype.kind in "fiu" and np.isfinite(given).all()
-        assert session.name in PASSING or space.contains(given.astype(space.dtype))
+        assert session.name in ONLY_LOOKING or space.contains(given.astype(space.dtype))
     if error is not None:
         assert isinstance(error, allowed) or (isinstance(error, OURS) and not reached), repr(error)
         return
@@ -167,7 +166,7 @@ def check(session, answer, allowed=()):
         if key in info and key in expected
     )
     flagged |= any(text not in usual_said for text in said)
-    passed = session.name in PASSING and len(reached) == len(usual_reached)
+    passed = session.name in ONLY_LOOKING and len(reached) == len(usual_reached)
     assert flagged or passed, "something else happened than without the fault, and nothing says so"
 
 

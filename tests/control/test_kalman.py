@@ -50,9 +50,6 @@ def test_the_covariance_stays_symmetric_and_semidefinite(seed, n, decades):
         assert np.array_equal(cov, cov.T)
 
 
-# Batches ----------------------------------------------------------------------------------------------------------
-
-
 # Against others ---------------------------------------------------------------------------------------------------
 
 

@@ -214,3 +214,18 @@ class Frozen(Machine):
 def test_what_is_no_map_is_refused(env, says):
     with pytest.raises(UnsupportedEnvError, match=says):
         bound(env)
+
+
+@pytest.mark.parametrize(
+    "constraint",
+    [
+        sw.constraints.Stance(),
+        sw.constraints.Traction(["turn"], max_slip=0.1),
+        sw.constraints.WallClearance(),
+        sw.constraints.HeadingDriveClearance([sw.constraints.Disc([5.0, 0.0], 1.0)], body="box"),
+    ],
+    ids=lambda one: type(one).__name__,
+)
+def test_what_reads_controls_off_the_model_is_refused(constraint):
+    with pytest.raises(UnsupportedEnvError, match="needs actions that are the model's controls"):
+        sw.CBFActionFilter(Machine(), [constraint])

@@ -140,9 +140,6 @@ def test_under_a_delay_it_is_where_the_commands_in_flight_lead(env_id, steps):
         plant.executed(action.astype(np.float64))
 
 
-# Braking ------------------------------------------------------------------------------------------------------
-
-
 # What it is not -----------------------------------------------------------------------------------------------
 
 

@@ -173,6 +173,3 @@ def test_looking_leaves_the_env_s_data_alone():
     after = np.zeros_like(before)
     mujoco.mj_getState(env.model, env.data, after, spec)
     assert before.tobytes() == after.tobytes()
-
-
-# Names ------------------------------------------------------------------------------------------------------------

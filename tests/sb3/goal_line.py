@@ -39,16 +39,6 @@ class GoalLine(Line):
         return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
 
 
-class BonusLine(GoalLine):
-    """Its reward needs the infos, as `copy_info_dict` is for."""
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        infos = [info] if isinstance(info, dict) else info
-        bonus = np.array([each["bonus"] for each in infos])
-        distance = super().compute_reward(achieved_goal, desired_goal, info)
-        return distance + (bonus if np.ndim(achieved_goal) > 1 else bonus[0])
-
-
 def filtered(wall=WALL, task=GoalLine):
     plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=HOLD)
     return Monitor(sw.RecordInterventions(sw.CBFActionFilter(task(), [BehindTheWall(wall)], plant=plant)))

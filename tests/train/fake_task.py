@@ -134,6 +134,18 @@ def until_stopped(progress):
     raise RunStoppedError("stopped")
 
 
+def never_stopped(progress):
+    """A job that is asked to stop and does not; it says so a second later."""
+    progress.say("working")
+    end = time.monotonic() + 60.0
+    while not progress.stopping():
+        assert time.monotonic() < end, "nobody asked it to stop"
+        time.sleep(0.05)
+    time.sleep(1.0)  # a signal that follows within half a second is the same one
+    progress.say("goes on")
+    time.sleep(300.0)
+
+
 class FilmedGoal(FakeGoal):
     """The same task seen from above in 60 by 80 pixels: the background tells the step, a dot the place."""
 

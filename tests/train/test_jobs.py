@@ -1,6 +1,7 @@
 """Jobs side by side: what is shown of them, how they fail, and signals."""
 
 import io
+import multiprocessing
 import os
 import signal
 
@@ -46,15 +47,16 @@ def test_lines_in_a_file_and_failures_among_others():
     ]
 
 
+class Signals(io.StringIO):
+    """SIGTERM comes when a job tells that it works, and when it tells what it has heard."""
+
+    def write(self, text):
+        if any(f": {word}" in text for word in ("working", "goes on")):
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().write(text)
+
+
 def test_a_signal_asks_jobs_to_stop_and_the_rest_do_not_begin():
-    class Signals(io.StringIO):
-        """A signal comes when the first job tells that it works."""
-
-        def write(self, text):
-            if "waits: working" in text:
-                os.kill(os.getpid(), signal.SIGTERM)
-            return super().write(text)
-
     text = Signals()
     jobs = [job("waits", fake_task.until_stopped), job("unwanted", fake_task.fail)]
     with pytest.raises(Interrupted) as stopped:
@@ -62,6 +64,14 @@ def test_a_signal_asks_jobs_to_stop_and_the_rest_do_not_begin():
     assert stopped.value.signum == signal.SIGTERM
     assert "waits: stopped" in text.getvalue()
     assert "unwanted" not in text.getvalue()
+
+
+def test_a_second_signal_waits_for_nobody():
+    text = Signals()
+    with pytest.raises(Interrupted):
+        run_jobs([job("deaf", fake_task.never_stopped)], 1, Console(file=text, width=100), "Waiting")
+    assert "deaf: goes on" in text.getvalue() and "deaf: stopped" not in text.getvalue()
+    assert not multiprocessing.active_children()
 
 
 def test_what_is_ignored_stays_ignored_and_all_is_put_back():

@@ -2,6 +2,7 @@
 
 import json
 import random
+import resource
 import shutil
 
 import numpy as np
@@ -17,7 +18,7 @@ from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.config import EnvConfig, FilterConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.files import only_writer, read_rows
-from safe_wrappers.train.processes import RunStoppedError
+from safe_wrappers.train.processes import Job, RunStoppedError, work
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.callbacks import CheckpointCallback
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, resume
@@ -322,3 +323,26 @@ def test_a_continued_run_goes_on_with_its_schedule(fake_experiment, monkeypatch)
     run(experiment)
     assert [steps for steps, _ in rates] == [128, 256, 384, 512]
     assert [rate for _, rate in rates] == pytest.approx([1e-3 * (1 - steps / 512) for steps, _ in rates])
+
+
+def test_a_file_that_cannot_be_written_is_named_and_the_last_checkpoint_stays(fake_experiment):
+    """The kernel refuses to write more than so many bytes, as a full disk does: once for each size of a file."""
+    folder = run(fake_experiment(*SAC, "total_steps=128", "checkpoint_every=64"))
+    at = folder / "checkpoints" / "step_000000000128"
+    longer = fake_experiment(*SAC, "total_steps=256", "checkpoint_every=64")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    named = 0
+    for size in sorted({path.stat().st_size for path in at.iterdir()}):
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, hard))
+            told = work(Job("a run", 256, "steps", lambda _: run(longer), ()), lambda _: None, bool)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert "File too large" in told and "Traceback" not in told
+        named += str(folder / "checkpoints") in told
+        assert not (folder / "checkpoints" / ".writing").exists()  # what it took is free again
+        assert latest_checkpoint(folder / "checkpoints").timesteps == 128
+        assert resumed(longer.arms[1], folder).num_timesteps == 128
+    assert named >= 2
+    run(longer)
+    assert finished(folder)["timesteps"] == 256

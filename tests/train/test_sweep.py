@@ -130,6 +130,13 @@ def test_values_that_the_task_refuses_fail_their_trial(tmp_path, in_process, cap
     assert "none is recommended" in told
 
 
+def test_a_task_that_reports_no_cost_is_refused(tmp_path):
+    given = settings(tmp_path)
+    given["env"] = "fake_task:SilentGoal-v0"
+    with pytest.raises(ConfigurationError, match=r"the task reports no cost.*env\.judge"):
+        sweep_experiment(given, FAKE, (), QUIET)
+
+
 def told(outcomes):
     """A study in memory: (return, violations) per trial; no violations: pruned."""
     made = optuna.create_study(direction="maximize")

@@ -204,9 +204,6 @@ def test_chunks_under_a_lease_hit_nothing_whatever_is_lost(blend):
     assert hits[True] == 0 and hits[False] > 0, hits
 
 
-# Orders that are refused --------------------------------------------------------------------------------------
-
-
 # Admission ----------------------------------------------------------------------------------------------------
 
 ARM = """

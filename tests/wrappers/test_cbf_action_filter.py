@@ -153,9 +153,6 @@ def test_a_wrong_shape_is_refused_and_the_env_not_stepped(action):
     assert filtered.unwrapped.given == []
 
 
-# Constructor refusals -----------------------------------------------------------------------------------------
-
-
 # Unsafe starts ------------------------------------------------------------------------------------------------
 
 

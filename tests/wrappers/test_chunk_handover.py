@@ -551,9 +551,6 @@ def test_wrong_shapes_are_refused_and_the_env_is_not_stepped(chunk):
     assert env.step([[0.25]] * 8)[4]["handover/latency"] == 0, "a list of the right shape is a chunk"
 
 
-# The chunk seams' bugs seen in others ---------------------------------------------------------------------------
-
-
 # What is told to those inside ---------------------------------------------------------------------------------
 
 
@@ -604,6 +601,3 @@ def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on(between):
     far = env.step(np.full((6, 1), 0.9, np.float32))[4]  # 0.6 s at 1 per second
     assert far["handover/refused"] and far["lease/refused"] and far["handover/latency"] == -1
     assert [float(c[0]) for c in env.unwrapped.given] == [float(np.float32(0.1))] * 6
-
-
-# Faults outside -------------------------------------------------------------------------------------------------

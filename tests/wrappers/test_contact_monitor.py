@@ -168,9 +168,3 @@ def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
         for key in (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL):
             assert macro[key] == max(i[key] for i in infos)
         assert macro[keys.CONTACT_PARTIAL] is False
-
-
-# The three conditions of an ideal contact ---------------------------------------------------------------------
-
-
-# The next impact ----------------------------------------------------------------------------------------------

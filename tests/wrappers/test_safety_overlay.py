@@ -213,9 +213,6 @@ def test_a_window_gets_marks_and_words_before_each_step():
     assert renderer.viewer.words[1].startswith("margin ") and set(renderer.modes) == {"human"}
 
 
-# Arrows -------------------------------------------------------------------------------------------------------
-
-
 # With GL ------------------------------------------------------------------------------------------------------
 
 SCRIPT = """

@@ -175,14 +175,18 @@ def test_an_arm_that_is_far_from_the_task_is_watched_as_well():
         assert (farthest < 0.9) == (wanted is not None)
 
 
-def test_what_is_judged_is_what_is_executed_and_without_a_ceiling_nothing_is_changed():
+def test_what_is_judged_and_executed_is_clipped_to_the_space_and_counted():
     loud, quiet = np.array([1e9, -0.5], np.float32), np.array([0.3, -0.5], np.float32)
-    for watched, expected in ((ceiling(), 1.0), (None, 1e9)):
+    for watched in (ceiling(), None):
         env = channel(ceiling=watched)
         place(env)
-        sent = env.step(loud)[4]["executed_action"]
-        assert sent[0] == np.float32(expected) and sent[1] == -0.5
-        assert np.array_equal(env.step(quiet)[4]["executed_action"], quiet.astype(np.float64))
+        info = env.step(loud)[4]
+        assert info["executed_action"].tolist() == [1.0, -0.5] and info["action/clipped"] == 1e9 - 1.0
+        info = env.step(quiet)[4]
+        assert (
+            np.array_equal(info["executed_action"], quiet.astype(np.float64))
+            and info["action/clipped"] == 0.0
+        )
 
 
 ROOM = CLAMP_Y - TOOL_RADIUS

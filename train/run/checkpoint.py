@@ -118,19 +118,31 @@ def save_checkpoint(root: Path, model: BaseAlgorithm, facts: Mapping[str, Any], 
         temporary = root / ".writing"  # a killed process may have left one
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
-        save_policy(temporary, model)
-        if isinstance(model, OffPolicyAlgorithm) and not final:
-            model.save_replay_buffer(temporary / _REPLAY)
-        of_numpy = np.random.get_state(legacy=False)
-        of_numpy["state"]["key"] = of_numpy["state"]["key"].tolist()
-        states = {"python": random.getstate(), "numpy": of_numpy, "torch": torch.get_rng_state().tolist()}
-        write_json(temporary / _RANDOM, states)
-        write_json(temporary / _STATE, facts)
+        try:
+            _write(temporary, model, facts, final)
+        except (OSError, RuntimeError) as error:  # torch makes a RuntimeError of what the system refuses
+            shutil.rmtree(temporary, ignore_errors=True)
+            cause = error.__context__ if isinstance(error.__context__, OSError) else error
+            raise RunStateError(
+                f"the checkpoint {str(folder)!r} cannot be written ({cause}). The one before it is whole: make room,"
+                " and the same command goes on."
+            ) from error
         temporary.rename(folder)
     older = [other for other in sorted(root.glob("step_*")) if other != folder]
     for old in older if final else older[:-1]:
         shutil.rmtree(old)
     return folder
+
+
+def _write(folder: Path, model: BaseAlgorithm, facts: Mapping[str, Any], final: bool) -> None:
+    save_policy(folder, model)
+    if isinstance(model, OffPolicyAlgorithm) and not final:
+        model.save_replay_buffer(folder / _REPLAY)
+    of_numpy = np.random.get_state(legacy=False)
+    of_numpy["state"]["key"] = of_numpy["state"]["key"].tolist()
+    states = {"python": random.getstate(), "numpy": of_numpy, "torch": torch.get_rng_state().tolist()}
+    write_json(folder / _RANDOM, states)
+    write_json(folder / _STATE, facts)
 
 
 def save_policy(folder: Path, model: BaseAlgorithm) -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import threading
 from collections.abc import Iterator
 from types import FunctionType, ModuleType
 from typing import Any
@@ -15,6 +16,7 @@ from safe_wrappers.plants.mujoco.model import Constants, every_constant
 
 _DRAWING = ("pygame", "glfw", "OpenGL", "moviepy")
 _SHARED = (gym.Space, gym.envs.registration.EnvSpec, ModuleType)
+_LOCKS = {type(made()): made for made in (threading.Lock, threading.RLock)}
 _WAYS_OUT = (
     "Say how its state is saved and restored, snapshot=(save, restore) with save(env) and restore(env, state) of the "
     "unwrapped env, or simulate in child processes, SimulatorPlant(snapshot='fork'), where the system has them"
@@ -156,6 +158,8 @@ def _copied(owner: Any, name: str, value: Any, memo: Memo) -> Any:
                 "itself, and in a copy would still act on that; make it a method of a wrapper or a subclass"
             )
         return value
+    if type(value) in _LOCKS:  # a copy has its own
+        return _LOCKS[type(value)]()
     try:
         return copy.deepcopy(value, memo)
     except Exception as error:

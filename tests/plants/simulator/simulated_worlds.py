@@ -1,7 +1,5 @@
 """Small envs for the tests of simulation: carts, a grid, and envs whose copies are wrong."""
 
-import threading
-
 import gymnasium as gym
 import numpy as np
 
@@ -42,12 +40,12 @@ class NoisyCart(Cart):
     noise = 0.5
 
 
-class LockedCart(Cart):
-    """Cannot be copied: it holds a lock."""
+class WaitingCart(Cart):
+    """Cannot be copied: it holds a generator."""
 
     def __init__(self, start=(0.0, 0.0)):
         super().__init__(start)
-        self.lock = threading.Lock()
+        self.waiting = (one for one in ())
 
 
 class SharedCart(Cart):
@@ -74,7 +72,7 @@ class SharedSight(SharedCart):
         return observation + np.array([self.steps[0], 0.0]), reward, terminated, truncated, info
 
 
-class StateCart(LockedCart):
+class StateCart(WaitingCart):
     """Saves and restores itself."""
 
     calls = 0
@@ -87,7 +85,7 @@ class StateCart(LockedCart):
         self.x, self.v = state
 
 
-class CloneCart(LockedCart):
+class CloneCart(WaitingCart):
     """As Atari's envs do."""
 
     seen = None
@@ -98,14 +96,6 @@ class CloneCart(LockedCart):
 
     def restore_state(self, state):
         self.x, self.v = state
-
-
-class PickyCart(gym.utils.EzPickle, Cart):
-    """A copy by its own rules is a new cart."""
-
-    def __init__(self, start=(0.0, 0.0)):
-        gym.utils.EzPickle.__init__(self, start)
-        Cart.__init__(self, start)
 
 
 GRID = ["S..#", ".#..", "...#", "#..G"]

@@ -12,15 +12,16 @@ from gymnasium.wrappers import NormalizeObservation, RecordEpisodeStatistics, Ti
 from simulated_worlds import (
     Cart,
     CloneCart,
-    LockedCart,
     NoisyCart,
     SharedCart,
     SharedSight,
     StateCart,
+    WaitingCart,
 )
 
 import safe_wrappers as sw
 from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.simulator.copies import EnvCopier
 from safe_wrappers.plants.simulator.simulation import simulation_of
 
 ENVS = ("Pendulum-v1", "CartPole-v1", "FrozenLake-v1", "HalfCheetah-v5", "SafePointGoal1-v0", "Humanoid-v5")
@@ -86,6 +87,14 @@ def test_a_rollout_goes_through_the_wrappers_inside_and_changes_none_of_them():
     np.testing.assert_array_equal(np.array(ahead.observations), np.array(mine))
 
 
+def test_a_filter_inside_is_copied_with_a_lock_of_its_own():
+    env = sw.protect(gym.make("SafePointGoal1-v0"))
+    env.reset(seed=0)
+    copied = EnvCopier(env).copy()
+    theirs, own = (one.step(np.ones(2)) for one in (copied, env))
+    assert bits(theirs[:2]) == bits(own[:2])
+
+
 def test_a_policy_acts_after_the_control_and_measures_stop_a_rollout():
     env = Cart(start=(0.0, 1.0))
     plant = bound(env)
@@ -139,13 +148,15 @@ def restore_cart(raw, state):
 
 
 def test_what_cannot_be_copied_is_refused_by_name_with_ways_out_that_work():
-    with pytest.raises(UnsupportedEnvError, match=r"LockedCart\.lock is a lock.*save, restore.*'fork'"):
-        bound(LockedCart())
+    with pytest.raises(
+        UnsupportedEnvError, match=r"WaitingCart\.waiting is a generator.*save, restore.*'fork'"
+    ):
+        bound(WaitingCart())
     ways = [(lambda raw: (raw.x, raw.v), restore_cart)]
     if hasattr(os, "fork"):
         ways.append("fork")
     for snapshot in ways:
-        env = LockedCart()
+        env = WaitingCart()
         plant = bound(env, snapshot=snapshot, check_steps=60)
         env.reset(seed=0)
         env.step(np.ones(1))
