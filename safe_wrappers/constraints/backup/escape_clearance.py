@@ -164,7 +164,9 @@ class BoundEscapeClearance(BoundBackupClearance):
     def _discs(self) -> Array:
         """For `Around`."""
         discs = [o for o in self._fixed if not isinstance(o, Plane)]
-        parts = [np.insert(o.centers(self.plant)[:, :2], 2, o.radius + self.spec.radius, axis=1) for o in discs]
+        parts = [
+            np.insert(o.centers(self.plant)[:, :2], 2, o.radius + self.spec.radius, axis=1) for o in discs
+        ]
         return np.concatenate([np.zeros((0, 3)), *parts])
 
     def _planes(self) -> Array:

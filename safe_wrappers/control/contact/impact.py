@@ -57,8 +57,9 @@ def peak_force(
     push: ArrayLike = 0.0,
     deflection: ArrayLike = 0.0,
 ) -> Array:
-    """The largest force of a contact, shape (...), N: `v sqrt(k m)`, or with a push F_p that goes on
-    `F_p + sqrt((k x - F_p)^2 + k m v^2)`.
+    """The largest force of a contact, shape (...), N.
+
+    `v sqrt(k m)`, and with a push F_p that goes on `F_p + sqrt((k x - F_p)^2 + k m v^2)`.
 
     Args:
         speed: v, m/s.
