@@ -23,7 +23,6 @@ from safe_wrappers.plants.simulator.simulation import (
     Snapshot,
     check_replay,
     differing,
-    other_noise,
     simulation_of,
 )
 
@@ -95,14 +94,11 @@ _ROUNDING = 1e-6  # of float32
 class SimulatorPlant(RolloutPlant):
     """Rolls out actions in the env itself, from its present state, with all wrappers inside the filter.
 
-    No dynamics are written down. By default the env is copied, MuJoCo's state included; an env with `get_state` and
-    `set_state`, or `clone_state` and `restore_state`, is restored by these. At binding random steps are made in the
-    simulation and in the env: both must agree bit for bit, or the env is refused.
+    No dynamics are written down. By default the env is copied, MuJoCo's state included. At binding random steps are
+    made in the simulation and in the env: both must agree bit for bit, or the env is refused.
 
     **It knows what will be drawn**: the random generator of the env belongs to its state, so that a rollout has the
-    noise that the env will have. Only a simulator has this privilege; `same_noise=False` takes it away, and then
-    rollouts are samples, and prove nothing about the env. It reseeds, in the simulation, the generators of NumPy and
-    of `random` that the env, its wrappers or anything in them holds.
+    noise that the env will have. Only a simulator has this privilege.
 
     **After every step** what the env has returned is compared with the rollout of the executed action. From the first
     difference on (a generator that copies share, a clock, another process) nothing is proved, and `cbf/mismatch` says
@@ -115,7 +111,6 @@ class SimulatorPlant(RolloutPlant):
             above.
         control_dt: Control interval, s; None takes the env's `dt`. An env without `dt` has none, and wrappers that
             count in seconds ask for it.
-        same_noise: Whether rollouts draw the random numbers that the env will draw.
         check_steps: Random steps of the check at binding; 0 checks nothing.
         check_s: How long this check may take, s, before it ends with fewer steps, and a warning.
 
@@ -138,15 +133,14 @@ class SimulatorPlant(RolloutPlant):
         self,
         snapshot: Snapshot = None,
         control_dt: float | None = None,
-        same_noise: bool = True,
         check_steps: int = 1000,
         check_s: float = 2.0,
     ) -> None:
-        self._snapshot, self.same_noise = snapshot, bool(same_noise)
+        self._snapshot = snapshot
         super().__init__(control_dt)
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
         self.check_s, self.checked_steps = positive("check_s", check_s, "s"), 0
-        self.exact = self.same_noise and self.check_steps > 0
+        self.exact = self.check_steps > 0
         self._simulation: Simulation | None = None
         self._compares, self._compared_substeps = self.exact, False
         self._sent, self._answered = b"", False
@@ -228,11 +222,8 @@ class SimulatorPlant(RolloutPlant):
     ) -> Rollout:
 
         def simulated(env: gym.Env[Any, Any]) -> tuple[Rollout, float | None, str]:
-            with contextlib.ExitStack() as stack:
-                if not self.same_noise:
-                    stack.enter_context(other_noise(env, self.observation_id))
-                seen = Substeps(measure, between if self.judges_substeps else "")
-                stack.enter_context(seen.of(env.unwrapped))
+            seen = Substeps(measure, between if self.judges_substeps else "")
+            with seen.of(env.unwrapped):
                 return rolled_out(env, seen)
 
         def rolled_out(env: gym.Env[Any, Any], seen: Substeps) -> tuple[Rollout, float | None, str]:
