@@ -374,7 +374,7 @@ class IdentifiedPlant(RolloutPlant):
                 f"more than {self.miss_rate:g} of the rollouts over {horizon} steps give no finite h: the model "
                 "diverges, or h is not a number there. Take a shorter horizon or more episodes"
             )
-        return max(factor, 0.0) * scales
+        return np.asarray(max(factor, 0.0) * scales)
 
     def _shortfalls(self, episodes: list[Episode], places: Array, horizon: int, measure: Measure) -> Array:
         windows = zip(episodes, places, strict=True)
