@@ -324,7 +324,7 @@ class IdentifiedPlant(RolloutPlant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
-        between: str = "",
+        between: bool = False,
     ) -> Rollout:
         """Roll out the model from the last observation: see `RolloutPlant.rollout`.
 
