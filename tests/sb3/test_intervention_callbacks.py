@@ -11,7 +11,7 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import InterventionCallback, InterventionEvalCallback
 from safe_wrappers.sb3.callbacks import log_steps
-from safe_wrappers.wrappers.faults import DroppedRefreshes
+from safe_wrappers.wrappers.faults import RepeatedCommands
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 
@@ -86,7 +86,7 @@ def lost_now_and_then():
         sw.StoppingBudget(sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0),
     )
     stack = sw.ChunkHandover(sw.RecordInterventions(lease), 8, 4, rate_limit=10.0)
-    return Monitor(DroppedRefreshes(stack, share=1.0))
+    return Monitor(RepeatedCommands(stack, share=1.0))
 
 
 def test_handover_lease_and_faults_reach_tensorboard(tmp_path):
