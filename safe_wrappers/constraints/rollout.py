@@ -59,9 +59,9 @@ class BoundSlacks(BoundConstraint):
         least = float(self.slacks(control).min(initial=np.inf))
         return least if least == least else -np.inf
 
-    def load(self, low: Array, high: Array) -> None:
+    def load(self) -> None:
         if self.value().size:
-            self.slacks(np.clip(np.zeros(low.size), low, high))
+            self.slacks(np.clip(0.0, self.plant.lower, self.plant.upper))
 
     def linearize(self, control: Array) -> HalfSpaces:
         return linearize(self.slacks, control, self.plant.lower, self.plant.upper)

@@ -99,8 +99,6 @@ class BoundConstraint:
     """Whether there is a barrier: set for every subclass that overrides `value`."""
     has_backup: bool = False
     """Whether it knows a backup control: set for every subclass that overrides `backup`."""
-    decides: bool = False
-    """Whether `decide` makes the search where this is the only constraint."""
     tolerance: float = 0.0
     """How far below zero a slack may be and count as rounding."""
     info_keys: tuple[str, ...] = ()
@@ -129,8 +127,8 @@ class BoundConstraint:
     def check(self) -> None:
         """Refuse at a reset what only a state can show."""
 
-    def load(self, low: Array, high: Array) -> None:
-        """Run once, in the first observed state, the compiled code that a step may need; the box is the filter's."""
+    def load(self) -> None:
+        """Run once, in the first observed state, the compiled code that a step may need."""
 
     def value(self) -> Array:
         """The barriers h, shape (k,), positive inside; the margin is not taken off. k may be 0: nothing is near."""
@@ -185,22 +183,11 @@ class BoundConstraint:
         """A control that the constraint knows to keep it, shape (m,), or None."""
         return None
 
-    def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
-        """The search for an admissible control, done by the constraint itself.
-
-        Returns:
-            The control, shape (m,), inside the action box and the plant's bounds; the `Stage` that found it; rows
-            that it keeps, for rounding. None: it has found none, and the search goes on as for every constraint.
-        """
-        return None
-
     @classmethod
-    def batch(
-        cls, bound: Sequence[Self], low: Array, high: Array, dtype: np.dtype[Any]
-    ) -> "ConstraintBatch | None":
-        """The same constraint on the plants of n envs, decided in one call, or None: one by one.
+    def batch(cls, bound: Sequence[Self]) -> "ConstraintBatch | None":
+        """The same constraint on the plants of n envs, judged in one call, or None: one by one.
 
-        Asked where each is the only constraint of its env; `low`, `high` and `dtype` are the action space's.
+        Asked where each is the only constraint of its env.
         """
         return None
 
@@ -220,7 +207,7 @@ class BoundConstraint:
 class ConstraintBatch(ABC):
     """The bound constraints of n envs with one action box; `BoundConstraint.batch` makes it.
 
-    It gives the same controls, bit for bit, as the constraints one by one.
+    It judges proposals as the constraints one by one, bit for bit.
     """
 
     @abstractmethod
@@ -232,22 +219,17 @@ class ConstraintBatch(ABC):
         """What the constraint of an env remembers, as its own `start` and `executed` give it."""
 
     @abstractmethod
-    def decide(
-        self, proposals: Array, judged: NDArray[np.bool_], controls: Array
-    ) -> tuple[Array, NDArray[np.int64]]:
-        """Take every env's present state and decide.
+    def judge(self, proposals: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Take every env's present state.
 
         Args:
             proposals: Inside the action box, shape (n, m); rows with NaN get an arbitrary answer.
-            judged: Which envs to decide, shape (n,).
-            controls: Written for those: what to execute, exact in the action space's dtype, shape (n, m). An admitted
-                proposal is written as it is.
 
         Returns:
-            The smallest h of each, shape (n,), NaN if one is not a number; and the `Stage` that found each control,
-            shape (n,). Stage.FALLBACK: none was found, decide this env by its own constraint.
+            The smallest h of each env, shape (n,), NaN if one is not a number; whether its proposal is admitted,
+            shape (n,).
         """
 
     @abstractmethod
     def executed(self, envs: NDArray[np.bool_]) -> None:
-        """Remember that the decisions for these envs, shape (n,), are executed; they are among those decided."""
+        """Remember that the proposals of these envs, shape (n,), which were admitted, are executed."""

@@ -91,7 +91,7 @@ class SafetyFilter:
             c.check()
         if not self._loaded and self.margin == self.margin:
             for c in self.bound:
-                c.load(self._low, self._high)
+                c.load()
             self._loaded = True
 
     def take_over(self, before: "SafetyFilter") -> None:

@@ -100,7 +100,6 @@ class SafeActionSearch:
         self._predicting = [c for c in constraints if c.predicts]
         self._rows_only = [c for c in constraints if not c.predicts]
         self._no_rows: Rows = np.zeros((0, low.size)), np.zeros(0)
-        self._sole = constraints[0] if len(self._constraints) == 1 and constraints[0].decides else None
         self._narrower = not plant.bounds_are_action_space
         self._tried: list[Array] = []
 
@@ -116,14 +115,6 @@ class SafeActionSearch:
         return decision
 
     def _decide(self, proposal: Array, last: Array) -> Decision:
-        if self._sole is not None:
-            found = self._sole.decide(proposal, self._low, self._high)
-            if found is not None:
-                control, stage, rows = found
-                if control is proposal:
-                    return Decision(proposal, Stage.PROPOSAL, changed=False)
-                control = self._rounded(control, rows.normals, rows.offsets)
-                return self._projected(proposal, control, Stage(stage))
         refused = bool(self._predicting) and not self._admitted(proposal)
         strict = self._rows(self._rows_only) if self._rows_only else self._no_rows
         if not refused:

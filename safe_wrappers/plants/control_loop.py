@@ -86,7 +86,7 @@ class ControlLoop:
             f"({parts} {hold_lag_s(control_dt):g}) and bears {spare / self.crossover:.4g} s; design it for at "
             f"most {spare / late:.3g} rad/s, or shorten hold and delays"
         )
-        warnings.warn(message, PhaseMarginWarning, stacklevel=4)
+        warnings.warn(message, PhaseMarginWarning, stacklevel=3)
 
 
 def checked_loop(given: ControlLoop | None) -> ControlLoop | None:

@@ -26,9 +26,7 @@ from safe_wrappers.wrappers.layer import (
 
 __all__ = [
     "FAULTS",
-    "DroppedRefreshes",
     "Fault",
-    "FrozenPolicy",
     "Jitter",
     "Outages",
     "RepeatedCommands",
@@ -154,34 +152,21 @@ def probability(name: str, value: float) -> float:
     return number
 
 
-class Struck(Fault):
-    """Loses the commands that it strikes, or sends the one from before instead, with its old observation time."""
-
-    repeats: ClassVar[bool] = False
-
-    @abstractmethod
-    def strikes(self, now_s: float) -> bool:
-        """Whether it strikes the command of now; called once per step."""
-
-    def begin(self) -> None:
-        self._before: Carried | None = None
-
-    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        if self.strikes(now_s):
-            return self._before if self.repeats else None
-        self._before = given if given is not None else self._before
-        return given
-
-
-class ShareFault(Struck):
-    """Base of the faults that strike a share of the commands: the probability, from 0 to 1, for each by itself."""
+class RepeatedCommands(Fault):
+    """Loses a `share` of the commands, from 0 to 1, each by itself, and sends the last one once more."""
 
     def __init__(self, env: Env, share: float, control_dt: float | None = None) -> None:
         self._share = probability("share", share)
         super().__init__(env, control_dt, share=self._share)
 
-    def strikes(self, now_s: float) -> bool:
-        return bool(self.random.draw.random() < self._share)
+    def begin(self) -> None:
+        self._before: Carried | None = None
+
+    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
+        if self.random.draw.random() < self._share:
+            return self._before
+        self._before = given if given is not None else self._before
+        return given
 
 
 class Jitter(Fault):
@@ -229,8 +214,8 @@ class OnOffProcess:
         return self._on
 
 
-class OnOffFault(Struck):
-    """Base of the faults that are on for `mean_length_s` at a time, then off for `mean_between_s`, on average, s."""
+class Outages(Fault):
+    """Loses all commands during outages of `mean_length_s`, `mean_between_s` apart, s on average."""
 
     def __init__(
         self, env: Env, mean_between_s: float, mean_length_s: float, control_dt: float | None = None
@@ -239,34 +224,11 @@ class OnOffFault(Struck):
         super().__init__(env, control_dt, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
 
     def begin(self) -> None:
-        super().begin()
         self._process.begin(self.random)
 
-    def strikes(self, now_s: float) -> bool:
-        return self._process.is_on(now_s, self.random)
+    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
+        return None if self._process.is_on(now_s, self.random) else given
 
 
-class DroppedRefreshes(ShareFault):
-    """Loses a `share` of the commands, from 0 to 1, each by itself."""
-
-
-class RepeatedCommands(ShareFault):
-    """Loses a `share` of the commands, from 0 to 1, each by itself, and sends the last one once more."""
-
-    repeats = True
-
-
-class Outages(OnOffFault):
-    """Loses all commands during outages of `mean_length_s`, `mean_between_s` apart, s on average."""
-
-
-class FrozenPolicy(OnOffFault):
-    """Repeats the last command from before for `mean_length_s`, then works for `mean_between_s`, on average, s."""
-
-    repeats = True
-
-
-FAULTS: dict[str, type[Fault]] = {
-    kind.__name__: kind for kind in (DroppedRefreshes, FrozenPolicy, Jitter, Outages, RepeatedCommands)
-}
+FAULTS: dict[str, type[Fault]] = {kind.__name__: kind for kind in (Jitter, Outages, RepeatedCommands)}
 """By name, for configs."""

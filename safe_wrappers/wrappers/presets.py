@@ -38,7 +38,7 @@ class SlipLimiter(CBFActionFilter):
         margin: Slip kept free below the limit.
 
     Info, at every step: the keys of `CBFActionFilter` (``cbf/margin`` stays 0), and arrays with one entry
-    per wheel: ``slip/ratio``, ``slip/limited``, ``slip/mu_estimate``, ``slip/mu_std``.
+    per wheel: ``slip/ratio``, ``slip/mu_estimate``.
 
     Raises:
         ConfigurationError: A joint that is no driven wheel, a radius of zero, or a number out of its range.
@@ -51,7 +51,7 @@ class SlipLimiter(CBFActionFilter):
         >>> env = sw.SlipLimiter(env, wheels=["front_left", "front_right", "rear_left", "rear_right"])
         >>> _ = env.reset(seed=0)
         >>> info = env.step(env.action_space.high)[4]
-        >>> bool(info["slip/limited"].all())
+        >>> bool(info["cbf/intervened"])
         True
     """
 
@@ -104,8 +104,8 @@ class WholeBodyFilter(CBFActionFilter):
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`.
 
-    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/contacts``, ``whole_body/cone_margin``, and with
-    a `zmp_inset` ``whole_body/zmp_margin``.
+    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/cone_margin``, and with a `zmp_inset`
+    ``whole_body/zmp_margin``.
 
     Raises:
         ConfigurationError: A share outside (0, 1], a negative tolerance, or a body that does not move.

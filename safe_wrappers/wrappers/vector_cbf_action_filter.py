@@ -15,7 +15,6 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint, ConstraintBatch
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, CBFActionFilter
 from safe_wrappers.wrappers.layer import action_array
@@ -35,8 +34,8 @@ class VectorCBFActionFilter(_Wrapper):
     """Filters the actions of all envs of a `SyncVectorEnv`.
 
     Every env has a `CBFActionFilter` of its own beside it, with the same guarantees; its executed actions are the
-    same, bit for bit. Where the only constraint can decide many envs in one compiled call (`HeadingDriveClearance`
-    without a delay), it does; other envs are decided one by one.
+    same, bit for bit. Where the only constraint can judge many proposals in one compiled call
+    (`HeadingDriveClearance` without a delay), it does; what it refuses, and other envs, are decided one by one.
 
     Infos are those that filtered envs give to a `SyncVectorEnv`, in all three autoreset modes: a step that resets an
     env reports the new episode, and with `AutoresetMode.SAME_STEP` the last step is in ``infos["final_info"]``.
@@ -51,7 +50,7 @@ class VectorCBFActionFilter(_Wrapper):
 
     Attributes:
         filters: Each env's `CBFActionFilter`, which judges but does not step; its `filter_seconds` are its share.
-        constraint_batch: What decides all envs in one call, or None: each is decided by its own filter.
+        constraint_batch: What judges all proposals in one call, or None: each is judged by its own filter.
 
     Raises:
         UnsupportedEnvError: Not such a vector env.
@@ -94,12 +93,10 @@ class VectorCBFActionFilter(_Wrapper):
         self._ended = np.zeros(self.num_envs, dtype=bool)
 
     def _make_batch(self, before: ConstraintBatch | None) -> None:
-        """Decide for all envs at once, where their constraint can; what a batch before has remembered stays."""
+        """Judge all envs at once, where their constraint can; what a batch before has remembered stays."""
         self._batched = [single.filter.bound[0] for single in self.filters]
-        self.constraint_batch = batch = None
-        if len(self.filters[0].filter.bound) == 1 and self._batched[0].decides:
-            dtype = np.dtype(self._dtype)
-            batch = self._batched[0].batch(self._batched, self._low, self._high, dtype)
+        alone = len(self.filters[0].filter.bound) == 1
+        batch = self._batched[0].batch(self._batched) if alone else None
         if batch is not None and before is not None:
             for i in range(self.num_envs):
                 batch.restart(i, before.memory(i))
@@ -219,32 +216,20 @@ class VectorCBFActionFilter(_Wrapper):
         judged: Mask,
         reports: dict[str, NDArray[Any]],
     ) -> Mask:
-        """`CBFActionFilter.judge` for all envs at once; False where an env must be judged alone."""
+        """`CBFActionFilter.judge` for the envs whose proposals are admitted; False where an env is judged alone."""
         proposed = given.astype(np.float64)
         inside = ((proposed >= self._low) & (proposed <= self._high)).all(axis=1)
         boxed = np.clip(proposed, self._low, self._high)
-        usual = judged & (
-            inside | (np.isfinite(proposed).all(axis=1) & ("clipped" in self.filters[0].warned))
-        )
-        controls = boxed.copy()
-        margins, stages = batch.decide(boxed, usual, controls)
-        # An unsafe or unreadable state (NaN) gets a warning, too.
-        usual &= (margins >= -SAFE_TOLERANCE) & (stages != Stage.FALLBACK)
+        margins, admitted = batch.judge(boxed)
+        # An unsafe or unreadable state (NaN) gets a warning, and so does the first action outside of the box.
+        known = inside | (np.isfinite(proposed).all(axis=1) & ("clipped" in self.filters[0].warned))
+        usual: Mask = judged & known & admitted & (margins >= -SAFE_TOLERANCE)
         batch.executed(usual)
-        changed = usual & (stages != Stage.PROPOSAL)
-        cast = np.clip(controls, self._low, self._high).astype(self._dtype)
-        written = usual & (changed | ~inside)
-        if isinstance(sent, list):
-            for i in np.flatnonzero(written).tolist():
-                sent[i] = cast[i]
-        else:
-            sent[written] = cast[written]
-        executed = np.where(written[:, None], cast.astype(np.float64), proposed)
+        written, executed = usual & ~inside, np.where(inside[:, None], proposed, boxed.astype(self._dtype))
+        for i in np.flatnonzero(written).tolist():
+            sent[i] = executed[i].astype(self._dtype)
         found = {
-            keys.CBF_INTERVENED: changed & (executed != boxed).any(axis=1),
-            keys.CBF_REFUSED: changed[:, None],
             keys.CBF_MARGIN: np.where(np.isfinite(margins), margins, 0.0),
-            keys.CBF_STAGE: stages,
             keys.PROPOSED_ACTION: proposed,
             keys.EXECUTED_ACTION: executed,
         }

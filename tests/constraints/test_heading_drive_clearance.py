@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.backup.base import Detour
-from safe_wrappers.control.backup import drive_decision
 from safe_wrappers.control.backup.heading_drive import (
     Motion,
     beyond_reach,
@@ -94,21 +93,6 @@ def test_a_robot_inside_a_hazard_is_brought_out_whatever_the_policy_wants(action
     costs = [env.step(np.array(action, np.float32))[4]["cost_substep"] for _ in range(400)]
     assert costs[0] == 1.0
     assert not any(costs[300:])
-
-
-def test_a_decision_that_is_not_finite_is_left_to_the_search(monkeypatch):
-    env = filtered({"hazards": [[0.29, 0.0]]}, (0.5, 0.0, 0.0))
-    (limit,) = env.filter.bound
-    bounds = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
-    assert not limit.admits(np.array([1.0, 0.0])) and limit.decide(np.array([1.0, 0.0]), *bounds) is not None
-
-    def overflowing(*arguments):
-        arguments[-1][:] = np.nan
-        return drive_decision.ROWS, 0.0, np.zeros((0, 2)), np.zeros(0)
-
-    monkeypatch.setattr(drive_decision, "closest_admitted", overflowing)
-    assert limit.decide(np.array([1.0, 0.0]), *bounds) is None
-    assert np.isfinite(env.filter.filter(np.array([1.0, 0.0])).control).all()
 
 
 # HeadingDriveClearance at the boundary of its safe set: an admissible control, and no disc touched until rest

@@ -8,7 +8,7 @@ from wrapper_examples import CASES, build, example, inside
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.wrappers.faults import DroppedRefreshes
+from safe_wrappers.wrappers.faults import RepeatedCommands
 
 
 def identified(env):
@@ -19,7 +19,7 @@ def identified(env):
 
 
 MORE = [
-    lambda: sw.RecordInterventions(DroppedRefreshes(gym.make("Pendulum-v1", max_episode_steps=20), 0.5)),
+    lambda: sw.RecordInterventions(RepeatedCommands(gym.make("Pendulum-v1", max_episode_steps=20), 0.5)),
     lambda: gym.make("FlexJointReach-v0"),
     lambda: gym.make("SafeRover-v0"),
     lambda: gym.make("PatrolledPointMaze-v0"),

@@ -57,12 +57,12 @@ def test_arguments_that_are_missing_or_wrong_are_named():
 
 
 def test_the_stack_has_every_layer_in_its_place():
-    faults = {"Outages": OUTAGES, "DroppedRefreshes": {"share": 0.1}}
+    faults = {"Outages": OUTAGES, "RepeatedCommands": {"share": 0.1}}
     filtered = FilterConfig(protect={}, lease=LEASE, escape={"progress": 0.1})
     stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), filtered)
     kinds = [type(wrapper).__name__ for wrapper in wrappers_of(stack)]
     order = [
-        "DroppedRefreshes",
+        "RepeatedCommands",
         "Outages",
         "RecordInterventions",
         "StuckEscape",

@@ -14,7 +14,7 @@ from slow_handover import BLENDS, Slow, measured
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError
-from safe_wrappers.wrappers.faults import DroppedRefreshes
+from safe_wrappers.wrappers.faults import RepeatedCommands
 from safe_wrappers.wrappers.layer import CommandReceiver, WrapperRng
 
 HOLD = 0.1
@@ -583,7 +583,7 @@ def test_whoever_is_inside_is_told_what_every_command_is_made_from():
     assert told == wanted
 
 
-@pytest.mark.parametrize("between", [lambda env: env, lambda env: DroppedRefreshes(env, 0.0)])
+@pytest.mark.parametrize("between", [lambda env: env, lambda env: RepeatedCommands(env, 0.0)])
 def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on(between):
     def reached(env):
         return np.zeros(1), np.zeros(1)

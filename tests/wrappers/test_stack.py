@@ -48,7 +48,7 @@ MAKE = {
     "SafeActionMap": sw.SafeActionMap,
     "RecordInterventions": sw.RecordInterventions,
     "ChunkHandover": lambda env: sw.ChunkHandover(env, 4, 2, fallback="zero", blend_time=0.02),
-    "DroppedRefreshes": lambda env: FAULTS["DroppedRefreshes"](env, 0.3),
+    "RepeatedCommands": lambda env: FAULTS["RepeatedCommands"](env, 0.3),
 }
 FILTERS = {
     "SafePointGoal1-v0": ("CBFActionFilter", "protect"),

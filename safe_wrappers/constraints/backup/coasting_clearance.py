@@ -157,7 +157,7 @@ class BoundCoastingClearance(BoundDetourClearance):
             return np.array([min(self._least, self._after(self._still).least)])
         return np.array([self._least - rolls])
 
-    def load(self, low: Array, high: Array) -> None:
+    def load(self) -> None:
         _ = self.plant.acting_range
 
     def nearest(self, neighbours: int) -> Array:

@@ -215,7 +215,7 @@ class BoundEscapeClearance(BoundBackupClearance):
             return left
         return left - self._needed() if left == left else -np.inf
 
-    def load(self, low: Array, high: Array) -> None:
+    def load(self) -> None:
         self._slacks(self._firsts())
 
     def _needed(self) -> float:

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array, check_fields, non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
-from safe_wrappers.control.backup import drive_decision as among
+from safe_wrappers.control.backup import drive_among_discs as among
 from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
 from safe_wrappers.control.numerics.shapes import nearest_discs
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, ConstraintBatch, HalfSpaces
-from safe_wrappers.plants.mujoco.actuators import Actuators, acting_ranges
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
@@ -69,7 +68,6 @@ class HeadingDriveClearance(Constraint):
 class BoundHeadingDriveClearance(BoundDetourClearance):
     """HeadingDriveClearance on a plant: the rules are in `control/backup/drive_among_discs.py`."""
 
-    decides = True
     detour_steps = 50
     spec: HeadingDriveClearance
     plant: MujocoPlant
@@ -158,34 +156,15 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         return [*found, *line("way", corners, THIN, closed=True), ball("way", corners[2], 3.0 * THIN)]
 
     @classmethod
-    def batch(
-        cls, bound: Sequence[Self], low: Array, high: Array, dtype: np.dtype[Any]
-    ) -> ConstraintBatch | None:
-        direct = all(b.plant.published() is not None for b in bound) and dtype in (np.float32, np.float64)
-        return HeadingDriveBatch(bound, low, high, dtype) if direct else None
+    def batch(cls, bound: Sequence[Self]) -> ConstraintBatch | None:
+        return HeadingDriveBatch(bound) if all(b.plant.published() is not None for b in bound) else None
 
-    def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
-        """The whole search at once, without a solver."""
-        if self.admits(proposal):
-            return proposal, among.PROPOSAL, HalfSpaces.none(2)
-        found, stage, side, normals, offsets = self._closest(proposal, low, high)
-        if side != 0.0:
-            self._keep_side(side)
-        # Comparisons with NaN are false: an overflow must not look admitted. The search looks at it again.
-        if stage == among.UNRESOLVED or not np.isfinite(found).all():
-            return None
-        return self._pair(found), stage, self._half_spaces(normals, offsets)
-
-    def _closest(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, float, Array, Array]:
-        """What `closest_admitted` writes, and returns."""
-        plant, found = self.plant, np.empty(2)
-        bounds = among.bounds_of(low, high, plant.lower, plant.upper, *plant.acting_range, self.turns_first)
-        told = self._pair(proposal), self._kept_side(), self.spec.detour
-        return found, *among.closest_admitted(self._scene, *told, bounds, found)
-
-    def load(self, low: Array, high: Array) -> None:
+    def load(self) -> None:
+        _ = self.plant.acting_range
         among.is_admitted(self._scene, 0.0, 0.0)
-        self._closest(np.zeros(2), low, high)
+        among.secants(self._scene)
+        among.way_around(self._scene, 0.0, 0.0, 0.0)
+        among.manoeuvre_drive(self._scene)
 
 
 class HeadingDriveBatch(ConstraintBatch):
@@ -193,34 +172,23 @@ class HeadingDriveBatch(ConstraintBatch):
 
     Args:
         bound: The constraint on every env's plant, all of one specification.
-        low: The action box, shape (2,).
-        high: Likewise.
-        dtype: Of actions: single or double precision.
     """
 
-    def __init__(
-        self, bound: Sequence[BoundHeadingDriveClearance], low: Array, high: Array, dtype: np.dtype[Any]
-    ) -> None:
+    def __init__(self, bound: Sequence[BoundHeadingDriveClearance]) -> None:
         n = len(bound)
-        self._bound, self._single = list(bound), dtype == np.float32
-        self._low, self._high = low, high
+        self._bound = list(bound)
         self._sides, self._steps = np.zeros(n), np.zeros(n, dtype=np.int64)
         self._positions: list[Array] = [np.zeros(3)] * n
         self._velocities: list[Array] = [np.zeros(3)] * n
         self._joints, self._motions = np.zeros((2, 3 * n)), np.zeros((n, 6))
         self._origins = np.zeros((n, 2))
         self._counts: list[int] = []
-        self._loaded = False
-        self._read_constants()
+        self._models = np.array([b.models for b in bound])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         for i in range(len(self._bound)):  # a copy reads the data of the copied envs
             self.restart(i, self.memory(i))
-
-    def _pairs(self, controls: Array) -> Array:
-        """(Drive, turn) from controls, shape (..., 2); the same swap leads back."""
-        return controls[..., ::-1] if self._bound[0].turns_first else controls
 
     def restart(self, env: int, memory: Detour) -> None:
         bound = self._bound[env]
@@ -231,44 +199,16 @@ class HeadingDriveBatch(ConstraintBatch):
     def memory(self, env: int) -> Detour:
         return Detour(float(self._sides[env]), int(self._steps[env]))
 
-    def decide(
-        self, proposals: Array, judged: NDArray[np.bool_], controls: Array
-    ) -> tuple[Array, NDArray[np.int64]]:
+    def judge(self, proposals: Array) -> tuple[Array, NDArray[np.bool_]]:
         self._observe()
-        n, one = len(proposals), self._bound[0]
+        one, values, admitted = self._bound[0], np.empty(len(proposals)), np.empty(len(proposals), dtype=bool)
+        pairs = np.ascontiguousarray(proposals[:, ::-1] if one.turns_first else proposals)
         scene = self._models, self._motions, self._discs, self._first, one.reserve
-        values, admitted, stages = np.empty(n), np.empty(n, dtype=bool), np.zeros(n, dtype=np.int64)
-        pairs = np.ascontiguousarray(self._pairs(proposals))
         among.admit_each(*scene, pairs, values, admitted)
-        found, refused = pairs.copy(), np.flatnonzero(judged & ~admitted)
-        sides = np.where(self._steps > 0, self._sides, 0.0)
-        if refused.size or not self._loaded:  # the first step compiles what a later one would wait for
-            self._loaded = True
-            bounds, detour = self._bounds(refused), one.spec.detour
-            among.decide_each(*scene, pairs, refused, sides, detour, bounds, self._single, found, stages)
-        self._tried = np.where(judged & ~admitted, sides, 0.0)
-        controls[judged] = self._pairs(found)[judged]
-        return values, stages
+        return values, admitted
 
     def executed(self, envs: NDArray[np.bool_]) -> None:
-        detour = envs & (self._tried != 0.0)
-        self._sides[detour], self._steps[detour] = self._tried[detour], self._bound[0].detour_steps
         self._steps[envs] -= 1
-
-    def _bounds(self, envs: NDArray[np.int64]) -> Array:
-        """The action box, and the part of it where forces still change, as (drive, turn), shape (r, 4, 2)."""
-        # Contiguous for any number of envs: else functions are compiled once for one env and again for several.
-        bounds, acting, dt = (
-            np.empty((len(envs), 4, 2)),
-            np.empty((len(envs), 2, 2)),
-            self._bound[0].plant.control_dt,
-        )
-        bounds[:, :2] = self._box[envs]
-        turn, on_hinge = self._bound[0].frame.turn_index, np.zeros((2, len(self._bound), 2))
-        on_hinge[:, :, turn] = self._turn_gear * self._motions[:, 2::3].T
-        acting_ranges(self._actuators, on_hinge[0], on_hinge[1], dt, envs, acting)
-        bounds[:, 2:] = np.clip(acting, bounds[:, :1], bounds[:, 1:2])
-        return np.ascontiguousarray(self._pairs(bounds))
 
     def _observe(self) -> None:
         """Take the present motion of every robot, and its discs."""
@@ -283,13 +223,3 @@ class HeadingDriveBatch(ConstraintBatch):
             self._counts, self._discs = counts, np.concatenate(discs)
             self._first = np.cumsum([0, *map(len, discs)])
         np.concatenate(groups, out=self._discs[:, :2])
-
-    def _read_constants(self) -> None:
-        models = [b.plant.model for b in self._bound]
-        self._models = np.array([b.models for b in self._bound])
-        self._actuators = Actuators(*map(np.array, zip(*map(Actuators.of, models), strict=True)))
-        turn = self._bound[0].frame.turn_index
-        self._turn_gear = np.array([m.actuator_gear[turn, 0] for m in models])
-        low = [np.maximum(self._low, b.plant.lower) for b in self._bound]
-        high = [np.minimum(self._high, b.plant.upper) for b in self._bound]
-        self._box = np.stack([low, high], axis=1)

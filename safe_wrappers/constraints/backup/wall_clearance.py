@@ -60,14 +60,12 @@ class WallClearance(Constraint):
 class BoundWallClearance(BoundBackupClearance):
     """WallClearance on a plant: the rules are in `control/backup/point_decision.py`."""
 
-    decides = True
     spec: WallClearance
     plant: MujocoPlant
 
     def __init__(self, spec: WallClearance, plant: Plant) -> None:
         hint = "on an AnalyticPlant use Clearance([Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
         super().__init__(spec, require_mujoco(plant, f"WallClearance needs a MujocoPlant; {hint}"))
-        self._none = HalfSpaces.none(self.plant.model.nu)
 
     def read_constants(self) -> None:
         clip = self.spec.velocity_clip
@@ -87,19 +85,10 @@ class BoundWallClearance(BoundBackupClearance):
     def admits(self, control: Array) -> bool:
         return point_decision.is_admitted(self._scene, self._motion, self._left, control)
 
-    def load(self, low: Array, high: Array) -> None:
+    def load(self) -> None:
         control = np.zeros(self.plant.model.nu)
         self.admits(control)
-        self.decide(control, low, high)
         self.candidates(control)
-
-    def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
-        """The proposal or the closest candidate, without a solver."""
-        control = proposal.copy()
-        stage = point_decision.closest_admitted(self._scene, self._motion, self._left, low, high, control)
-        if stage == point_decision.UNRESOLVED:
-            return None
-        return proposal if stage == point_decision.PROPOSAL else control, stage, self._none
 
     def backup(self) -> Array:
         """The control that is always admitted: brake both axes. From outside it leads back inside."""

@@ -319,8 +319,8 @@ class BoundJointSpeedLimit(BoundRollout):
         )
         return HalfSpaces(*rows)
 
-    def load(self, low: Array, high: Array) -> None:
-        super().load(low, high)
+    def load(self) -> None:
+        super().load()
         if self.plant.has_acceleration:
             self.rows()
 

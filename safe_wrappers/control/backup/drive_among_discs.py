@@ -10,6 +10,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import (
@@ -369,3 +370,72 @@ def backup_drive(at: Look) -> float:
     if at.safe and best < _needed_outside(at, best):
         return _braking(at)
     return drive if _keeps_clear(at, best, drive, 0.0) else _braking(at)
+
+
+@compiled
+def least_clearance(qpos: Array, qvel: Array, place: Array, scene: Scene) -> tuple[float, int]:
+    """`Look.value`, m (NaN if a disc is not a number), and how many discs are in play.
+
+    Writes the scene's motion: `place` has the indices of the first of its joints in qpos and qvel, and the body's
+    place at qpos = 0, m.
+    """
+    motion = scene[1]
+    for i in range(3):
+        motion[i], motion[3 + i] = qpos[int(place[0]) + i], qvel[int(place[1]) + i]
+    motion[0] += place[2]
+    motion[1] += place[3]
+    at = look(scene)
+    return at.value, len(at.discs)
+
+
+@compiled
+def is_admitted(scene: Scene, drive: float, turn: float) -> bool:
+    """Whether the end of a held control still has a safe stopping path."""
+    return admits(look(scene), drive, turn)
+
+
+@compiled
+def secants(scene: Scene) -> tuple[Array, Array]:
+    """Half-spaces of (drive, turn) that keep the clearance, about: shapes (k, 2) and (k,)."""
+    return rows(look(scene))
+
+
+@compiled
+def way_around(scene: Scene, drive: float, turn: float, side: float) -> float:
+    """1 (left), -1 (right), or 0 with nothing to go around; `side` is that of a detour that goes on, or 0."""
+    return passing_side(look(scene), drive, turn, side)
+
+
+@compiled
+def manoeuvre_drive(scene: Scene) -> float:
+    """The drive control of the backup manoeuvre."""
+    return backup_drive(look(scene))
+
+
+@compiled
+def admit_each(
+    models: Array,
+    motions: Array,
+    discs: Array,
+    first: NDArray[np.int64],
+    reserve: float,
+    proposals: Array,
+    values: Array,
+    admitted: NDArray[np.bool_],
+) -> None:
+    """Judges n robots.
+
+    Args:
+        models: As for one, of each, shape (n, 1 + c, 14).
+        motions: Likewise, shape (n, 6).
+        discs: All robots' discs, one after the other, shape (d, 3).
+        first: Where each robot's discs begin, and the end, shape (n + 1,).
+        reserve: The margin, m.
+        proposals: (drive, turn), shape (n, 2).
+        values: Written: as of `least_clearance`, m, shape (n,).
+        admitted: Written: whether its proposal is admitted, shape (n,).
+    """
+    for i in range(len(motions)):
+        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], reserve))
+        values[i] = at.value
+        admitted[i] = admits(at, proposals[i, 0], proposals[i, 1])

@@ -28,8 +28,6 @@ from safe_wrappers.control.backup.point_among_walls import (
 from safe_wrappers.control.numerics.compiled import compiled, hypot
 from safe_wrappers.control.numerics.shapes import Rectangle, closer, gaps, nearest, one_of
 
-PROPOSAL, CANDIDATE, UNRESOLVED = 0, 2, 7
-"""What `closest_admitted` returns: a `Stage` of the search, or that it has found no admitted control."""
 HAIR_M: Final = 1e-7
 """Extra distance of corrections, for rounding to float32."""
 _NOISE_M: Final = 1e-12  # rounding of float64 between a path and the rest of it
@@ -328,24 +326,6 @@ def room_left(scene: Scene, qpos: Array, qvel: Array, motion: Array) -> float:
 def is_admitted(scene: Scene, motion: Array, left: float, control: Array) -> bool:
     """Whether a control, shape (m,), keeps the room, or from outside shrinks the violation."""
     return admits(_at(scene, motion, left), _pair(scene, control), 0.0)
-
-
-@compiled
-def closest_admitted(
-    scene: Scene, motion: Array, left: float, low: Array, high: Array, control: Array
-) -> int:
-    """Replaces a control, shape (m,), by the closest candidate in the box that is admitted; the stage that did it."""
-    at, asked = _at(scene, motion, left), _pair(scene, control)
-    if admits(at, asked, 0.0):
-        return PROPOSAL
-    i, j = int(scene[0][0, 13]), int(scene[0][1, 13])
-    found = near(at, asked)
-    for k in range(len(found)):
-        x, y = min(max(found[k, 0], low[i]), high[i]), min(max(found[k, 1], low[j]), high[j])
-        if math.isfinite(x + y) and admits(at, (x, y), 0.0):
-            control[i], control[j] = x, y
-            return CANDIDATE
-    return UNRESOLVED
 
 
 @compiled

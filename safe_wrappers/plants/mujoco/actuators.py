@@ -121,33 +121,6 @@ def _acting_range(
 
 
 @compiled
-def acting_ranges(
-    every: Actuators,
-    lengths: Array,
-    velocities: Array,
-    control_dt: float,
-    chosen: NDArray[np.int64],
-    bounds: Array,
-) -> None:
-    """`AffineActuators.acting_range` for the `chosen` of n machines, shape (r,), into `bounds`, shape (r, 2, nu)."""
-    for r in range(len(chosen)):
-        i = chosen[r]
-        one = Actuators(
-            every.gain_type[i],
-            every.gain[i],
-            every.bias_type[i],
-            every.bias[i],
-            every.force_limited[i],
-            every.force_range[i],
-            every.control_limited[i],
-            every.control_range[i],
-            every.gear[i],
-            every.acceleration[i],
-        )
-        _acting_range(one, lengths[i], velocities[i], control_dt, bounds[r, 0], bounds[r, 1])
-
-
-@compiled
 def _respond(
     act: Actuators,
     length: Array,
