@@ -37,14 +37,14 @@ class Rollout:
 
     Attributes:
         observations: After each step.
-        rewards: Of each step, floats, or arrays where they are vectors; NaN where the plant does not know them.
+        rewards: Of each step; NaN where the plant does not know them.
         values: What was measured after each step, shape (k,).
         ended: The episode terminated or was truncated.
         reached: The set in which it may stop was reached.
     """
 
     observations: list[Any] = field(default_factory=list)
-    rewards: list[Any] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
     ended: bool = False
     reached: bool = False

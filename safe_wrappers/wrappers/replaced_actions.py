@@ -12,7 +12,7 @@ from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import brake
 from safe_wrappers.filter.ray_map import Ray, centre, mapped_on_ray, rounded
-from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards, wrappers_of
+from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng, action_array
@@ -189,7 +189,6 @@ class StuckEscape(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
-        refuse_vector_rewards(env, "StuckEscape")
         inside = filter_inside(env)
         if inside is None:
             raise ConfigurationError(
@@ -225,7 +224,7 @@ class StuckEscape(LayerWrapper):
         if escaping:
             self._left -= 1
             info[keys.CBF_NONFINITE] |= not np.isfinite(own).all()
-        self._rewards.append(one_reward(reward, "StuckEscape"))
+        self._rewards.append(float(reward))
         self._changed.append(info[keys.CBF_INTERVENED] or escaping)
         full = len(self._rewards) == self._window
         stuck = full and 2 * sum(self._changed) > self._window and sum(self._rewards) <= self.progress
