@@ -54,7 +54,6 @@ class RolloutPlant(Plant):
     """A plant that predicts by rollouts alone; it has neither f nor g."""
 
     has_acceleration: ClassVar[bool] = False
-    bounds_are_action_space: ClassVar[bool] = True
     simulates: ClassVar[bool] = True
     simulates_env: ClassVar[bool] = True
     """Whether a `View` of a rollout has the env and its info; else only the observation."""

@@ -3,7 +3,7 @@
 A `Replay` repeats an env's control step on separate data, and visits every evaluation of the physics.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import mujoco
@@ -223,10 +223,17 @@ class ContactReader:
         bodies = np.where(fixed_bodies(model), 0, np.arange(model.nbody))
         self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
         self._wrench = np.zeros(6)
+        self.clear()
 
-    def _read(self, data: mujoco.MjData, step: int) -> Iterator[tuple[Any, ...]]:
-        """Every contact of a moving body with the fixed world, as MuJoCo has computed them last."""
-        body, contact = self._body_of_geom, data.contact
+    def clear(self) -> None:
+        """Forget what has been read."""
+        self.count = 0
+        self._found: list[tuple[Any, ...]] = []
+
+    def read(self, data: mujoco.MjData) -> None:
+        """Copy every contact of a moving body with the fixed world, as MuJoCo has computed them last."""
+        step, body, contact = self.count, self._body_of_geom, data.contact
+        self.count += 1
         for i, (one, other) in enumerate(contact.geom.tolist()):
             first, second = body[one], body[other]
             if first == second or min(first, second) != 0 or contact.efc_address[i] < 0:
@@ -236,29 +243,36 @@ class ContactReader:
             side = 1.0 if first == 0 else -1.0
             slide = contact.friction[i, :2].min() if contact.dim[i] > 1 else 0.0
             frame = contact.frame[i].reshape(3, 3).copy()
-            yield step, first or second, contact.pos[i].copy(), side, frame, self._wrench[:3].copy(), slide
+            self._found.append(
+                (step, first or second, contact.pos[i].copy(), side, frame, self._wrench[:3].copy(), slide)
+            )
+
+    def forecast(self, finite: bool) -> ContactForecast:
+        """All contacts that have been read since `clear`."""
+        if not self._found:
+            none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+            return ContactForecast(self.count, none, none, nowhere, nowhere, nowhere, np.zeros(0), finite)
+        step, body, point, side, frame, force, friction = (
+            np.array(part) for part in zip(*self._found, strict=True)
+        )
+        normal, force = side[:, None] * frame[:, 0], side[:, None] * np.einsum("ki,kij->kj", force, frame)
+        return ContactForecast(self.count, step, body, point, normal, force, friction, finite)
 
     def follow(self, data: mujoco.MjData, substeps: int) -> ContactForecast:
         """Step the data, with the control it has, and return the contacts of all these physics substeps."""
         data.warning.number[RESETS] = 0
-        steps, inside, found = 0, True, list[tuple[Any, ...]]()
+        self.clear()
+        inside = True
 
         def visit(at: mujoco.MjData, _: float) -> None:
-            nonlocal steps, inside
-            found.extend(self._read(at, steps))
-            steps += 1
+            nonlocal inside
+            self.read(at)
             inside = inside and bool(at.qacc @ at.qacc < _FASTEST)
 
         for _ in range(substeps):
             evaluations(self._model, data, visit)
         inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
-        inside = inside and not data.warning.number[RESETS].any()
-        if not found:
-            none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-            return ContactForecast(steps, none, none, nowhere, nowhere, nowhere, np.zeros(0), inside)
-        step, body, point, side, frame, force, friction = (np.array(p) for p in zip(*found, strict=True))
-        normal, force = side[:, None] * frame[:, 0], side[:, None] * np.einsum("ki,kij->kj", force, frame)
-        return ContactForecast(steps, step, body, point, normal, force, friction, inside)
+        return self.forecast(inside and not data.warning.number[RESETS].any())
 
 
 def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:

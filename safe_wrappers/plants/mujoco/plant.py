@@ -59,7 +59,6 @@ class MujocoPlant(Plant):
         UnsupportedEnvError: No MuJoCo model, a disabled actuator, one not affine, or actions that no map fits.
     """
 
-    bounds_are_action_space: ClassVar[bool] = True
     can_brake: ClassVar[bool] = True
     model: mujoco.MjModel  #: the plant's own
     data: mujoco.MjData  #: likewise; at the present state only after `forward` or `pose`
