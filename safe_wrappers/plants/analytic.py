@@ -123,7 +123,7 @@ class AnalyticPlant(Plant):
     @property
     def f(self) -> Array:
         if self._drift is None:
-            self._drift, expected = np.asarray(self._f(self.state), dtype=np.float64), self.state.shape
+            self._drift, expected = self.drift(self.state), self.state.shape
             if self._drift.shape != expected:
                 found = self._drift.shape
                 raise ConfigurationError(f"f must return the shape of the state {expected}, got {found}")
@@ -132,11 +132,17 @@ class AnalyticPlant(Plant):
     @property
     def g(self) -> Array:
         if self._effect is None:
-            self._effect = np.asarray(self._g(self.state), dtype=np.float64)
-            found, expected = self._effect.shape, (self.state.size, self.lower.size)
+            self._effect, expected = self.effect(self.state), (self.state.size, self.lower.size)
+            found = self._effect.shape
             if found != expected:
                 raise ConfigurationError(f"g must return shape (states, controls) = {expected}, got {found}")
         return self._effect
+
+    def drift(self, x: Array) -> Array:
+        return np.asarray(self._f(x), dtype=np.float64)
+
+    def effect(self, x: Array) -> Array:
+        return np.asarray(self._g(x), dtype=np.float64)
 
     def attribute(self, name: str) -> Any:
         return read_attribute(self._env, name)

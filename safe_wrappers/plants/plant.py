@@ -98,6 +98,14 @@ class Plant(ABC):
         """States on the way and at the end of a held control; empty where the plant cannot predict them."""
         return []
 
+    def drift(self, x: Array) -> Array:
+        """The drift at any state, shape (n,); by default that of the present one."""
+        return self.f
+
+    def effect(self, x: Array) -> Array:
+        """The control matrix at any state, shape (n, m); by default that of the present one."""
+        return self.g
+
     def require_acceleration(self, asker: str) -> None:
         """Refuse a constraint, named by `asker`, whose rows need f and g where there are none."""
         if not self.has_acceleration:

@@ -62,8 +62,6 @@ def shield(env):
     return sw.CBFActionFilter(env, [BehindTheWall()], plant=plant)
 
 
-
-
 def one_arm(fake_experiment, learner, *overrides, algorithm="SAC"):
     """An experiment of one filtered arm."""
     settings = {
