@@ -97,15 +97,15 @@ class WholeBodyFilter(CBFActionFilter):
         friction_share: Of the model's friction coefficient that may be counted on, in (0, 1].
         joint_tolerance: How far a joint may press its stop, rad or m. None leaves the joints alone.
         zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, positive, wherever
-            there is a polygon. None sets no bound.
+            there is a polygon, for forecasts. None sets no bound.
         tolerance: By how much a forecast force may miss its cone, as a share of the robot's weight; None is 0.01.
         bodies: Names of the bodies whose contacts count, for forecasts; None is every moving body.
         horizon: Control steps to look ahead for the joints, for forecasts: as many as braking takes; None is 3.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`.
 
-    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/cone_margin``, and for
-    forecasts with a `zmp_inset` ``whole_body/zmp_margin``.
+    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/cone_margin``, and with a `zmp_inset`
+    ``whole_body/zmp_margin``.
 
     Raises:
         ConfigurationError: A share outside (0, 1], a negative tolerance, or a body that does not move.
@@ -149,11 +149,11 @@ class WholeBodyFilter(CBFActionFilter):
             )
         constraints: list[Constraint]
         if contacts in ("pyramid", "cone"):
-            for name in ("tolerance", "bodies", "horizon"):
+            for name in ("zmp_inset", "tolerance", "bodies", "horizon"):
                 if arguments[name] is not None:
                     raise ConfigurationError(f'{name} is for contacts="forecast", not for {contacts!r}')
             cone: Any = "exact" if contacts == "cone" else "pyramid"
-            constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance, zmp_inset=zmp_inset)]
+            constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance)]
         elif contacts == "forecast":
             tolerance = TOLERANCE if tolerance is None else tolerance
             constraints = [ContactFeasibility(friction_share, tolerance, bodies)]
