@@ -168,11 +168,6 @@ ADAPTION_PENALTY: Final = _key("adaption/penalty", "float64", unit="reward", chu
 ADAPTION_TASK_REWARD: Final = _key("adaption/task_reward", "float64", unit="reward", chunk="sum")
 """The task's own reward of this step, before the penalty."""
 
-# SafeActionMap, every step -----------------------------------------------------------------------------------
-MAP_SCALE: Final = _key("map/scale", "float64", chunk="min", log="map_scale")
-"""By what the distance of the policy's action from the anchor was multiplied, from 0 to 1; 1: the action is
-unchanged; NaN: there was no admitted anchor, and the filter was given the policy's action."""
-
 # LeaseExpiry and TeleopChannel without a filter inside, ChunkHandover: every step --------------------------------
 ACTION_CLIPPED: Final = _key("action/clipped", "float64", unit="action", chunk="max")
 """L2 norm by which the action left the action space (of a chunk, of the entry that left it farthest); what is

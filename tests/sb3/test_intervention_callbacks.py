@@ -142,6 +142,13 @@ def test_evaluation_reaches_tensorboard_at_its_own_step(tmp_path):
 
 def test_a_step_without_a_judgement_does_not_hide_the_mean_of_the_others(tmp_path):
     logger = configure(str(tmp_path), ["tensorboard"])
-    log_steps(logger, [{keys.MAP_SCALE: 0.5}, {keys.MAP_SCALE: keys.NOT_JUDGED}, {keys.MAP_SCALE: 1.0}])
-    assert logger.name_to_value["interventions/step_map_scale"] == 0.75
+    log_steps(
+        logger,
+        [
+            {keys.CONTACT_PEAK_FORCE: 0.5},
+            {keys.CONTACT_PEAK_FORCE: keys.NOT_JUDGED},
+            {keys.CONTACT_PEAK_FORCE: 1.0},
+        ],
+    )
+    assert logger.name_to_value["interventions/step_contact_force"] == 0.75
     logger.close()
