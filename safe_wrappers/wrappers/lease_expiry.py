@@ -1,7 +1,7 @@
 """LeaseExpiry: a command is in force only while the machine could still stop behind it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from numpy.typing import NDArray
@@ -10,7 +10,6 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.handover.smoothstep import smoothstep
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
@@ -175,10 +174,6 @@ class LeaseExpiry(CommandGate):
         info[keys.LEASE_REFUSED] = refused
         info[keys.LEASE_BRAKING] = not covered
         return answer
-
-    def look(self) -> Sequence[BoundConstraint]:
-        """The constraint that leases are worked out from, in the env's present state, for who looks on."""
-        return self._budget.look()
 
     def admits(self, end: Array, steps: int) -> bool:
         """Whether the end of a chunk of setpoints is within `motion_limits`; a refusal is in the next step's info."""

@@ -39,16 +39,6 @@ def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Ar
     return symmetric
 
 
-def checked_noise(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
-    """As `checked_covariance`, but positive definite: no measurement is exact."""
-    symmetric, smallest, largest = _symmetric(name, matrix, n)
-    if not smallest > 1e-14 * largest:
-        raise ConfigurationError(
-            f"{name} must be positive definite but its smallest eigenvalue is {smallest:.6g}"
-        )
-    return symmetric
-
-
 def discretise(A: ArrayLike, Q: ArrayLike, time_s: float) -> Discrete:
     """The exact step over a time; identity and zero for time 0.
 
