@@ -130,7 +130,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         if self.mode == "safe_action":
             super().add(obs, next_obs, executed, reward, done, infos)
             return
-        task = np.array([info[keys.ADAPTION_TASK_REWARD] for info in infos], dtype=np.float64)
+        task = reward + np.array([info[keys.ADAPTION_PENALTY] for info in infos])
         self._keep(infos, executed, task, changed, finite)
         policy = np.where(finite[:, None], policy, executed)
         super().add(obs, next_obs, policy, np.where(finite, reward, task), done, infos)

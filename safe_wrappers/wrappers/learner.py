@@ -74,7 +74,7 @@ class AdaptionPenalty(LayerWrapper):
         penalty: For every changed step, in units of the task's reward, at least 0.
         per_correction: For each unit of `cbf/correction` (L2 norm, action units) of a changed step, at least 0.
 
-    Info, at every step: ``adaption/penalty`` and ``adaption/task_reward`` (float), whose difference is the reward.
+    Info, at every step: ``adaption/penalty`` (float); with it added back, the reward is the task's own.
 
     Raises:
         ConfigurationError: No filter inside, a second AdaptionPenalty, no penalty, or one that is negative.
@@ -84,9 +84,9 @@ class AdaptionPenalty(LayerWrapper):
         >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
         >>> env = sw.AdaptionPenalty(env, penalty=0.1)
         >>> _ = env.reset(seed=0)
-        >>> _, reward, _, _, info = env.step(env.action_space.sample())
-        >>> float(reward) == info["adaption/task_reward"] - info["adaption/penalty"]
-        True
+        >>> info = env.step(env.action_space.high)[4]
+        >>> bool(info["cbf/intervened"]), info["adaption/penalty"]
+        (True, 0.1)
     """
 
     layer: ClassVar = Layer.ADAPTION
@@ -112,20 +112,19 @@ class AdaptionPenalty(LayerWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Resets the env; its info holds the keys of a step, as 0."""
         observation, info = self.env.reset(seed=seed, options=options)
-        info[keys.ADAPTION_PENALTY] = info[keys.ADAPTION_TASK_REWARD] = 0.0
+        info[keys.ADAPTION_PENALTY] = 0.0
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Steps the env; an unchanged step's reward passes through untouched."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         penalty = 0.0
-        info[keys.ADAPTION_TASK_REWARD] = one_reward(reward, "AdaptionPenalty")
         changed, correction = info[keys.CBF_INTERVENED], info[keys.CBF_CORRECTION]
         if info.get(keys.CBF_ESCAPING, False):  # StuckEscape gave the filter another action than this one
             changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))
         if changed:
             penalty = self.of(float(correction))
-            reward = float(reward) - penalty
+            reward = one_reward(reward, "AdaptionPenalty") - penalty
         info[keys.ADAPTION_PENALTY] = penalty
         return observation, reward, terminated, truncated, info
 

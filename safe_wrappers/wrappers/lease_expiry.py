@@ -53,7 +53,7 @@ class LeaseExpiry(CommandGate):
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
 
-    Info, at every step: ``lease/remaining_s`` (float), ``lease/expired``, ``lease/refused``, ``lease/braking``
+    Info, at every step: ``lease/remaining_s`` (float), ``lease/refused``, ``lease/braking``
     (bool); without a filter inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
@@ -133,7 +133,7 @@ class LeaseExpiry(CommandGate):
         self._budget.reset()
         self._start(info)
         info[keys.LEASE_REMAINING_S] = 0.0
-        info.update(dict.fromkeys((keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
+        info.update(dict.fromkeys((keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
         self.started = True
         return observation, info
 
@@ -154,7 +154,6 @@ class LeaseExpiry(CommandGate):
         if fresh:
             refused |= not self._grant(now)
         covered = now + self.control_dt <= self._until_s + self._same_s
-        expired = not covered and self._until_s > -math.inf
         if covered:
             if arrived:
                 self._command = given
@@ -163,14 +162,12 @@ class LeaseExpiry(CommandGate):
             # The env gets a copy as well: it may scale in place what is still in force.
             sent = self._command.copy() if self._blend is None else self._blended(self._command)
         else:
-            self._until_s = -math.inf
             self._braking, self._blend = True, None
             sent = self._fallback.command().astype(self._dtype)
         self._executed, answer = self._execute(sent)
         self._observed_s = self.now_s
         info = answer[4]
         info[keys.LEASE_REMAINING_S] = max(self._until_s - self.now_s, 0.0)
-        info[keys.LEASE_EXPIRED] = expired
         info[keys.LEASE_REFUSED] = refused
         info[keys.LEASE_BRAKING] = not covered
         return answer

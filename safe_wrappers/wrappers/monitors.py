@@ -80,7 +80,7 @@ class StepMonitor(LayerWrapper, ABC):
 
 
 class ContactMonitor(StepMonitor):
-    """Reports forces, impulses and violations of a MuJoCo env's contacts; changes nothing.
+    """Reports forces and violations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
     of its own, from the state before it and with the inputs that the env has left. An env that changes its inputs or
@@ -92,8 +92,8 @@ class ContactMonitor(StepMonitor):
         against: Names of what they touch, "world" among them; None is everything. A contact counts if one of its
             bodies is in each list.
 
-    Info, at every step: ``contact/peak_force`` (N), ``contact/impulse`` (N s), ``contact/penetration`` (m),
-    ``contact/residual`` (N m; 0 for rigid contacts), NaN where the simulation's contacts are not finite, and
+    Info, at every step: ``contact/peak_force`` (N), ``contact/penetration`` (m), ``contact/residual`` (N m; 0 for
+    rigid contacts), NaN where the simulation's contacts are not finite, and
     ``contact/partial`` (bool), see `safe_wrappers.info`. After a reset they are 0 and False.
 
     Raises:
@@ -148,7 +148,7 @@ class ContactMonitor(StepMonitor):
             self._contacts = Contacts(model, self.bodies, self.against)
         self._gaps: list[float] = []
         self._forces: list[float] = []
-        self._impulse = self._peak = 0.0
+        self._peak = 0.0
         self._peak_bodies: tuple[int, int] | None = None
 
     def _visit(self, data: mujoco.MjData, time_s: float) -> None:
@@ -156,24 +156,22 @@ class ContactMonitor(StepMonitor):
         for bodies, gap, force in self._contacts.read(data):
             self._gaps.append(gap)
             self._forces.append(force)
-            self._impulse += force * time_s
             pairs[bodies] = pairs.get(bodies, 0.0) + force
         for bodies, force in pairs.items():
             if force > self._peak:
                 self._peak, self._peak_bodies = force, bodies
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
-        peak, impulse, depth, residual = self._peak, self._impulse, 0.0, 0.0
+        peak, depth, residual = self._peak, 0.0, 0.0
         if self._gaps:
             gaps, forces = np.array(self._gaps), np.array(self._forces)
             if np.isfinite(gaps).all() and np.isfinite(forces).all():
                 residuals = complementarity_residuals(gaps, forces)
                 depth, residual = float(residuals.penetration.max()), float(residuals.product.max())
             else:
-                peak = impulse = depth = residual = math.nan
+                peak = depth = residual = math.nan
         return {
             keys.CONTACT_PEAK_FORCE: peak,
-            keys.CONTACT_IMPULSE: impulse,
             keys.CONTACT_PENETRATION: depth,
             keys.CONTACT_RESIDUAL: residual,
         }
@@ -196,8 +194,8 @@ class BalanceMonitor(StepMonitor):
         bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves.
 
     Info, at every step: ``balance/linear_momentum`` (kg m/s), ``balance/angular_momentum`` (kg m^2/s), arrays (3,),
-    ``balance/friction_used``, ``balance/zmp_margin`` (m), ``balance/airborne``, and ``balance/partial`` (bool), see
-    `safe_wrappers.info`. After a reset they are 0 and False, the margin NaN.
+    ``balance/friction_used``, ``balance/zmp_margin`` (m), and ``balance/partial`` (bool), see `safe_wrappers.info`.
+    After a reset they are 0 and False, the margin NaN.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.
@@ -211,8 +209,8 @@ class BalanceMonitor(StepMonitor):
         >>> env = sw.BalanceMonitor(gym.make("Ant-v5"))
         >>> _ = env.reset(seed=0)
         >>> infos = [env.step(0 * env.action_space.low)[4] for _ in range(20)]
-        >>> infos[0]["balance/airborne"], infos[-1]["balance/airborne"]
-        (1.0, 0.0)
+        >>> infos[0]["balance/friction_used"], infos[-1]["balance/friction_used"] > 0.0
+        (0.0, True)
     """
 
     partial: ClassVar = keys.BALANCE_PARTIAL
@@ -258,7 +256,6 @@ class BalanceMonitor(StepMonitor):
         return {
             keys.BALANCE_FRICTION_USED: float(used.max(initial=0.0)),
             keys.BALANCE_ZMP_MARGIN: float(distances.min()) if distances.size else keys.NOT_JUDGED,
-            keys.BALANCE_AIRBORNE: (found.steps - np.unique(found.step).size) / found.steps,
         }
 
 
@@ -266,7 +263,6 @@ _MOMENTA: Final = (keys.BALANCE_LINEAR_MOMENTUM, keys.BALANCE_ANGULAR_MOMENTUM)
 _NOTHING: Final = {
     keys.BALANCE_FRICTION_USED: 0.0,
     keys.BALANCE_ZMP_MARGIN: keys.NOT_JUDGED,
-    keys.BALANCE_AIRBORNE: 0.0,
 }
 
 

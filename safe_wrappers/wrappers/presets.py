@@ -20,9 +20,9 @@ from safe_wrappers.wrappers.layer import Env, refuse_vector_env
 class SlipLimiter(CBFActionFilter):
     """Keeps every driven wheel on what seems the stable side of its traction curve, with friction unknown.
 
-    It is `CBFActionFilter` with one `Traction`, whose brake acts as hard as the slip limit allows. **What it guarantees.** What `CBFActionFilter` does. **What it does
-    not.** A wheel that comes to another ground overshoots for a few control steps, which ``slip/ratio`` shows and no
-    flag marks; sideways slip is not limited. See `Traction`.
+    It is `CBFActionFilter` with one `Traction`, whose brake acts as hard as the slip limit allows. **What it
+    guarantees.** What `CBFActionFilter` does. **What it does not.** A wheel that comes to another ground overshoots for
+    a few control steps, which ``slip/ratio`` shows and no flag marks; sideways slip is not limited. See `Traction`.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.
@@ -31,7 +31,7 @@ class SlipLimiter(CBFActionFilter):
         friction: Declared lower bound on the peak friction coefficient; None counts on nothing but what it measures.
 
     Info, at every step: the keys of `CBFActionFilter` (``cbf/margin`` stays 0), and arrays with one entry
-    per wheel: ``slip/ratio``, ``slip/limited``, ``slip/mu_estimate``, ``slip/mu_std``.
+    per wheel: ``slip/ratio``, ``slip/mu_estimate``.
 
     Raises:
         ConfigurationError: A joint that is no driven wheel, a radius of zero, or a number out of its range.
@@ -44,7 +44,7 @@ class SlipLimiter(CBFActionFilter):
         >>> env = sw.SlipLimiter(env, wheels=["front_left", "front_right", "rear_left", "rear_right"])
         >>> _ = env.reset(seed=0)
         >>> info = env.step(env.action_space.high)[4]
-        >>> bool(info["slip/limited"].all())
+        >>> bool(info["cbf/intervened"])
         True
     """
 
@@ -88,7 +88,7 @@ class WholeBodyFilter(CBFActionFilter):
             there is a polygon. None sets no bound.
         tolerance: By how much a forecast force may miss its cone, as a share of the robot's weight; None is 0.01.
 
-    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/contacts``, ``whole_body/cone_margin``, and for
+    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/cone_margin``, and for
     forecasts with a `zmp_inset` ``whole_body/zmp_margin``.
 
     Raises:

@@ -54,8 +54,7 @@ class TeleopChannel(CommandGate):
         plant: For the ceiling's constraint and the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
 
-    Info, at every step: ``teleop/round_trip_s``, ``teleop/ceiling_s``, ``teleop/energy_in_j``,
-    ``teleop/energy_out_j``, ``teleop/in_flight_j``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
+    Info, at every step: ``teleop/round_trip_s``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
     ``teleop/lost`` (int); without a filter inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
@@ -126,7 +125,7 @@ class TeleopChannel(CommandGate):
         self._start(info)
         self._lost = 0
         self._images: list[float] = [0.0]  # when the image was taken that was shown after each step
-        self._report(info, 0.0, self._ceiling_s)
+        self._report(info, 0.0)
         self.started = True
         return observation, info
 
@@ -141,7 +140,6 @@ class TeleopChannel(CommandGate):
         if flow is not None:
             command = self._with_flow(command, flow)
         round_trip_s = now_s - seen_s
-        ceiling_s = self._ceiling_s
         if self._watch is not None:
             self._watch.judge(self._boxed(command), seen_s, round_trip_s, now_s)
         if self.revoked:
@@ -153,7 +151,7 @@ class TeleopChannel(CommandGate):
         shown = self._send_down(executed, observation, obeyed)
         if self._watch is not None:
             self._watch.look()
-        self._report(info, round_trip_s, ceiling_s)
+        self._report(info, round_trip_s)
         return shown, reward, terminated, truncated, info
 
     @property
@@ -220,19 +218,10 @@ class TeleopChannel(CommandGate):
             coding.account(self._moved, shown, given)
         return shown
 
-    @property
-    def _ceiling_s(self) -> float:
-        """The ceiling of the present state, s; inf where it is not watched."""
-        return math.inf if self._watch is None else self._watch.ceiling_s
-
-    def _report(self, info: dict[str, Any], round_trip_s: float, ceiling_s: float) -> None:
+    def _report(self, info: dict[str, Any], round_trip_s: float) -> None:
         info[keys.TELEOP_ROUND_TRIP_S] = round_trip_s
-        info[keys.TELEOP_CEILING_S] = ceiling_s
         info[keys.TELEOP_LOST] = self._lost
         info[keys.TELEOP_REVOKED] = self.revoked
-        info[keys.TELEOP_ENERGY_IN_J] = self._coding.energy_in_j
-        info[keys.TELEOP_ENERGY_OUT_J] = self._coding.energy_out_j
-        info[keys.TELEOP_IN_FLIGHT_J] = self._coding.stored_j
         info[keys.TELEOP_CREATED_J] = self._coding.ledger.created_j
 
 

@@ -53,7 +53,6 @@ class PlainCoding:
         """A new episode, whose first observation the operator knows."""
         self._seen_s = 0.0
         self.ledger = ChannelLedger()
-        self.energy_in_j = self.energy_out_j = 0.0
         if self._reading is not None:
             self._reading.reset(observation)
             self._still = np.zeros(self._reading.effort.size)
@@ -91,8 +90,6 @@ class PlainCoding:
         felt = self._reading.of(shown)
         moved = np.zeros_like(felt) if moved is None else moved
         self.ledger.add(felt, moved, *given, self._tick_s, self.stored_j)
-        self.energy_in_j += port_energy(felt, moved, self._tick_s)
-        self.energy_out_j += port_energy(*given, self._tick_s)
 
     @property
     def stored_j(self) -> float:

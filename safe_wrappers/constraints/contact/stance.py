@@ -70,7 +70,7 @@ class BoundStance(BoundConstraint):
     """Stance on a plant."""
 
     predicts: bool = True
-    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONTACTS, keys.WHOLE_BODY_CONE_MARGIN)
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONE_MARGIN,)
     spec: Stance
     plant: MujocoPlant
 
@@ -188,8 +188,7 @@ class BoundStance(BoundConstraint):
         return -float(missed.max()) / self.plant.weight_n if len(forces) else 0.0
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info keys `whole_body/contacts` and `whole_body/cone_margin`: of the forces that would hold them."""
-        contacts, margin = 0, 0.0
-        if executed is not None and self._problem is not None:
-            contacts, margin = len(self._problem.normals), 0.0 + self.slack(executed)
-        return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}
+        """The info key `whole_body/cone_margin`: of the forces that would hold the contacts."""
+        if executed is None or self._problem is None:
+            return {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
+        return {keys.WHOLE_BODY_CONE_MARGIN: 0.0 + self.slack(executed)}

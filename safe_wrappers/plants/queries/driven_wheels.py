@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle.slip import Wheel
@@ -144,10 +143,6 @@ class DrivenWheels:
     def torque(self, data: mujoco.MjData) -> Array:
         """Torque of the drives without `feedback`, shape (n,), N m, in an env's last physics substep."""
         return np.asarray(data.qfrc_actuator[self.dofs] + self._opposing @ data.actuator_velocity)
-
-    def driven_by(self, controls: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which wheels, shape (n,), any of the given controls, shape (nu,), drives."""
-        return np.asarray((self._drives & controls).any(axis=1))
 
     def drive(self, plant: MujocoPlant) -> tuple[Array, Array]:
         """`torque = bias + effect @ u - feedback * rate` inside the actuators' clamps: (n,) in N m and (n, nu)."""
