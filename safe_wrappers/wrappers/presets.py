@@ -21,8 +21,9 @@ class SlipLimiter(CBFActionFilter):
     """Keeps every driven wheel on what seems the stable side of its traction curve, with friction unknown.
 
     It is `CBFActionFilter` with one `Traction`, whose brake acts as hard as the slip limit allows. **What it
-    guarantees.** What `CBFActionFilter` does. **What it does not.** A wheel that comes to another ground overshoots for
-    a few control steps, which ``slip/ratio`` shows and no flag marks; sideways slip is not limited. See `Traction`.
+    guarantees.** What `CBFActionFilter` does. **What it does not.** A wheel that comes to another ground overshoots
+    for a few control steps, which ``slip/ratio`` shows and no flag marks; sideways slip is not limited. See
+    `Traction`.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.

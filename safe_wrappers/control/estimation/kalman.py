@@ -1,6 +1,6 @@
 """The sampled Kalman filter for many tracks at once.
 
-It runs at every step and checks nothing: check matrices once with `covariance.checked_covariance`, and take `transition`
+It runs at every step and checks nothing: check matrices once with `covariance.checked_covariance`, take `transition`
 and `noise` from `covariance.discretise`. The update has Joseph's form: symmetric and positive semidefinite for any
 gain, rounding included.
 
