@@ -229,7 +229,7 @@ def test_figures_are_those_of_stepping_by_hand(env_id, strength):
         assert info[keys.BALANCE_PARTIAL] is False
         found.append(values(info))
     used, margins = np.array(found).T
-    assert (~np.isnan(margins)).sum() > 10 and np.nanmin(margins) < 0.0 < np.nanmax(margins)
+    assert (~np.isnan(margins)).sum() > 10 and np.nanmin(margins) < 0.02 < np.nanmax(margins)
     assert used.max() > 0.9 and (used > 0.0).sum() > 60
 
 

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from chunk_worlds import Line, Wander, counting_plant
@@ -543,16 +544,19 @@ def test_whoever_is_inside_is_told_what_every_command_is_made_from():
     assert told == wanted
 
 
+SERVO = """<mujoco><worldbody><body><joint name="j" type="slide"/><geom size="0.1"/></body></worldbody>
+<actuator><position joint="j" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
 @pytest.mark.parametrize("between", [lambda env: env, lambda env: RepeatedCommands(env, 0.0)])
 def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on(between):
-    def reached(env):
-        return np.zeros(1), np.zeros(1)
-
+    servo = Line()
+    servo.model = mujoco.MjModel.from_xml_string(SERVO)
+    servo.data = mujoco.MjData(servo.model)  # it stays at 0
     lease = sw.LeaseExpiry(
-        Line(),
+        servo,
         sw.StoppingBudget(lambda env: ([9.0], [0.0]), braking=1.0, acceleration=1.0),
         motion_limits={"max_speed": 1.0, "max_acceleration": 10.0},
-        measured=reached,
         fallback="zero",
     )
     env = sw.ChunkHandover(between(lease), 6, 3, rate_limit=5.0, fallback="zero")

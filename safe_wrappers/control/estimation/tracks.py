@@ -74,6 +74,10 @@ class Tracks:
         self._single: dict[float, _Over] = {}
         self._stacked: dict[tuple[float, ...], _Over] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is computed again: a pickle stores it in another order, and sums would round otherwise."""
+        return vars(self) | {"_single": {}, "_stacked": {}}
+
     @property
     def positions(self) -> Array:
         """Estimated positions, shape (n, d), m."""
