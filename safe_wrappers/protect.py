@@ -136,24 +136,25 @@ def remedy_for(env: Any, single: gym.Env[Any, Any]) -> Remedy:
     """The first filter that can be made of an env: a speed limit by MuJoCo's model, else a simulation of the env.
 
     Args:
-        env: What is to be filtered. The filters are made to be tried, and some of them reset it.
-        single: The env itself, or one of a vector env's.
+        env: What is to be filtered.
+        single: The env itself, or one of a vector env's. Filters are made of it to be tried, and some reset it.
 
     Raises:
         ConfigurationError: None can be made; the message says why.
     """
     discrete = isinstance(single.action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
-    vector = isinstance(env, gym.vector.VectorEnv)
-    kind: Any = ActionShield if discrete else VectorCBFActionFilter if vector else CBFActionFilter
+    kind: Any = ActionShield if discrete else CBFActionFilter
+    vector = isinstance(env, gym.vector.VectorEnv) and not discrete
+    name = VectorCBFActionFilter.__name__ if vector else kind.__name__
     if not discrete:
         check_actions(single)
-        if _is_made(kind, env, JointSpeedLimit(4.0)) is None:
-            return Remedy("These lines protect it", f"{_LIMIT_LINE}\nenv = sw.{kind.__name__}(env, [limit])")
+        if _is_made(kind, single, JointSpeedLimit(4.0)) is None:
+            return Remedy("These lines protect it", f"{_LIMIT_LINE}\nenv = sw.{name}(env, [limit])")
     shield = PredictiveShield(lambda seen: 1.0, 2, "hold")
-    code = f"{_SHIELD_LINE}\nenv = sw.{kind.__name__}(env, [shield])"
-    if _is_made(kind, env, shield) is None:
+    code = f"{_SHIELD_LINE}\nenv = sw.{name}(env, [shield])"
+    if _is_made(kind, single, shield) is None:
         return Remedy(_SHIELD, code, is_open=True)
-    refused = _is_made(kind, env, shield, plant=SimulatorPlant("fork"))
+    refused = _is_made(kind, single, shield, plant=SimulatorPlant("fork"))
     if refused is None:
         return Remedy(_SHIELD, f'{code[:-1]}, plant=sw.SimulatorPlant("fork"))', is_open=True)
     if isinstance(refused, ConfigurationError):
