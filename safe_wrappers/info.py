@@ -123,9 +123,6 @@ CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
 PLANT_COVERAGE: Final = _key("plant/coverage", "float64")
 """Share of the episode's steps so far after which h was at least its prediction less the margin; NaN before the first
 one."""
-PLANT_COVERAGE_LOST: Final = _key("plant/coverage_lost", "bool", chunk="any", log="coverage_lost")
-"""In this episode h has been below that more often than the plant's `miss_rate` explains. False alarms: in about one
-of n + 1 episodes that are like the n held-out ones; in at most 0.1 %, if the steps of an episode are exchangeable."""
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")

@@ -250,7 +250,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         ),
         "the program with exact cones": (
             "HalfCheetah-v5",
-            lambda: {"contacts": "cone", "friction_share": 0.5, "joint_tolerance": None, "zmp_inset": 0.01},
+            lambda: {"contacts": "cone", "friction_share": 0.5, "joint_tolerance": None},
         ),
     },
 }

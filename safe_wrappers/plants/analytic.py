@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.control_loop import ControlLoop, checked_loop
 from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant
 
@@ -25,7 +24,6 @@ class AnalyticPlant(Plant):
         lower, upper: Smallest and largest control, shape (m,) or scalar; None takes the action space's.
         control_dt: Control interval in s; None takes the env's `dt`, and an env without `dt` needs it.
         delay_s: Delay from measurement to effect in s; predicted over with the commands in flight.
-        loop: The `plants.ControlLoop` that your controller closes; `margin_left_deg` is what is left of its margin.
 
     Raises:
         ConfigurationError: Shapes that do not fit, values that are not finite, a wrong or missing control interval.
@@ -55,7 +53,6 @@ class AnalyticPlant(Plant):
         upper: ArrayLike | None = None,
         control_dt: float | None = None,
         delay_s: float = 0.0,
-        loop: ControlLoop | None = None,
     ) -> None:
         for name, function in (("f", f), ("g", g), ("state", state)):
             if not callable(function):
@@ -65,7 +62,6 @@ class AnalyticPlant(Plant):
         if self._given_control_dt is not None:
             self.control_dt = self._given_control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
-        self.loop = checked_loop(loop)
         self._box = (lower, upper)
         self._env: Any = None
         self._drift: Array | None = None
@@ -88,7 +84,6 @@ class AnalyticPlant(Plant):
             raise ConfigurationError(f"the env has {m} controls; got bounds of shape {shapes}") from None
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
-        self._check_loop(bound_before=self._env is not None)
         self._env = env
 
     def observe(self) -> None:
@@ -141,7 +136,7 @@ class AnalyticPlant(Plant):
     @property
     def f(self) -> Array:
         if self._drift is None:
-            self._drift, expected = self.drift(self.state), self.state.shape
+            self._drift, expected = np.asarray(self._f(self.state), dtype=np.float64), self.state.shape
             if self._drift.shape != expected:
                 found = self._drift.shape
                 raise ConfigurationError(f"f must return the shape of the state {expected}, got {found}")
@@ -150,17 +145,11 @@ class AnalyticPlant(Plant):
     @property
     def g(self) -> Array:
         if self._effect is None:
-            self._effect, expected = self.effect(self.state), (self.state.size, self.lower.size)
-            found = self._effect.shape
+            self._effect = np.asarray(self._g(self.state), dtype=np.float64)
+            found, expected = self._effect.shape, (self.state.size, self.lower.size)
             if found != expected:
                 raise ConfigurationError(f"g must return shape (states, controls) = {expected}, got {found}")
         return self._effect
-
-    def drift(self, x: Array) -> Array:
-        return np.asarray(self._f(x), dtype=np.float64)
-
-    def effect(self, x: Array) -> Array:
-        return np.asarray(self._g(x), dtype=np.float64)
 
     def attribute(self, name: str) -> Any:
         return read_attribute(self._env, name)

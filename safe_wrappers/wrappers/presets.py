@@ -86,11 +86,11 @@ class WholeBodyFilter(CBFActionFilter):
         friction_share: Of the model's friction coefficient that may be counted on, in (0, 1].
         joint_tolerance: How far a joint may press its stop, rad or m. None leaves the joints alone.
         zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, positive, wherever
-            there is a polygon. None sets no bound.
+            there is a polygon, for forecasts. None sets no bound.
         tolerance: By how much a forecast force may miss its cone, as a share of the robot's weight; None is 0.01.
 
-    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/cone_margin``, and for
-    forecasts with a `zmp_inset` ``whole_body/zmp_margin``.
+    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/cone_margin``, and with a `zmp_inset`
+    ``whole_body/zmp_margin``.
 
     Raises:
         ConfigurationError: A share outside (0, 1], or a negative tolerance.
@@ -126,10 +126,11 @@ class WholeBodyFilter(CBFActionFilter):
                 raise UnsupportedEnvError("no driven joint has a range: pass joint_tolerance=None")
         constraints: list[Constraint]
         if contacts in ("pyramid", "cone"):
-            if tolerance is not None:
-                raise ConfigurationError(f'tolerance is for contacts="forecast", not for {contacts!r}')
+            for name in ("zmp_inset", "tolerance"):
+                if arguments[name] is not None:
+                    raise ConfigurationError(f'{name} is for contacts="forecast", not for {contacts!r}')
             cone: Any = "exact" if contacts == "cone" else "pyramid"
-            constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance, zmp_inset=zmp_inset)]
+            constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance)]
         elif contacts == "forecast":
             tolerance = TOLERANCE if tolerance is None else tolerance
             constraints = [ContactFeasibility(friction_share, tolerance)]

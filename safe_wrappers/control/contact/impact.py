@@ -7,7 +7,7 @@ modelled: stiffness that grows with depth, damping, a pad at the end of its stro
 relate force to speed; they do not certify a contact as safe.
 
 **Braking after contact is too late.** The peak comes a quarter of a period after the touch, typically 20 to 50 ms.
-A brake that acts later does not reduce it (`attenuation_after_delay`), so protection needs clearance before contact.
+A brake that acts later does not reduce it (`braked_deflection`), so protection needs clearance before contact.
 
 Arguments are numbers or arrays that broadcast; speeds of approach that are negative count as at rest. What is not
 finite, or not positive where it must be, raises `ConfigurationError`.
@@ -50,19 +50,16 @@ def in_series(*parts: ArrayLike) -> Array:
         return np.asarray(1.0 / sum(1.0 / _positive("what is in series", part) for part in parts))
 
 
-def peak_force(speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike) -> Array:
-    """The largest force of the contact, `v sqrt(k m)`, shape (...), N, of v (m/s), m (kg) and k (N/m)."""
-    return pushed_peak_force(speed, mass, stiffness)
-
-
-def pushed_peak_force(
+def peak_force(
     speed: ArrayLike,
     mass: ArrayLike,
     stiffness: ArrayLike,
     push: ArrayLike = 0.0,
     deflection: ArrayLike = 0.0,
 ) -> Array:
-    """That of a contact on which a push F_p goes on: `F_p + sqrt((k x - F_p)^2 + k m v^2)`, shape (...), N.
+    """The largest force of a contact, shape (...), N.
+
+    `v sqrt(k m)`, and with a push F_p that goes on `F_p + sqrt((k x - F_p)^2 + k m v^2)`.
 
     Args:
         speed: v, m/s.
@@ -114,18 +111,6 @@ def braked_deflection(
     gained = free**2 + 2.0 * b * deep
     braked = gained / np.where(in_time, np.sqrt(b**2 + gained) + b, 1.0)
     return np.asarray(np.where(in_time, braked, free))
-
-
-def attenuation_after_delay(
-    speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, braking: ArrayLike, latency: ArrayLike
-) -> Array:
-    """Relative reduction of the peak force by a brake, shape (...), arguments as of `braked_deflection`.
-
-    Exactly 0 from the `time_to_peak` on, and where there is no peak.
-    """
-    braked = braked_deflection(speed, mass, stiffness, braking, latency)
-    free = braked_deflection(speed, mass, stiffness, 0.0, np.full_like(braked, np.inf))
-    return np.asarray(np.where(free > 0.0, 1.0 - braked / np.where(free > 0.0, free, 1.0), 0.0))
 
 
 def _positive(name: str, value: ArrayLike) -> Array:

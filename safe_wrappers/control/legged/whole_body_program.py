@@ -238,8 +238,8 @@ def eliminate(motion: Motion) -> tuple[Elimination, Elimination]:
 class ReducedProgram(NamedTuple):
     """A program, and the contact forces as a function of its unknowns.
 
-    A least violation may break the first `softenable` rows: those of accelerations, forces and opening contacts. The
-    others are sides of pyramids.
+    A least violation may break the first `softenable` rows: those of accelerations and opening contacts. The others
+    are sides of pyramids.
     """
 
     program: Program
@@ -269,7 +269,7 @@ def reduced_program(
     each = np.arange(nu)
     hessian[each, each] += 1.0
     linear[:nu] -= problem.nominal
-    rows, limits = _rows(problem, elimination, start, slope)
+    rows, limits = _rows(problem, start, slope)
     softenable = len(limits)
     normals, friction = problem.normals[problem.stance], problem.friction[problem.stance]
     by_contact, force = elimination.matrix.reshape(-1, 3, n), elimination.offset.reshape(-1, 3, 1)
@@ -290,18 +290,12 @@ def reduced_program(
     return ReducedProgram(program, softenable, elimination)
 
 
-def _rows(problem: WholeBodyProblem, forces: Elimination, start: Array, slope: Array) -> tuple[Array, Array]:
-    """The acceleration, force and opening rows, in this order."""
-    rows, limits = [np.zeros((0, forces.size))], [np.zeros(0)]
+def _rows(problem: WholeBodyProblem, start: Array, slope: Array) -> tuple[Array, Array]:
+    """The acceleration and opening rows, in this order."""
+    rows, limits = [np.zeros((0, slope.shape[1]))], [np.zeros(0)]
     if problem.acceleration_rows is not None and problem.acceleration_limits is not None:
         rows.append(problem.acceleration_rows @ slope)
         limits.append(problem.acceleration_limits - problem.acceleration_rows @ start)
-    if problem.force_rows is not None and problem.force_limits is not None:
-        count = len(problem.force_limits)
-        part = problem.force_rows.reshape(count, len(problem.normals), 3)[:, problem.stance]
-        stance = part.reshape(count, 3 * len(problem.stance))
-        rows.append(stance @ forces.matrix)
-        limits.append(problem.force_limits - stance @ forces.offset)
     if problem.opening.size:
         normals = problem.normals[problem.opening]
         away = np.einsum("ki,kiv->kv", normals, problem.jacobians[problem.opening])

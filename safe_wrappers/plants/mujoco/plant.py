@@ -48,7 +48,8 @@ class MujocoPlant(Plant):
         delay_s: Evidence age plus detection plus actuation delay in s, over which this plant's model predicts.
         data: A function of the unwrapped env that returns its data; None: they are its `.data`.
         control_dt: How long the env holds an action, s; needed where it has no `dt` or `frame_skip`.
-        loop: The `plants.ControlLoop` that your controller closes; `margin_left_deg` is what is left of its margin.
+        loop: The `plants.ControlLoop` that your controller closes; a warning says where too little of its margin is
+            left.
 
     Attributes:
         action_map: By which the env makes controls of actions, where the action space is not the control range; found
@@ -80,7 +81,7 @@ class MujocoPlant(Plant):
         self._given_dt = control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._pending: deque[Array] = deque()
-        self._factors, self.loop = (1.0, 1.0), checked_loop(loop)
+        self._factors, self._loop = (1.0, 1.0), checked_loop(loop)
         self._raw: Any = None
         self._sent: Array | None = None
         self._outdated = False
@@ -95,7 +96,8 @@ class MujocoPlant(Plant):
         bound_before, self._raw, self._env = self._raw is not None, raw, env
         self._env_model = self.model = None
         self._take_model()
-        self._check_loop(bound_before)
+        if self._loop is not None and not bound_before:
+            self._loop.warn_if_short(self.control_dt, self.delay_s)
 
     def _take_model(self) -> None:
         """Read the model anew: at binding, and when the env's has changed."""

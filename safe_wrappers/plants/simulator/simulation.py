@@ -1,18 +1,11 @@
 """Simulation: runs a task on an env as it would go on from its present state, and leaves the env as it is."""
 
-import contextlib
 import copy
-import functools
-import gc
-import inspect
-import logging
 import os
 import pickle
-import random
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from types import FunctionType, ModuleType
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
@@ -164,7 +157,7 @@ def _state_of(layer: Any) -> dict[str, Any]:
 
 
 def simulation_of(env: Env, snapshot: Snapshot) -> Simulation:
-    """The way to simulate an env: the user's, its own functions, else copies.
+    """The way to simulate an env: the user's, else copies.
 
     Raises:
         UnsupportedEnvError: It cannot be copied, or there are no child processes.
@@ -173,96 +166,14 @@ def simulation_of(env: Env, snapshot: Snapshot) -> Simulation:
     refuse_recorders(env)
     if snapshot == "fork":
         return ForkedSimulation(env)
-    if snapshot is not None:
-        pair = isinstance(snapshot, tuple | list) and len(snapshot) == 2 and all(map(callable, snapshot))
-        if not pair:
-            raise ConfigurationError(
-                "snapshot is two functions, (save, restore) with save(env) and restore(env, state), or 'fork', or"
-                f" None for the env's own; got {snapshot!r}"
-            )
-        return RestoredSimulation(env, *snapshot)
-    own = _own_functions(env.unwrapped)
-    return CopiedSimulation(env) if own is None else RestoredSimulation(env, *own)
-
-
-def _own_functions(raw: Any) -> tuple[Save, Restore] | None:
-    """`get_state` and `set_state`, or `clone_state` and `restore_state`, of an unwrapped env."""
-    for save, restore in (("get_state", "set_state"), ("clone_state", "restore_state")):
-        functions = getattr(raw, save, None), getattr(raw, restore, None)
-        if not (callable(functions[0]) and callable(functions[1])):
-            continue
-        # Of an Atari env: its random numbers belong to the state.
-        takes = inspect.signature(functions[0]).parameters
-        options = {"include_rng": True} if "include_rng" in takes else {}
-        return functools.partial(_saved, save, options), functools.partial(_put_back, restore)
-    return None
-
-
-def _saved(method: str, options: dict[str, Any], env: Any) -> Any:
-    return copy.deepcopy(getattr(env, method)(**options))
-
-
-def _put_back(method: str, env: Any, state: Any) -> None:
-    getattr(env, method)(copy.deepcopy(state))
-
-
-_GLOBAL: Any = (np.random.get_state.__self__, random.getstate.__self__)  # type: ignore[attr-defined]
-_ELSEWHERE = (type, ModuleType, logging.Logger, random.SystemRandom)
-"""What leads out of an env, and what has no state."""
-
-
-def _generators_of(env: Env) -> list[Any]:
-    """The generators of NumPy and of `random` that an env, its wrappers or anything in them could draw from."""
-    found: list[Any] = []
-    seen: set[int] = set()
-    left: list[Any] = [*_GLOBAL, env, env.unwrapped.np_random]
-    while left:
-        one = left.pop()
-        if id(one) in seen or isinstance(one, _ELSEWHERE) or is_drawn(one):
-            continue
-        seen.add(id(one))
-        if isinstance(one, np.random.Generator | np.random.RandomState | random.Random):
-            found.append(one)
-        elif isinstance(one, FunctionType):
-            left += [cell.cell_contents for cell in one.__closure__ or ()]
-        else:
-            left += gc.get_referents(one)
-    return found
-
-
-@contextlib.contextmanager
-def other_noise(env: Env, seed: int) -> Iterator[None]:
-    """Lets steps draw other random numbers than the env will; afterwards its generators are as they were."""
-    generators = _generators_of(env)
-    before = [_state(one) for one in generators]
-    try:
-        for number, one in enumerate(generators):
-            fresh = np.random.SeedSequence([0x5AFE, seed, number])
-            if isinstance(one, np.random.Generator):
-                one.bit_generator.state = type(one.bit_generator)(fresh).state
-            else:
-                one.seed(int(fresh.generate_state(1)[0]))
-        yield
-    finally:
-        for one, state in zip(generators, before, strict=True):
-            _set_state(one, state)
-
-
-def _state(generator: Any) -> Any:
-    if isinstance(generator, np.random.Generator):
-        return generator.bit_generator.state
-    if isinstance(generator, random.Random):
-        return generator.getstate()
-    return generator.get_state(legacy=False)
-
-
-def _set_state(generator: Any, state: Any) -> None:
-    if isinstance(generator, np.random.Generator):
-        generator.bit_generator.state = state
-    elif isinstance(generator, random.Random):
-        generator.setstate(state)
-    else:
-        generator.set_state(state)
+    if snapshot is None:
+        return CopiedSimulation(env)
+    if not (isinstance(snapshot, tuple | list) and len(snapshot) == 2 and all(map(callable, snapshot))):
+        raise ConfigurationError(
+            "snapshot is two functions, (save, restore) with save(env) and restore(env, state), or 'fork', or"
+            f" None for copies; got {snapshot!r}"
+        )
+    return RestoredSimulation(env, *snapshot)
 
 
 _LONGEST = 10  # steps that are simulated ahead before the env makes them
