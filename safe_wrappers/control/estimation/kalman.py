@@ -1,8 +1,7 @@
 """The sampled Kalman filter for many tracks at once.
 
-It runs at every step and checks nothing: check matrices once with `covariance.checked_covariance`, take `transition`
-and `noise` from `covariance.discretise`. The update has Joseph's form: symmetric and positive semidefinite for any
-gain, rounding included.
+It runs at every step and checks nothing; take `transition` and `noise` from `covariance.discretise`. The update has
+Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
 
 Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), section 5.2.
 """
