@@ -70,8 +70,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         plant: For the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
-        limits: Of the machine, which every blend keeps between its ends, too: it is stretched until it does, or its
-            chunk is refused.
+        limits: Of the machine, which every "quintic" keeps between its ends, too: it is stretched until it does, or
+            its chunk is refused.
         flexible: A `plants.rigid_model_check`, or "auto", which makes one now: where it finds that springs ring on,
             `blend_time` and `rate_limit` are so strict that a blend over the whole action range leaves at most 1 % of
             the energy that a step of torque leaves in the springs, and smoothsteps that the next seam comes before

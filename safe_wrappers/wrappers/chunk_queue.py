@@ -181,16 +181,17 @@ class ChunkQueue:
             fresh = np.clip(fresh, self._low, self._high)
             prior = drawn_out(prior, len(fresh))
         blend: Any = self._blend  # checked by the wrapper
-        motion = self._sent, prior, fresh
         return join(
-            *motion,
+            self._sent,
+            prior,
+            fresh,
             self._control_dt,
             blend=blend,
             fewest=self._fewest,
             rate_limit=self._rate_limit,
             low=self._low,
             high=self._high,
-            accepts=None if self._check is None else partial(self._check.accepts, blend, *motion),
+            accepts=None if self._check is None else partial(self._check.accepts, self._sent, fresh),
             hold_back=not self._overlap,
         )
 
@@ -290,6 +291,8 @@ def blend_bounds(
                 f"{baseline}: blend_time, rate_limit, limits and flexible are for {bounded}"
             )
         return fewest, rate_limits
+    if limits is not None and blend != "quintic":
+        raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
     if blend_time is not None:
         fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
         available = sizes.chunk - sizes.delay[1]

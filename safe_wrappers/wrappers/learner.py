@@ -65,9 +65,8 @@ class AdaptionPenalty(LayerWrapper):
     The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty + per_correction * c` for a
     correction c = |a_safe - a| (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023).
 
-    Wrappers that scale or clip rewards belong inside, and `RecordInterventions` and SB3's `Monitor` too. With
-    hindsight replay use `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the penalty off relabelled
-    rewards too.
+    Wrappers that scale or clip rewards belong inside, and `RecordInterventions` and SB3's `Monitor` too. Not
+    for hindsight replay, which asks the task for rewards anew.
 
     Args:
         env: With a `CBFActionFilter` inside.

@@ -238,17 +238,6 @@ def test_findings_are_ranked_and_json_has_no_nan():
     assert "with these lines: 1 N" in words and "Think." in words and "no model" in words and "50 %" in words
 
 
-def test_joints_that_ring_get_a_rate_that_their_slowest_resonance_follows():
-    env = gym.make("FlexJointReach-v0")
-    policy = waving(env, 0.5, 200.0, seam=24)
-    finding = diagnose(env, policy, steps=100, symptoms=["command_steps"]).findings[0]
-    slowest = {each.name: each.value for each in finding.evidence}["slowest resonance of its joints"]
-    assert slowest == pytest.approx(sw.plants.rigid_model_check(env).resonances[0], rel=0.2)
-    rates = [float(each) for each in finding.code.partition("rate_limit=[")[2].partition("]")[0].split(",")]
-    assert rates == pytest.approx([0.5 * slowest * 0.05 * 6.0, 0.5 * slowest * 0.05 * 2.0], rel=1e-3)
-    assert 'flexible="auto"' in finding.advice
-
-
 def test_what_presses_all_the_time_is_no_impact():
     env = Bench(CART.format(stiffness=20_000), [0.955])
     policy = lambda observation: np.array([20.0])  # noqa: E731

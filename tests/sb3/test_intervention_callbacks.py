@@ -9,7 +9,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.sb3 import InterventionCallback, InterventionEvalCallback
+from safe_wrappers.sb3 import InterventionCallback
 from safe_wrappers.sb3.callbacks import log_steps
 from safe_wrappers.wrappers.faults import RepeatedCommands
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
@@ -124,19 +124,6 @@ def test_without_recorder_the_step_values_are_logged(tmp_path):
     logged = scalars(tmp_path)
     assert logged["interventions/step_rate"] == pytest.approx([0.25])
     assert "interventions/rate" not in logged
-
-
-def test_evaluation_reaches_tensorboard_at_its_own_step(tmp_path):
-    model = PPO("MlpPolicy", make_env(), n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
-    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
-    evaluation = InterventionEvalCallback(Monitor(make_env()), n_eval_episodes=2, eval_freq=20, verbose=0)
-    model.learn(32, callback=evaluation)
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
-    (event,) = events.Scalars("eval/interventions/rate")
-    assert (event.step, event.value) == (20, 0.25)
-    assert np.isclose(events.Scalars("eval/interventions/cost")[0].value, 4.0)
-    assert events.Scalars("eval/mean_reward")[0].step == 20
 
 
 def test_a_step_without_a_judgement_does_not_hide_the_mean_of_the_others(tmp_path):

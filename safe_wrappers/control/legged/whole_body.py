@@ -125,12 +125,14 @@ def _solve(problem: WholeBodyProblem, sides: Array | None) -> WholeBodySolution:
     reduced = reduced_program(problem, motion, rigid, sides) if consistent else None
     verdict = "infeasible"
     if reduced is not None:
-        unchanged = _nominal(problem, motion, reduced)
+        nu = len(problem.nominal)
+        unchanged = _nominal(problem, motion, reduced, np.zeros(rigid.size - nu))
         if unchanged is not None:
             return unchanged
         candidate = _ask(reduced.program)
         if candidate.y is not None:
-            found = _checked(problem, motion, reduced, candidate.y, WholeBodyStatus.SOLVED)
+            unchanged = _nominal(problem, motion, reduced, candidate.y[nu:])
+            found = unchanged or _checked(problem, motion, reduced, candidate.y, WholeBodyStatus.SOLVED)
             if found is not None:
                 return found
         verdict = "failed" if candidate.y is not None else candidate.verdict
@@ -146,20 +148,14 @@ def _ask(program: Program) -> Candidate:
     return by_clarabel(program)
 
 
-def _nominal(problem: WholeBodyProblem, motion: Motion, reduced: ReducedProgram) -> WholeBodySolution | None:
-    """The nominal control, if contacts can hold it exactly with some forces that they can give."""
-    u, inner = problem.nominal, reduced.elimination.size - len(problem.nominal)
+def _nominal(
+    problem: WholeBodyProblem, motion: Motion, reduced: ReducedProgram, inner: Array
+) -> WholeBodySolution | None:
+    """The nominal control, if contacts can hold it exactly with these inner forces."""
+    u = problem.nominal
     if not ((u >= problem.lower) & (u <= problem.upper)).all():
         return None
-    y = np.concatenate([u, np.zeros(inner)])
-    if inner:
-        program = reduced.program.with_first(u)
-        # One solver is enough: where it finds no inner forces, the whole problem is solved next.
-        found = by_daqp(program) if program.cones is None else by_clarabel(program)
-        if found.y is None:
-            return None
-        y[len(u) :] = found.y
-    return _checked(problem, motion, reduced, y, WholeBodyStatus.INACTIVE)
+    return _checked(problem, motion, reduced, np.concatenate([u, inner]), WholeBodyStatus.INACTIVE)
 
 
 def _tolerance(sizes: Array) -> float:

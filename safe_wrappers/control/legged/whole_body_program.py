@@ -46,23 +46,6 @@ class Program(NamedTuple):
     cones: Array | None = None  # C_i, (m, d, n)
     cone_offsets: Array | None = None  # c_i, (m, d)
 
-    def with_first(self, values: Array) -> "Program":
-        """The program in the remaining unknowns, with the first ones fixed."""
-        i = len(values)
-        cones, offsets = self.cones, self.cone_offsets
-        if cones is not None and offsets is not None:
-            cones, offsets = cones[:, :, i:], offsets + cones[:, :, :i] @ values
-        return Program(
-            self.hessian[i:, i:],
-            self.linear[i:] + self.hessian[i:, :i] @ values,
-            self.rows[:, i:],
-            self.limits - self.rows[:, :i] @ values,
-            self.lower[i:],
-            self.upper[i:],
-            cones,
-            offsets,
-        )
-
     def softened(self, count: int) -> "Program":
         """The first rows made soft: half the squares of their violations are added to the objective."""
         n, k = self.linear.size, self.limits.size
