@@ -1,4 +1,4 @@
-"""StuckEscape: another action for a while, where policy and filter block each other."""
+"""StuckEscape: where policy and filter block each other, another action is proposed for a while."""
 
 from collections import deque
 from typing import Any, ClassVar
@@ -9,7 +9,6 @@ from gymnasium.spaces import Box
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng, action_array
@@ -59,7 +58,6 @@ class StuckEscape(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
-        refuse_vector_rewards(env, "StuckEscape")
         inside = filter_inside(env)
         if inside is None:
             raise ConfigurationError(
@@ -95,7 +93,7 @@ class StuckEscape(LayerWrapper):
         if escaping:
             self._left -= 1
             info[keys.CBF_NONFINITE] |= not np.isfinite(own).all()
-        self._rewards.append(one_reward(reward, "StuckEscape"))
+        self._rewards.append(float(reward))
         self._changed.append(info[keys.CBF_INTERVENED] or escaping)
         full = len(self._rewards) == self._window
         stuck = full and 2 * sum(self._changed) > self._window and sum(self._rewards) <= self.progress
