@@ -157,10 +157,6 @@ IS_SUCCESS: Final = _key("is_success", "bool")
 ADAPTION_PENALTY: Final = _key("adaption/penalty", "float64", unit="reward", chunk="sum", log="penalty")
 """What was taken off this step's reward because the filter changed the action; else 0."""
 
-# SafeActionMap, every step -----------------------------------------------------------------------------------
-MAP_SCALE: Final = _key("map/scale", "float64", chunk="min", log="map_scale")
-"""By what the distance of the policy's action from the anchor was multiplied, from 0 to 1; 1: the action is
-unchanged; NaN: there was no admitted anchor, and the filter was given the policy's action."""
 
 # LeaseExpiry and TeleopChannel without a filter inside, ChunkHandover: every step --------------------------------
 ACTION_CLIPPED: Final = _key("action/clipped", "float64", unit="action", chunk="max")

@@ -196,7 +196,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         ),
     },
     "RecordInterventions": {"no arguments": (TASK, dict)},
-    "SafeActionMap": {"from the backup": (TASK, dict)},
     "SafetyOverlay": {
         "everything, of a filter": (TASK, dict),
         "the strip alone": (TASK, lambda: {"scene": False}),
@@ -265,7 +264,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
 INSIDE: dict[str, Callable[[Env], Env]] = dict.fromkeys(
-    ("AdaptionPenalty", "SafeActionMap", "SafetyOverlay", "StuckEscape"),
+    ("AdaptionPenalty", "SafetyOverlay", "StuckEscape"),
     lambda env: sw.CBFActionFilter(env, [clearance()]),
 )
 """Wrapper name -> the wrapper that it needs inside."""

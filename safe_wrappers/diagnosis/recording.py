@@ -13,7 +13,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.env_checks import check_timing, one_reward, wrappers_of
+from safe_wrappers.plants.env_checks import check_timing, wrappers_of
 from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 
 Env = gym.Env[Any, Any]
@@ -189,9 +189,8 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
                     f"the policy's action in control step {k} is not finite: {action}; the env was not given it"
                 )
             before = (0.0, 0) if found is None else (found[1].time, _warnings(found[1]))
-            observation, reward, terminated, truncated, info = env.step(action)
+            observation, _, terminated, truncated, info = env.step(action)
             struck = None if monitor is None else monitor.peak_bodies
-            one_reward(reward, "diagnose")
             rows.append((info, first, terminated, spy.given, struck))
             over = bool(terminated or truncated)
             if found is not None:

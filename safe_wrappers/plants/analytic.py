@@ -21,7 +21,6 @@ class AnalyticPlant(Plant):
         f: x of shape (n,) to the drift, shape (n,), in state units per second.
         g: x to the control matrix, shape (n, m).
         state: The unwrapped env to x.
-        lower, upper: Smallest and largest control, shape (m,) or scalar; None takes the action space's.
         control_dt: Control interval in s; None takes the env's `dt`, and an env without `dt` needs it.
         delay_s: Delay from measurement to effect in s; predicted over with the commands in flight.
 
@@ -49,8 +48,6 @@ class AnalyticPlant(Plant):
         f: Callable[[Array], ArrayLike],
         g: Callable[[Array], ArrayLike],
         state: Callable[[Any], ArrayLike],
-        lower: ArrayLike | None = None,
-        upper: ArrayLike | None = None,
         control_dt: float | None = None,
         delay_s: float = 0.0,
     ) -> None:
@@ -62,7 +59,6 @@ class AnalyticPlant(Plant):
         if self._given_control_dt is not None:
             self.control_dt = self._given_control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
-        self._box = (lower, upper)
         self._env: Any = None
         self._drift: Array | None = None
         self._effect: Array | None = None
@@ -74,16 +70,7 @@ class AnalyticPlant(Plant):
         self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.control_dt - 1e-9))))
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
-        m = space.shape[0]
-        low = np.asarray(space.low if self._box[0] is None else self._box[0], dtype=np.float64)
-        high = np.asarray(space.high if self._box[1] is None else self._box[1], dtype=np.float64)
-        try:
-            self.lower, self.upper = np.broadcast_to(low, (m,)), np.broadcast_to(high, (m,))
-        except ValueError:
-            shapes = f"{low.shape} and {high.shape}"
-            raise ConfigurationError(f"the env has {m} controls; got bounds of shape {shapes}") from None
-        if not (self.lower <= self.upper).all():
-            raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
+        self.lower, self.upper = space.low.astype(np.float64), space.high.astype(np.float64)
         self._env = env
 
     def observe(self) -> None:
@@ -136,7 +123,7 @@ class AnalyticPlant(Plant):
     @property
     def f(self) -> Array:
         if self._drift is None:
-            self._drift, expected = np.asarray(self._f(self.state), dtype=np.float64), self.state.shape
+            self._drift, expected = self.drift(self.state), self.state.shape
             if self._drift.shape != expected:
                 found = self._drift.shape
                 raise ConfigurationError(f"f must return the shape of the state {expected}, got {found}")
@@ -145,11 +132,17 @@ class AnalyticPlant(Plant):
     @property
     def g(self) -> Array:
         if self._effect is None:
-            self._effect = np.asarray(self._g(self.state), dtype=np.float64)
-            found, expected = self._effect.shape, (self.state.size, self.lower.size)
+            self._effect, expected = self.effect(self.state), (self.state.size, self.lower.size)
+            found = self._effect.shape
             if found != expected:
                 raise ConfigurationError(f"g must return shape (states, controls) = {expected}, got {found}")
         return self._effect
+
+    def drift(self, x: Array) -> Array:
+        return np.asarray(self._f(x), dtype=np.float64)
+
+    def effect(self, x: Array) -> Array:
+        return np.asarray(self._g(x), dtype=np.float64)
 
     def attribute(self, name: str) -> Any:
         return read_attribute(self._env, name)

@@ -87,11 +87,3 @@ class ControlLoop:
             f"most {spare / late:.3g} rad/s, or shorten hold and delays"
         )
         warnings.warn(message, PhaseMarginWarning, stacklevel=3)
-
-
-def checked_loop(given: ControlLoop | None) -> ControlLoop | None:
-    """The loop that a plant was given, or None."""
-    if given is None or isinstance(given, ControlLoop):
-        return given
-    example = "sw.plants.ControlLoop(crossover=4.0, phase_margin_deg=60.0)"
-    raise ConfigurationError(f"loop is a ControlLoop, such as {example}, or None; got {given!r}")

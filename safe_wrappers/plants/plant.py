@@ -26,8 +26,6 @@ class Plant(ABC):
     model_version: int = 0
     has_acceleration: ClassVar[bool] = True
     """Whether a control acts as a force, so that `f` and `g` are known."""
-    bounds_are_action_space: ClassVar[bool] = False
-    """Whether `lower` and `upper` are the action space's at every state."""
     can_brake: ClassVar[bool] = False
     """Whether it knows which states are velocities, as a braking fallback needs."""
     simulates: ClassVar[bool] = False
@@ -51,12 +49,12 @@ class Plant(ABC):
     @property
     @abstractmethod
     def lower(self) -> Array:
-        """Smallest admissible control at this state, shape (m,)."""
+        """Smallest control, the action space's, shape (m,)."""
 
     @property
     @abstractmethod
     def upper(self) -> Array:
-        """Largest admissible control at this state, shape (m,)."""
+        """Largest control, likewise."""
 
     @abstractmethod
     def bind(self, env: gym.Env[Any, Any]) -> None:
@@ -99,6 +97,14 @@ class Plant(ABC):
     def path(self, control: Array) -> list[Array]:
         """States on the way and at the end of a held control; empty where the plant cannot predict them."""
         return []
+
+    def drift(self, x: Array) -> Array:
+        """The drift at any state, shape (n,); by default that of the present one."""
+        return self.f
+
+    def effect(self, x: Array) -> Array:
+        """The control matrix at any state, shape (n, m); by default that of the present one."""
+        return self.g
 
     def require_acceleration(self, asker: str) -> None:
         """Refuse a constraint, named by `asker`, whose rows need f and g where there are none."""

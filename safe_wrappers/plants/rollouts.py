@@ -37,14 +37,14 @@ class Rollout:
 
     Attributes:
         observations: After each step.
-        rewards: Of each step, floats, or arrays where they are vectors; NaN where the plant does not know them.
+        rewards: Of each step; NaN where the plant does not know them.
         values: What was measured after each step, shape (k,).
         ended: The episode terminated or was truncated.
         reached: The set in which it may stop was reached.
     """
 
     observations: list[Any] = field(default_factory=list)
-    rewards: list[Any] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
     ended: bool = False
     reached: bool = False
@@ -54,7 +54,6 @@ class RolloutPlant(Plant):
     """A plant that predicts by rollouts alone; it has neither f nor g."""
 
     has_acceleration: ClassVar[bool] = False
-    bounds_are_action_space: ClassVar[bool] = True
     simulates: ClassVar[bool] = True
     simulates_env: ClassVar[bool] = True
     """Whether a `View` of a rollout has the env and its info; else only the observation."""

@@ -14,7 +14,7 @@ from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
-from safe_wrappers.plants.env_checks import check_actions, check_timing, reward_numbers
+from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
@@ -191,7 +191,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             executed = np.array(info.get(keys.EXECUTED_ACTION, command.control), dtype=np.float64)
             self._fallback.executed(executed)
             self._executed.append(executed)
-            total = total + reward_numbers(reward)
+            total += float(reward)
             infos.append(dict(info))  # the env may use the same one again
             commands.append(command)
             if terminated or truncated:

@@ -10,7 +10,6 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, whole_number
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards, reward_numbers
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
@@ -52,7 +51,7 @@ class ActionRepeat(LayerWrapper):
         infos = []
         for _ in range(self.repeat):
             observation, reward, terminated, truncated, info = self._pass_on(action)
-            total = total + reward_numbers(reward)
+            total += float(reward)
             infos.append(info)
             if terminated or truncated:
                 break
@@ -92,7 +91,6 @@ class AdaptionPenalty(LayerWrapper):
 
     def __init__(self, env: Env, penalty: float = 0.0, per_correction: float = 0.0) -> None:
         LayerWrapper.__init__(self, env)
-        refuse_vector_rewards(env, "AdaptionPenalty")
         if filter_inside(env) is None:
             example = "AdaptionPenalty(sw.protect(env), penalty=...)"
             raise ConfigurationError(f"AdaptionPenalty needs a CBFActionFilter inside: {example}")
@@ -123,7 +121,7 @@ class AdaptionPenalty(LayerWrapper):
             changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))
         if changed:
             penalty = self.of(float(correction))
-            reward = one_reward(reward, "AdaptionPenalty") - penalty
+            reward = float(reward) - penalty
         info[keys.ADAPTION_PENALTY] = penalty
         return observation, reward, terminated, truncated, info
 

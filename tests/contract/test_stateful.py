@@ -79,7 +79,7 @@ def reacher():
 
 
 def pendulum():
-    plant = sw.AnalyticPlant(drift, push, angle_and_speed, lower=-2.0, upper=2.0, control_dt=0.05)
+    plant = sw.AnalyticPlant(drift, push, angle_and_speed, control_dt=0.05)
     return sw.RecordInterventions(
         sw.CBFActionFilter(made("Pendulum-v1"), [sw.constraints.Barrier(slow)], plant)
     )

@@ -128,6 +128,6 @@ def test_without_recorder_the_step_values_are_logged(tmp_path):
 
 def test_a_step_without_a_judgement_does_not_hide_the_mean_of_the_others(tmp_path):
     logger = configure(str(tmp_path), ["tensorboard"])
-    log_steps(logger, [{keys.MAP_SCALE: 0.5}, {keys.MAP_SCALE: keys.NOT_JUDGED}, {keys.MAP_SCALE: 1.0}])
-    assert logger.name_to_value["interventions/step_map_scale"] == 0.75
+    log_steps(logger, [{keys.COST: 0.5}, {keys.COST: keys.NOT_JUDGED}, {keys.COST: 1.0}])
+    assert logger.name_to_value["interventions/step_cost"] == 0.75
     logger.close()

@@ -11,7 +11,7 @@ import numpy as np
 from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
-from safe_wrappers.plants.control_loop import ControlLoop, checked_loop
+from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
@@ -59,7 +59,6 @@ class MujocoPlant(Plant):
         UnsupportedEnvError: No MuJoCo model, a disabled actuator, one not affine, or actions that no map fits.
     """
 
-    bounds_are_action_space: ClassVar[bool] = True
     can_brake: ClassVar[bool] = True
     model: mujoco.MjModel  #: the plant's own
     data: mujoco.MjData  #: likewise; at the present state only after `forward` or `pose`
@@ -78,10 +77,13 @@ class MujocoPlant(Plant):
         loop: ControlLoop | None = None,
     ) -> None:
         self._given, self._functions = binding.given_and_functions(model, data)
+        if not isinstance(loop, ControlLoop | None):
+            example = "sw.plants.ControlLoop(crossover=4.0, phase_margin_deg=60.0)"
+            raise ConfigurationError(f"loop is a ControlLoop, such as {example}, or None; got {loop!r}")
         self._given_dt = control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._pending: deque[Array] = deque()
-        self._factors, self._loop = (1.0, 1.0), checked_loop(loop)
+        self._factors, self._loop = (1.0, 1.0), loop
         self._raw: Any = None
         self._sent: Array | None = None
         self._outdated = False
