@@ -59,7 +59,8 @@ class ActionMap:
 
     def reach(self) -> tuple[Array, Array]:
         """The least and the largest control that actions have, shapes (nu,)."""
-        ends = _times(self.scale, self.low), _times(self.scale, self.high)
+        # Zero where the scale is, though the end may be infinite.
+        ends = [self.scale * np.where(self.scale == 0.0, 0.0, end) for end in (self.low, self.high)]
         return self.offset + np.minimum(*ends), self.offset + np.maximum(*ends)
 
     def exceeds(self, lower: Array, upper: Array) -> bool:
@@ -89,11 +90,6 @@ def refuse_mapped(action_map: ActionMap | None, asker: str) -> None:
             "offset + scale * action. Constraints that forecast take that into account (SpeedLimit, JointSpeedLimit, "
             "JointPositionLimit, Workspace, Upright), as do Clearance, Barrier and ImpactSpeedLimit"
         )
-
-
-def _times(scale: Array, end: Array) -> Array:
-    """Their product, zero where the scale is, though the end may be infinite."""
-    return np.where(scale == 0.0, 0.0, scale) * np.where(scale == 0.0, 0.0, end)
 
 
 class MappedRecorder(Recorder):

@@ -1,7 +1,7 @@
 """A forecast: what a MuJoCo model does under a held control, and under braking after it."""
 
 from collections import deque
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -179,8 +179,7 @@ class Recorder(Remade):
             for state in states:
                 mujoco.mj_step(m, data)
                 mujoco.mj_getState(m, data, state, _MOTION)
-            if self.settles:
-                self.settle(data)
+            if self.settle(data):
                 mujoco.mj_getState(m, data, states[-1], _MOTION)
             if euler:
                 mujoco.mj_kinematics(m, data)
@@ -205,11 +204,9 @@ class Recorder(Remade):
         """Give the machine the control that brakes."""
         data.ctrl[:] = self._against_motion(data)
 
-    settles: ClassVar[bool] = False
-    """Whether the env does something to its data at the end of a control interval."""
-
-    def settle(self, data: mujoco.MjData) -> None:
-        """Do what the env does to its data at the end of a control interval."""
+    def settle(self, data: mujoco.MjData) -> bool:
+        """Do what the env does to its data at the end of a control interval, and say whether it does anything."""
+        return False
 
     def _against_motion(self, data: mujoco.MjData) -> Array:
         rest, per_length, damping = self._servos
