@@ -107,10 +107,6 @@ class MappedRecorder(Recorder):
         """Give the machine an action, shape (nu,), as its env does at the start of a control interval."""
         data.ctrl[:] = self._map.control(control)
 
-    def key(self, control: Array) -> bytes:
-        """What identifies an action: the bytes of the control that its env sets."""
-        return self._map.control(control).tobytes()
-
     def braking(self, data: mujoco.MjData) -> Array:
         """The action that brakes, shape (nu,)."""
         return self._map.action(super().braking(data))
