@@ -157,7 +157,6 @@ IS_SUCCESS: Final = _key("is_success", "bool")
 ADAPTION_PENALTY: Final = _key("adaption/penalty", "float64", unit="reward", chunk="sum", log="penalty")
 """What was taken off this step's reward because the filter changed the action; else 0."""
 
-
 # LeaseExpiry and TeleopChannel without a filter inside, ChunkHandover: every step --------------------------------
 ACTION_CLIPPED: Final = _key("action/clipped", "float64", unit="action", chunk="max")
 """L2 norm by which the action left the action space (of a chunk, of the entry that left it farthest); what is

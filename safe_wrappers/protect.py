@@ -126,23 +126,24 @@ def _remedy(env: Any, single: gym.Env[Any, Any]) -> tuple[str, str]:
     """Lines that make the first filter that works out of `env`, and the text that introduces them.
 
     A speed limit by MuJoCo's model, else a simulation of the env. `single` is the env itself, or one of a vector
-    env's. The filters are made to be tried, and some of them reset the env.
+    env's, of which filters are made to be tried; some of them reset it.
 
     Raises:
         ConfigurationError: None can be made; the message says why.
     """
     discrete = isinstance(single.action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
-    vector = isinstance(env, gym.vector.VectorEnv)
-    kind: Any = ActionShield if discrete else VectorCBFActionFilter if vector else CBFActionFilter
+    kind: Any = ActionShield if discrete else CBFActionFilter
+    vector = isinstance(env, gym.vector.VectorEnv) and not discrete
+    name = VectorCBFActionFilter.__name__ if vector else kind.__name__
     if not discrete:
         check_actions(single)
-        if _is_made(kind, env, JointSpeedLimit(4.0)) is None:
-            return "These lines protect it", f"{_LIMIT_LINE}\nenv = sw.{kind.__name__}(env, [limit])"
+        if _is_made(kind, single, JointSpeedLimit(4.0)) is None:
+            return "These lines protect it", f"{_LIMIT_LINE}\nenv = sw.{name}(env, [limit])"
     shield = PredictiveShield(lambda seen: 1.0, 2, "hold")
-    code = f"{_SHIELD_LINE}\nenv = sw.{kind.__name__}(env, [shield]"
-    if _is_made(kind, env, shield) is None:
+    code = f"{_SHIELD_LINE}\nenv = sw.{name}(env, [shield]"
+    if _is_made(kind, single, shield) is None:
         return _SHIELD, f"{code})"
-    refused = _is_made(kind, env, shield, plant=SimulatorPlant("fork"))
+    refused = _is_made(kind, single, shield, plant=SimulatorPlant("fork"))
     if refused is None:
         return _SHIELD, f'{code}, plant=sw.SimulatorPlant("fork"))'
     if isinstance(refused, ConfigurationError):

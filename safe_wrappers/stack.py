@@ -47,11 +47,7 @@ _BELONGS_OUTSIDE: Final = (
         (Layer.OCCLUSION,),
         "the filter reads the estimates, so they must be there before it decides",
     ),
-    (
-        Layer.FAULT,
-        (Layer.LEASE, Layer.CHANNEL),
-        "it hands commands over, which the others must time",
-    ),
+    (Layer.FAULT, (Layer.LEASE, Layer.CHANNEL), "it hands commands over, which the others must time"),
     (
         Layer.CHANNEL,
         (Layer.OCCLUSION, Layer.OBSERVATION),

@@ -206,10 +206,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         """Seconds of the episode so far, on the clock of control steps."""
         return self._queue.now * self.control_dt
 
-    def switch(self, source: str) -> None:
-        """Name the source of the chunks from now on; the change is blended, from the last command."""
-        self._queue.switch(source)
-
     def _springs(self, flexible: Any) -> RigidModelCheck | None:
         """What the user or the env's model says about springs that ring on; None where there are none."""
         if flexible is None:

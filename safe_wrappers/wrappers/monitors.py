@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.control.contact.impact import complementarity_residuals
 from safe_wrappers.control.legged.support import support_distances
@@ -192,8 +191,6 @@ class BalanceMonitor(StepMonitor):
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
-        friction_share: Of the model's friction coefficient that is taken as the whole, in (0, 1].
-        inset: Kept inside the support polygon, m.
         bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves.
 
     Info, at every step: ``balance/linear_momentum`` (kg m/s), ``balance/angular_momentum`` (kg m^2/s), arrays (3,),
@@ -203,7 +200,7 @@ class BalanceMonitor(StepMonitor):
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.
         UnknownNameError: No body of that name; the message lists those there are.
-        ConfigurationError: A share or an inset out of its range, bodies that do not move, or a wrong order.
+        ConfigurationError: Bodies that do not move, or a wrong order.
 
     Source: appendix "Centroidal Dynamics and Floating-Base Control".
 
@@ -218,18 +215,12 @@ class BalanceMonitor(StepMonitor):
 
     partial: ClassVar = keys.BALANCE_PARTIAL
 
-    def __init__(
-        self, env: Env, friction_share: float = 1.0, inset: float = 0.0, bodies: Sequence[str] | None = None
-    ) -> None:
+    def __init__(self, env: Env, bodies: Sequence[str] | None = None) -> None:
         StepMonitor.__init__(self, env)
         raw: Any = env.unwrapped
-        self.friction_share = positive("friction_share", friction_share, "shares of the model's friction")
-        if self.friction_share > 1.0:
-            raise ConfigurationError(f"friction_share is in (0, 1], got {friction_share}")
-        self.inset = non_negative("inset", inset, "m")
         self._robot = _Robot(raw.model, bodies)
         self.bodies = None if bodies is None else list(bodies)
-        self._record({"friction_share": self.friction_share, "inset": self.inset, "bodies": self.bodies})
+        self._record({"bodies": self.bodies})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env; its info holds the keys of a step, as 0."""
@@ -258,15 +249,13 @@ class BalanceMonitor(StepMonitor):
         if not found.steps:
             return dict(_NOTHING)
         normal, tangential = normal_and_tangential(found.force, found.normal)
-        held = self.friction_share * found.friction * normal
+        held = found.friction * normal
         loaded = (normal >= PRESSING * self._robot.weight_n()) & (held > 0.0)
         used = np.linalg.norm(tangential[loaded], axis=1) / held[loaded]
         distances = support_distances(found.step, found.point, found.normal, found.force)
         return {
             keys.BALANCE_FRICTION_USED: float(used.max(initial=0.0)),
-            keys.BALANCE_ZMP_MARGIN: float(distances.min()) - self.inset
-            if distances.size
-            else keys.NOT_JUDGED,
+            keys.BALANCE_ZMP_MARGIN: float(distances.min()) if distances.size else keys.NOT_JUDGED,
         }
 
 

@@ -133,7 +133,7 @@ class OcclusionPenalty(LayerWrapper):
         """Resolve names on a model."""
         s = self.sensor
         range_m = math.inf if s.range_m is None else s.range_m
-        self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m, s.occluder_groups)
+        self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m)
         imu = s.imu
         self.ego_motion = EgoMotion(imu, self._sight) if isinstance(imu, Imu) else None
         self._things = tracked_things(model, self.tracks, self._published)
@@ -238,8 +238,6 @@ class OcclusionPenalty(LayerWrapper):
         seen = self._sight.sees(truth, self._bodies)
         # Drawn for every track, seen or not, so that the noise of one does not depend on another's sight.
         noise = self._random.draw.standard_normal((n, self._noise.shape[0])) @ self._noise_root.T
-        if self.sensor.dropout:
-            seen &= self._random.draw.random(n) >= self.sensor.dropout
         which = np.flatnonzero(seen)
         if which.size:
             among = None if velocities is None else velocities[which]

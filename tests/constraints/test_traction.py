@@ -158,7 +158,6 @@ def test_on_mujocos_own_friction(friction, most):
         ({"max_slip": 0.0}, ConfigurationError, r"\(0, 1\)"),
         ({"max_slip": float("nan")}, ConfigurationError, "max_slip"),
         ({"friction": -0.5}, ConfigurationError, "friction"),
-        ({"margin": -0.1}, ConfigurationError, "margin"),
     ],
 )
 def test_refused_at_construction(arguments, error, says):
@@ -181,4 +180,4 @@ def test_an_env_without_a_model_is_refused():
         f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda env: np.zeros(1), control_dt=0.05
     )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
-        sw.SlipLimiter(gym.make("Pendulum-v1"), wheels=["left"], plant=plant)
+        sw.CBFActionFilter(gym.make("Pendulum-v1"), [sw.constraints.Traction(["left"])], plant)

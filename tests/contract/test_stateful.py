@@ -318,7 +318,7 @@ class VectorCalls(RuleBasedStateMachine):
     @invariant()
     def nothing_wrong_reached_the_task(self):
         if hasattr(self, "stack"):
-            assert not any(env.wrong for env in self.stack.unwrapped.envs)
+            assert not any(env.get_wrapper_attr("wrong") for env in self.stack.unwrapped.envs)
 
 
 class ReacherVectorCalls(VectorCalls):

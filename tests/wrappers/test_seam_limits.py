@@ -96,14 +96,14 @@ def test_a_bridge_that_the_box_would_cut_is_not_taken():
         ).any() or refused  # it was cut: the bridge goes on with the rate that it had
 
 
-def test_a_change_of_source_is_faded_within_the_limits():
+def test_a_change_to_and_from_the_fallback_is_faded_within_the_limits():
     line = Line(1, dtype=np.float64)
     limits = {"acceleration": 5.7735026919 / 0.7**2 * 1.0001}
     env = sw.ChunkHandover(line, 1, 1, blend="quintic", fallback="hold", limits=limits)
     env.reset(seed=0)
-    env.switch("policy")
     env.step(np.array([-0.5]))
-    env.switch("human")
+    env.set_observation_time(None)
+    env.step(np.array([0.5]))
     info = env.step(np.array([0.5]))[4]
     assert info["handover/blend_time"] == pytest.approx(0.7)
 

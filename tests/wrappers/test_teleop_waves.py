@@ -212,12 +212,3 @@ def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
     # 4.5 mJ too much: the next nine waves of half a millijoule are kept for it.
     np.testing.assert_allclose(flows, [1.0] + 9 * [0.0] + 4 * [1.0], atol=1e-6)
     assert out <= 14 * 0.5 * tick + 1e-12
-
-
-def test_named_by_the_user_a_port_is_the_published_one():
-    runs = []
-    for port in (None, sw.teleop.TeleopPort([0, 1], [4, 5], 40.0), {"flow": [0, 1], "effort": [4, 5]}):
-        env = channel(0.005, 0.005, coding="wave", impedance=B, port=port)
-        place(env)
-        runs.append([env.step(np.array([0.1, 0.05]))[0] for _ in range(200)])
-    assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])

@@ -1,4 +1,4 @@
-"""The envs of one run, each a whole stack: from the task to SB3's Monitor, with the learner's map or penalty."""
+"""The envs of one run, each a whole stack: from the task to SB3's Monitor, with the learner's penalty."""
 
 from __future__ import annotations
 

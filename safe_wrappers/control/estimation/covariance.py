@@ -13,11 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, finite_array
-from safe_wrappers.errors import ConfigurationError
-
-_SYMMETRY = 1e-9
-"""Relative asymmetry, and relative size of negative eigenvalues, up to which they count as rounding."""
+from safe_wrappers.checks import Array
 
 
 class Discrete(NamedTuple):
@@ -25,28 +21,6 @@ class Discrete(NamedTuple):
 
     transition: Array
     noise: Array
-
-
-def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
-    """A covariance or a noise intensity as float64, shape (..., n, n), rounding-sized asymmetry removed.
-
-    Raises:
-        ConfigurationError: Not a finite square matrix (of size n, if given), not symmetric, or a negative eigenvalue.
-    """
-    symmetric, smallest, largest = _symmetric(name, matrix, n)
-    if smallest < -_SYMMETRY * largest:
-        raise ConfigurationError(f"{name} must be positive semidefinite, has the eigenvalue {smallest:.6g}")
-    return symmetric
-
-
-def checked_noise(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
-    """As `checked_covariance`, but positive definite: no measurement is exact."""
-    symmetric, smallest, largest = _symmetric(name, matrix, n)
-    if not smallest > 1e-14 * largest:
-        raise ConfigurationError(
-            f"{name} must be positive definite but its smallest eigenvalue is {smallest:.6g}"
-        )
-    return symmetric
 
 
 def discretise(A: ArrayLike, Q: ArrayLike, time_s: float) -> Discrete:
@@ -84,19 +58,3 @@ def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: float) -> Array:
     a, drift = np.asarray(A, dtype=np.float64), np.asarray(b, dtype=np.float64)
     whole = np.block([[a, drift[:, None]], [np.zeros((1, len(a) + 1))]])
     return np.asarray(expm(time_s * whole)[:-1, -1])
-
-
-def _symmetric(name: str, matrix: ArrayLike, n: int | None) -> tuple[Array, float, float]:
-    """The matrix, its smallest eigenvalue and the largest absolute value of one."""
-    given = finite_array(name, matrix)
-    if given.ndim < 2 or given.shape[-1] != given.shape[-2] or given.shape[-1] == 0:
-        raise ConfigurationError(f"{name} must be a square matrix, got shape {given.shape}")
-    if n is not None and given.shape[-1] != n:
-        raise ConfigurationError(f"{name} must be {n} x {n}, got shape {given.shape}")
-    turned = np.swapaxes(given, -1, -2)
-    asymmetry = float(np.abs(given - turned).max(initial=0.0))
-    if asymmetry > _SYMMETRY * float(np.abs(given).max(initial=0.0)):
-        raise ConfigurationError(f"{name} must be symmetric, its entries differ by up to {asymmetry:.6g}")
-    symmetric = 0.5 * (given + turned)
-    values = np.linalg.eigvalsh(symmetric)
-    return symmetric, float(values.min(initial=np.inf)), float(np.abs(values).max(initial=0.0))

@@ -1,7 +1,6 @@
 """The sampled Kalman filter for many tracks at once.
 
-It runs at every step and checks nothing: check the matrices once with `checked_covariance` and `checked_noise` of
-`safe_wrappers.control.estimation.covariance`; take `transition` and `noise` from its `discretise`. The update has
+It runs at every step and checks nothing; take `transition` and `noise` from `covariance.discretise`. The update has
 Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
 
 Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), section 5.2.

@@ -9,7 +9,7 @@ Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,10 @@ class Tracks:
         self.mean = np.zeros((len(self.motions), self.size))
         self.covariance = np.zeros((len(self.motions), self.size, self.size))
         self._known: dict[float, _Over] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is computed again: a pickle stores it in another order, and sums would round otherwise."""
+        return vars(self) | {"_known": {}}
 
     @property
     def positions(self) -> Array:

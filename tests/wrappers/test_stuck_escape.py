@@ -1,4 +1,4 @@
-"""StuckEscape in closed loops on real envs, and in closed form on a cart."""
+"""StuckEscape in closed loops on real envs."""
 
 import gymnasium as gym
 import numpy as np
