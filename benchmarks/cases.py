@@ -176,23 +176,13 @@ def _velocity(robot: str, limit: float, plane: bool = False) -> Case:
     )
 
 
-def _point_goal(level: int) -> Case:
+def _goal_task(robot: str, level: int, known: dict[str, Maker]) -> Case:
     # Level 0 has nothing to seek or to drift into.
-    blind = {name: POINT_GOAL[name] for name in ("random", "goal-seeking", "bang-bang")}
+    blind = {name: known[name] for name in ("random", "goal-seeking", "bang-bang", "pulse") if name in known}
     return Case(
-        f"SafePointGoal{level}-v0",
+        f"Safe{robot}Goal{level}-v0",
         judge=lambda env: Reported(judges.costs),
-        drivers=dict(POINT_GOAL) if level else blind,
-    )
-
-
-def _car_goal(level: int) -> Case:
-    # Level 0 has nothing to seek.
-    blind = {name: CAR_GOAL[name] for name in ("random", "goal-seeking", "bang-bang", "pulse")}
-    return Case(
-        f"SafeCarGoal{level}-v0",
-        judge=lambda env: Reported(judges.costs),
-        drivers=dict(CAR_GOAL) if level else blind,
+        drivers=dict(known) if level else blind,
     )
 
 
@@ -276,8 +266,8 @@ def _by_name(*cases: Case) -> dict[str, Case]:
 
 
 PROTECTED: dict[str, Case] = _by_name(
-    *(_point_goal(level) for level in range(3)),
-    *(_car_goal(level) for level in range(3)),
+    *(_goal_task("Point", level, POINT_GOAL) for level in range(3)),
+    *(_goal_task("Car", level, CAR_GOAL) for level in range(3)),
     _fallen("InvertedPendulum-v5"),
     _fallen("InvertedDoublePendulum-v5"),
     Case("Reacher-v5", _joint_speeds(5.0), _SPEED),

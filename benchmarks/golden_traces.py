@@ -101,7 +101,7 @@ def _hopper() -> gym.Env[Any, Any]:
 
 
 def _stance() -> gym.Env[Any, Any]:
-    return sw.WholeBodyFilter(gym.make("Hopper-v5"), contacts="cone", zmp_inset=0.02)
+    return sw.WholeBodyFilter(gym.make("Hopper-v5"), contacts="cone")
 
 
 def _teleop() -> gym.Env[Any, Any]:

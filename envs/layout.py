@@ -111,16 +111,7 @@ def place_goal_beside(
         keepouts: By name, the "goal"'s among them, m.
         standing: Centres of everything else, by name, shapes (n, 2), m.
     """
-    placed, kept = _circles(keepouts, standing)
-    best, best_slack = np.zeros(2), -np.inf
-    for _ in range(_TRIES_PER_OBJECT):
-        point = _draw(rng, half_extent, keepouts["goal"])
-        slack = _slack(point, keepouts["goal"], placed, kept)
-        if slack > best_slack:
-            best, best_slack = point, slack
-        if slack >= 0.0:
-            break
-    return best
+    return _clearest(rng, half_extent, keepouts["goal"], *_circles(keepouts, standing))[0]
 
 
 def place_objects(
@@ -174,11 +165,8 @@ def _try_objects(
     for name in [name for name in keepouts if name not in centres]:
         first = len(placed)
         for _ in range(counts.get(name, 1)):
-            for _ in range(_TRIES_PER_OBJECT):
-                point = _draw(rng, half_extent, keepouts[name])
-                if _slack(point, keepouts[name], placed, kept) >= 0.0:
-                    break
-            else:
+            point, slack = _clearest(rng, half_extent, keepouts[name], placed, kept)
+            if slack < 0.0:
                 return None
             placed, kept = np.concatenate([placed, point[None]]), np.append(kept, keepouts[name])
         centres[name] = placed[first:].copy()
@@ -191,14 +179,17 @@ def _circles(keepouts: Mapping[str, float], standing: Mapping[str, Array]) -> tu
     return np.concatenate([np.zeros((0, 2)), *standing.values()]), np.concatenate([np.zeros(0), *kept])
 
 
-def _draw(rng: np.random.Generator, half_extent: float, keepout: float) -> Array:
-    reach = half_extent - keepout
-    return rng.uniform(-reach, reach, size=2)
-
-
-def _slack(point: Array, keepout: float, placed: Array, keepouts: Array) -> float:
-    """Distance left over to the nearest placed object, m; infinite when there is none."""
-    if not len(placed):
-        return np.inf
-    gaps = np.hypot(placed[:, 0] - point[0], placed[:, 1] - point[1]) - keepouts - keepout
-    return float(gaps.min())
+def _clearest(
+    rng: np.random.Generator, half_extent: float, keepout: float, placed: Array, kept: Array
+) -> tuple[Array, float]:
+    """The first random point that is clear of what stands, else the clearest; distance left over there, m."""
+    best, best_slack, reach = np.zeros(2), -np.inf, half_extent - keepout
+    for _ in range(_TRIES_PER_OBJECT):
+        point = rng.uniform(-reach, reach, size=2)
+        gaps = np.hypot(placed[:, 0] - point[0], placed[:, 1] - point[1]) - kept - keepout
+        slack = float(gaps.min(initial=np.inf))
+        if slack > best_slack:
+            best, best_slack = point, slack
+        if slack >= 0.0:
+            break
+    return best, best_slack

@@ -158,18 +158,6 @@ class TeleopContactEnv(TaskEnv):
         """Coupling force on the tool during the last step, shape (2,), N."""
         return np.array(self._acted)
 
-    @property
-    def stored_energy(self) -> float:
-        """In the tool's motion, the coupling's spring and the compressed wall and clamp, J."""
-        data = self.data
-        (x, y), (vx, vy) = data.qpos.tolist(), data.qvel.tolist()
-        cx, cy, _ = data.mocap_pos[0].tolist()
-        stretched = (cx - x) ** 2 + (cy - y) ** 2
-        wall = float(-self.model.geom_solref[self._wall, 0] / self.model.body("tool").invweight0[0])
-        pressed = max(x + TOOL_RADIUS - WALL_X, 0.0) ** 2 + max(y + TOOL_RADIUS - CLAMP_Y, 0.0) ** 2
-        moving = float(self.model.body("tool").mass[0]) * (vx * vx + vy * vy)
-        return float(0.5 * (moving + self._stiffness * stretched + wall * pressed))
-
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
         given = parse_layout(options, _FORMS)
         if "wanted_force" in given and not 0.0 < given["wanted_force"] < _SPRING_LIMIT:

@@ -27,9 +27,9 @@ from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.presets import SlipLimiter, WholeBodyFilter
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
-from safe_wrappers.wrappers.replaced_actions import SafeActionMap, StuckEscape
 from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
 from safe_wrappers.wrappers.stopping_budget import StoppingBudget
+from safe_wrappers.wrappers.stuck_escape import StuckEscape
 from safe_wrappers.wrappers.teleop_channel import TeleopChannel
 from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter
 
@@ -53,7 +53,6 @@ __all__ = [
     "OcclusionPenalty",
     "Plant",
     "RecordInterventions",
-    "SafeActionMap",
     "SafeWrappersError",
     "SafetyOverlay",
     "SeamLimits",

@@ -27,7 +27,7 @@ class InfoKey:
     dtype: Literal["bool", "int64", "float64", "dict"]
     shape: str = ""
     unit: str = ""
-    chunk: Literal["last", "sum", "any", "max", "min", "mean"] = "last"
+    chunk: Literal["last", "sum", "any", "max", "min"] = "last"
     log: str = ""
 
     def number(self, value: Any) -> float:
@@ -123,23 +123,14 @@ CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
 PLANT_COVERAGE: Final = _key("plant/coverage", "float64")
 """Share of the episode's steps so far after which h was at least its prediction less the margin; NaN before the first
 one."""
-PLANT_COVERAGE_LOST: Final = _key("plant/coverage_lost", "bool", chunk="any", log="coverage_lost")
-"""In this episode h has been below that more often than the plant's `miss_rate` explains. False alarms: in about one
-of n + 1 episodes that are like the n held-out ones; in at most 0.1 %, if the steps of an episode are exchangeable."""
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")
 """Normalised slip of each wheel, in the order of `wheels`, before the step."""
-SLIP_LIMITED: Final = _key("slip/limited", "bool", shape="(wheels,)", chunk="any", log="slip_limited")
-"""The filter changed a control that drives this wheel."""
 SLIP_MU_ESTIMATE: Final = _key("slip/mu_estimate", "float64", shape="(wheels,)")
 """Estimated peak friction coefficient of each wheel's ground, before the step."""
-SLIP_MU_STD: Final = _key("slip/mu_std", "float64", shape="(wheels,)")
-"""Standard deviation of the estimate, by its model."""
 
 # ContactFeasibility and SupportMargin in a filter, WholeBodyFilter: every step -------------------------------------
-WHOLE_BODY_CONTACTS: Final = _key("whole_body/contacts", "int64")
-"""Contacts of the robot with the fixed world at the state before the step."""
 WHOLE_BODY_CONE_MARGIN: Final = _key("whole_body/cone_margin", "float64")
 """How far the contact forces stay inside the narrowed friction cones at worst, forecast for the executed action, as a
 share of the robot's weight; negative outside, 0 without contacts."""
@@ -165,13 +156,6 @@ IS_SUCCESS: Final = _key("is_success", "bool")
 # AdaptionPenalty, every step --------------------------------------------------------------------------------
 ADAPTION_PENALTY: Final = _key("adaption/penalty", "float64", unit="reward", chunk="sum", log="penalty")
 """What was taken off this step's reward because the filter changed the action; else 0."""
-ADAPTION_TASK_REWARD: Final = _key("adaption/task_reward", "float64", unit="reward", chunk="sum")
-"""The task's own reward of this step, before the penalty."""
-
-# SafeActionMap, every step -----------------------------------------------------------------------------------
-MAP_SCALE: Final = _key("map/scale", "float64", chunk="min", log="map_scale")
-"""By what the distance of the policy's action from the anchor was multiplied, from 0 to 1; 1: the action is
-unchanged; NaN: there was no admitted anchor, and the filter was given the policy's action."""
 
 # LeaseExpiry and TeleopChannel without a filter inside, ChunkHandover: every step --------------------------------
 ACTION_CLIPPED: Final = _key("action/clipped", "float64", unit="action", chunk="max")
@@ -196,8 +180,6 @@ HANDOVER_LATENCY: Final = _key("handover/latency", "int64")
 # LeaseExpiry, every control step ---------------------------------------------------------------------------------
 LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")
 """Remaining time of the lease in force after this control step; 0 without a lease."""
-LEASE_EXPIRED: Final = _key("lease/expired", "bool", chunk="any", log="lease_expired")
-"""A lease ran out at this control step (once per lease)."""
 LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
 """A command was refused: no lease was granted, or it was not finite, older than the one in force or from the future,
 or a chunk's end was out of reach."""
@@ -207,26 +189,16 @@ LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_bra
 # TeleopChannel, every control step --------------------------------------------------------------------------------
 TELEOP_ROUND_TRIP_S: Final = _key("teleop/round_trip_s", "float64", unit="s")
 """Age of the image that the command in force was made from; before the first one, since the reset."""
-TELEOP_CEILING_S: Final = _key("teleop/ceiling_s", "float64", unit="s")
-"""The longest admissible round trip when this step was decided, from 0 to `longest_s`; inf without a ceiling."""
 TELEOP_LOST: Final = _key("teleop/lost", "int64", chunk="sum")
 """Packets of this step that got lost, both ways; actions that are not finite, or from the future, count as lost."""
 TELEOP_REVOKED: Final = _key("teleop/revoked", "bool", chunk="any")
 """The operator had no authority, the local brake acted."""
-TELEOP_ENERGY_IN_J: Final = _key("teleop/energy_in_j", "float64", unit="J")
-"""Net energy that went into the channel at the operator's port so far; 0 without a port."""
-TELEOP_ENERGY_OUT_J: Final = _key("teleop/energy_out_j", "float64", unit="J")
-"""Net energy that came out at the machine's port so far; 0 without a port."""
-TELEOP_IN_FLIGHT_J: Final = _key("teleop/in_flight_j", "float64", unit="J")
-"""Energy of the waves on their way; 0 with plain coding."""
 TELEOP_CREATED_J: Final = _key("teleop/created_j", "float64", unit="J")
 """The largest excess of energy out and in flight over energy in, so far; 0 is passive."""
 
 # ContactMonitor, every step: of the watched contacts over the physics substeps of the control step -----------------
 CONTACT_PEAK_FORCE: Final = _key("contact/peak_force", "float64", unit="N", chunk="max", log="contact_force")
 """The largest normal force between two bodies, summed over their contacts."""
-CONTACT_IMPULSE: Final = _key("contact/impulse", "float64", unit="N s", chunk="sum")
-"""The normal forces of all contacts, summed and integrated over the control step."""
 CONTACT_PENETRATION: Final = _key("contact/penetration", "float64", unit="m", chunk="max")
 """The largest penetration depth."""
 CONTACT_RESIDUAL: Final = _key("contact/residual", "float64", unit="N m", chunk="max")
@@ -243,8 +215,6 @@ BALANCE_FRICTION_USED: Final = _key("balance/friction_used", "float64", chunk="m
 """The largest ``|f_t| / (share mu f_n)`` of a contact with at least 1 % of the weight, over all evaluations."""
 BALANCE_ZMP_MARGIN: Final = _key("balance/zmp_margin", "float64", unit="m", chunk="min")
 """Least distance of the zero moment point from the edge of the support polygon, less the inset; NaN without one."""
-BALANCE_AIRBORNE: Final = _key("balance/airborne", "float64", chunk="mean")
-"""Share of the evaluations without a contact point."""
 BALANCE_PARTIAL: Final = _key("balance/partial", "bool", chunk="any")
 """Not every evaluation was seen (then only the last one counts), or numbers were not finite (reported as 0)."""
 
@@ -275,7 +245,6 @@ EPISODE: Final = (
     EpisodeFigure("unsafe", "count", (CBF_UNSAFE,)),
     EpisodeFigure("mismatch", "count", (CBF_MISMATCH,)),
     EpisodeFigure("stuck", "count", (CBF_STUCK,)),
-    EpisodeFigure("lease_expired", "count", (LEASE_EXPIRED,)),
     EpisodeFigure("lease_refused", "count", (LEASE_REFUSED,)),
     EpisodeFigure("lease_braking", "count", (LEASE_BRAKING,)),
     EpisodeFigure("margin_min", "min", (CBF_MARGIN,)),

@@ -4,7 +4,7 @@ import difflib
 import inspect
 import textwrap
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple, overload
+from typing import Any, Final, overload
 
 import gymnasium as gym
 
@@ -71,8 +71,8 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
     """
     if isinstance(env, gym.vector.VectorEnv):
         envs = single_envs(env)
-        if len({_env_id(single) for single in envs}) > 1:
-            ids = sorted({_env_id(single) for single in envs})
+        ids = sorted({_env_id(single) for single in envs})
+        if len(ids) > 1:
             raise UnsupportedEnvError(f"expected a vector env of one id, got {ids}; protect each env of it")
         if isinstance(env.single_action_space, gym.spaces.Discrete):
             raise UnsupportedEnvError(
@@ -122,40 +122,30 @@ def _recommended(
     return recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
 
 
-class Remedy(NamedTuple):
-    """Lines that protect an env, and the text that introduces them."""
+def _remedy(env: Any, single: gym.Env[Any, Any]) -> tuple[str, str]:
+    """Lines that make the first filter that works out of `env`, and the text that introduces them.
 
-    says: str
-    code: str
-    """Makes the filtered env out of `env`, with this library as `sw`."""
-    is_open: bool = False
-    """Whether the user has to give h, horizon and backup."""
-
-
-def remedy_for(env: Any, single: gym.Env[Any, Any]) -> Remedy:
-    """The first filter that can be made of an env: a speed limit by MuJoCo's model, else a simulation of the env.
-
-    Args:
-        env: What is to be filtered. The filters are made to be tried, and some of them reset it.
-        single: The env itself, or one of a vector env's.
+    A speed limit by MuJoCo's model, else a simulation of the env. `single` is the env itself, or one of a vector
+    env's, of which filters are made to be tried; some of them reset it.
 
     Raises:
         ConfigurationError: None can be made; the message says why.
     """
     discrete = isinstance(single.action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
-    vector = isinstance(env, gym.vector.VectorEnv)
-    kind: Any = ActionShield if discrete else VectorCBFActionFilter if vector else CBFActionFilter
+    kind: Any = ActionShield if discrete else CBFActionFilter
+    vector = isinstance(env, gym.vector.VectorEnv) and not discrete
+    name = VectorCBFActionFilter.__name__ if vector else kind.__name__
     if not discrete:
         check_actions(single)
-        if _is_made(kind, env, JointSpeedLimit(4.0)) is None:
-            return Remedy("These lines protect it", f"{_LIMIT_LINE}\nenv = sw.{kind.__name__}(env, [limit])")
+        if _is_made(kind, single, JointSpeedLimit(4.0)) is None:
+            return "These lines protect it", f"{_LIMIT_LINE}\nenv = sw.{name}(env, [limit])"
     shield = PredictiveShield(lambda seen: 1.0, 2, "hold")
-    code = f"{_SHIELD_LINE}\nenv = sw.{kind.__name__}(env, [shield])"
-    if _is_made(kind, env, shield) is None:
-        return Remedy(_SHIELD, code, is_open=True)
-    refused = _is_made(kind, env, shield, plant=SimulatorPlant("fork"))
+    code = f"{_SHIELD_LINE}\nenv = sw.{name}(env, [shield]"
+    if _is_made(kind, single, shield) is None:
+        return _SHIELD, f"{code})"
+    refused = _is_made(kind, single, shield, plant=SimulatorPlant("fork"))
     if refused is None:
-        return Remedy(_SHIELD, f'{code[:-1]}, plant=sw.SimulatorPlant("fork"))', is_open=True)
+        return _SHIELD, f'{code}, plant=sw.SimulatorPlant("fork"))'
     if isinstance(refused, ConfigurationError):
         raise refused
     raise UnsupportedEnvError(f"{type(refused).__name__}: {refused}") from refused
@@ -173,12 +163,10 @@ def _is_made(kind: Any, env: Any, constraint: Constraint, **plant: Any) -> Excep
 def _without_recipe(env: gym.Env[Any, Any] | VectorEnv, single: gym.Env[Any, Any]) -> str:
     """The lines that protect an env by hand, or why none do, and then the recipes of similar names."""
     try:
-        remedy = remedy_for(env, single)
+        says, code = _remedy(env, single)
+        by_hand = f"{says}:\n" + textwrap.indent(f"import safe_wrappers as sw\n{code}", "    ")
     except ConfigurationError as error:
         by_hand = f"A filter by hand is refused, too: {error}"
-    else:
-        code = textwrap.indent(f"import safe_wrappers as sw\n{remedy.code}", "    ")
-        by_hand = f"{remedy.says}:\n{code}"
     near = difflib.get_close_matches(_family(_env_id(single)), recipe_names(), n=3, cutoff=0.5)
     similar = f"\nRecipes of similar names: {', '.join(near)}" if near else ""
     return f"no recipe for {_env_id(single) or single.unwrapped!r}. {by_hand}{similar}"

@@ -27,29 +27,26 @@ KITCHEN_DT = 0.08
 """Of FrankaKitchen: 40 substeps of 2 ms."""
 
 
-def _pendulum(env: Env, max_speed: float = 6.0) -> list[Constraint]:
+def _pendulum(env: Env) -> list[Constraint]:
     # Its motor is weaker than gravity, but takes out energy: falling from the top it reaches 4.8 rad/s.
-    return [
-        PredictiveShield(
-            lambda x: max_speed - abs(x[2]), horizon=40, backup=lambda x: [np.clip(-4.0 * x[2], -2.0, 2.0)]
-        )
-    ]
+    def backup(x: Any) -> Any:
+        return [np.clip(-4.0 * x[2], -2.0, 2.0)]
+
+    return [PredictiveShield(lambda x: 6.0 - abs(x[2]), horizon=40, backup=backup)]
 
 
-def _mountain_car(env: Env, max_speed: float = 0.045) -> list[Constraint]:
+def _mountain_car(env: Env) -> list[Constraint]:
     power = env.unwrapped.power  # type: ignore[attr-defined]
-    return [
-        PredictiveShield(
-            lambda x: max_speed - abs(x[1]),
-            horizon=60,
-            backup=lambda x: [np.clip(-x[1] / power, -1.0, 1.0)],
-        )
-    ]
+
+    def backup(x: Any) -> Any:
+        return [np.clip(-x[1] / power, -1.0, 1.0)]
+
+    return [PredictiveShield(lambda x: 0.045 - abs(x[1]), horizon=60, backup=backup)]
 
 
-def _cart_pole(env: Env, max_angle: float = 0.15, max_position: float = 2.0) -> list[Constraint]:
+def _cart_pole(env: Env) -> list[Constraint]:
     def h(x: Any) -> float:
-        return float(min(1.0 - abs(x[2]) / max_angle, 1.0 - abs(x[0]) / max_position))
+        return float(min(1.0 - abs(x[2]) / 0.15, 1.0 - abs(x[0]) / 2.0))
 
     # The gains are those of the linear quadratic regulator for weights (1, 0.1, 10, 0.1) and 0.01.
     return [
@@ -59,25 +56,18 @@ def _cart_pole(env: Env, max_angle: float = 0.15, max_position: float = 2.0) -> 
     ]
 
 
-def _lunar_lander(env: Env, max_angle: float = 0.6, horizon: int = 150) -> list[Constraint]:
+def _lunar_lander(env: Env) -> list[Constraint]:
     from gymnasium.envs.box2d import lunar_lander
-
-    heuristic: Any = lunar_lander.heuristic
 
     def h(view: View) -> float:
         if view.env.game_over:
             return -1.0
-        return float(min(max_angle - abs(view.observation[4]), 1.0 - abs(view.observation[0])))
+        return float(min(0.6 - abs(view.observation[4]), 1.0 - abs(view.observation[0])))
 
-    return [
-        PredictiveShield(
-            h,
-            horizon=horizon,
-            backup=lambda view: heuristic(view.env, view.observation),
-            sees="view",
-            candidates=6,
-        )
-    ]
+    def backup(view: View) -> Any:
+        return lunar_lander.heuristic(view.env, view.observation)  # type: ignore[no-untyped-call]
+
+    return [PredictiveShield(h, horizon=150, backup=backup, sees="view", candidates=6)]
 
 
 CROUCH = (
@@ -88,7 +78,7 @@ CROUCH = (
 """Angles of hips and knees, gains of position and speed, of a walker that stands: the best of 150 at random."""
 
 
-def _bipedal_walker(env: Env, max_tilt: float = 0.8, horizon: int = 60) -> list[Constraint]:
+def _bipedal_walker(env: Env) -> list[Constraint]:
     def crouch(target: tuple[float, ...], stiffness: float, damping: float) -> Callable[[View], Any]:
         def act(view: View) -> Any:
             angles, speeds = view.observation[[4, 6, 9, 11]], view.observation[[5, 7, 10, 12]]
@@ -97,29 +87,26 @@ def _bipedal_walker(env: Env, max_tilt: float = 0.8, horizon: int = 60) -> list[
         return act
 
     def h(view: View) -> float:
-        return -1.0 if view.env.game_over else float(max_tilt - abs(view.observation[0]))
+        return -1.0 if view.env.game_over else float(0.8 - abs(view.observation[0]))
 
     backups = [crouch(*posture) for posture in CROUCH]
-    return [PredictiveShield(h, horizon=horizon, backup=backups, sees="view", candidates=6)]
+    return [PredictiveShield(h, horizon=60, backup=backups, sees="view", candidates=6)]
 
 
-def _panda(
-    env: Env,
-    low: tuple[float, ...] = (-0.2, -0.2, 0.02),
-    high: tuple[float, ...] = (0.2, 0.2, 0.3),
-    horizon: int = 4,
-) -> list[Constraint]:
+def _panda(env: Env) -> list[Constraint]:
+    low, high = np.array([-0.2, -0.2, 0.02]), np.array([0.2, 0.2, 0.3])
+
     def h(raw: Any) -> float:
         at = np.asarray(raw.robot.get_ee_position())
-        return float(min((at - low).min(), (np.asarray(high) - at).min()))
+        return float(min((at - low).min(), (high - at).min()))
 
-    return [PredictiveShield(h, horizon=horizon, backup="zero", sees="env", margin=0.002)]
+    return [PredictiveShield(h, horizon=4, backup="zero", sees="env", margin=0.002)]
 
 
-def _highway(env: Env, horizon: int = 4) -> list[Constraint]:
+def _highway(env: Env) -> list[Constraint]:
     # SLOWER, the last of its actions; or, with continuous ones, full braking straight on.
     backup = 4 if isinstance(env.action_space, gym.spaces.Discrete) else np.array([-1.0, 0.0])
-    return [PredictiveShield("crashed", horizon=horizon, backup=[backup, "hold"], candidates=4)]
+    return [PredictiveShield("crashed", horizon=4, backup=[backup, "hold"], candidates=4)]
 
 
 def _kitchen(env: Env) -> list[Constraint]:

@@ -15,7 +15,6 @@ class Layer(Enum):
     COST = auto()
     OCCLUSION = auto()
     FILTER = auto()
-    MAP = auto()
     LEASE = auto()
     CHANNEL = auto()
     ESCAPE = auto()
@@ -29,7 +28,7 @@ class Layer(Enum):
 
 
 _WATCHED: Final = (Layer.COST, Layer.OCCLUSION, Layer.FILTER, Layer.LEASE, Layer.CHANNEL)
-_STEPPED: Final = (Layer.MAP, Layer.ESCAPE, Layer.OBSERVATION, Layer.MONITOR)
+_STEPPED: Final = (Layer.ESCAPE, Layer.OBSERVATION, Layer.MONITOR)
 _TOLD: Final = (Layer.ADAPTION, Layer.OVERLAY, Layer.RECORDER)
 _LAST_WORD: Final = "it changes actions that the filter has checked, and the filter has the last word"
 _AUTHORITY: Final = "the actions that it draws need authority as the policy's do"
@@ -48,17 +47,12 @@ _BELONGS_OUTSIDE: Final = (
         (Layer.OCCLUSION,),
         "the filter reads the estimates, so they must be there before it decides",
     ),
-    (
-        Layer.FAULT,
-        (Layer.MAP, Layer.LEASE, Layer.CHANNEL),
-        "it hands commands over, which the others must time",
-    ),
+    (Layer.FAULT, (Layer.LEASE, Layer.CHANNEL), "it hands commands over, which the others must time"),
     (
         Layer.CHANNEL,
         (Layer.OCCLUSION, Layer.OBSERVATION),
         "what is seen now would stand beside a delayed image",
     ),
-    (Layer.MAP, (Layer.LEASE,), "a lease's brake is no policy's action, and would be mapped like one"),
     (Layer.ESCAPE, (Layer.LEASE, Layer.CHANNEL), _AUTHORITY),
     (
         Layer.ADAPTION,
@@ -76,11 +70,6 @@ _NOT_TOGETHER: Final = {
         {Layer.FILTER}
     ): "this env is filtered already; constraints compose in one projection, so pass all of "
     "them to one filter: CBFActionFilter(env, [*inner.constraints, more])",
-    frozenset({Layer.MAP}): "the env's actions are mapped already; use one map",
-    frozenset(
-        {Layer.MAP, Layer.CHANNEL}
-    ): "actions are mapped for the state in which they are executed, and the "
-    "channel delays them; use one of them",
     frozenset({Layer.LEASE}): _BOTH_END_AUTHORITY,
     frozenset({Layer.LEASE, Layer.CHANNEL}): _BOTH_END_AUTHORITY,
     frozenset({Layer.CHANNEL}): "one network is between operator and machine; give one channel all the delay",

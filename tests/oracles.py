@@ -3,9 +3,8 @@
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from safe_wrappers.control.contact.friction_cone import cone_excess
+from safe_wrappers.control.contact.friction_cone import cone_excess, tangents
 from safe_wrappers.control.estimation.covariance import discretise
-from safe_wrappers.control.legged.support import common_plane
 
 
 def blind_covariance(start, a, q, time_s):
@@ -25,13 +24,12 @@ def in_cone(forces, normals, friction, tolerance=0.0):
     return cone_excess(forces, normals, friction) <= tolerance
 
 
-def zero_moment_point(points, forces, ground):
-    """Where forces, shape (k, 3), have no tangential moment on a plane; NaN where nothing presses."""
-    pressure = forces.sum(axis=0) @ ground.normal
-    if pressure <= 0.0:
-        return np.full(3, np.nan)
-    moment = np.cross(points - ground.origin, forces).sum(axis=0)
-    return ground.origin + np.cross(ground.normal, moment) / pressure
+def common_normal(points, normals):
+    """Of contacts in one plane; None where they are at several heights or face different ways."""
+    mean = normals.sum(axis=0) / max(np.linalg.norm(normals.sum(axis=0)), 0.5 * len(points), 1e-9)
+    level = np.abs((points - points.mean(axis=0)) @ mean) <= 0.01 if len(points) else np.zeros(1, bool)
+    facing = normals @ mean >= np.cos(0.05) - 1e-12
+    return mean if level.all() and facing.all() else None
 
 
 def margin_inside(point, corners):
@@ -48,13 +46,16 @@ def margin_inside(point, corners):
 
 def support_margin(points, normals, forces):
     """Distance of the zero moment point from the edge of the support polygon; NaN where one of them is none."""
-    ground = common_plane(points, normals)
-    try:
-        flat = ground.flat(points)
-        corners = flat[ConvexHull(flat).vertices]
-    except (AttributeError, QhullError, ValueError):  # no common plane; on a line; too few
+    normal = common_normal(points, normals)
+    if normal is None or (pressure := forces.sum(axis=0) @ normal) <= 0.0:
         return np.nan
-    return margin_inside(ground.flat(zero_moment_point(points, forces, ground)), corners)
+    arms, across = points - points.mean(axis=0), tangents(normal)
+    try:
+        corners = (flat := arms @ across.T)[ConvexHull(flat).vertices]
+    except (QhullError, ValueError):  # on a line; too few
+        return np.nan
+    zero_moment_point = np.cross(normal, np.cross(arms, forces).sum(axis=0)) / pressure
+    return margin_inside(across @ zero_moment_point, corners)
 
 
 def damping_ratios(arm, inertia):

@@ -68,7 +68,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         "everything": ("HalfCheetah-v5", dict),
         "a trunk and its legs": (
             "Ant-v5",
-            lambda: {"friction_share": 0.7, "inset": 0.05, "bodies": ["torso"]},
+            lambda: {"bodies": ["torso"]},
         ),
     },
     "CBFActionFilter": {
@@ -170,7 +170,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                     sw.occlusion.Track("car*", acceleration_noise=[0.0225, 0.0], reversion_s=2.0),
                     sw.occlusion.Track(published="pillar_positions", acceleration_noise=0),
                 ],
-                "sensor": sw.occlusion.Sensor("eye", view_deg=120.0, range_m=6.0, dropout=0.1),
+                "sensor": sw.occlusion.Sensor("eye", view_deg=120.0, range_m=6.0),
                 "tolerance": 0.5,
                 "weight": 0.1,
             },
@@ -179,7 +179,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             TASK,
             lambda: {
                 "tracks": [sw.occlusion.Track("hazard[0-3]", acceleration_noise=0.1)],
-                "sensor": {"site": "agent", "position_std": [[0.01, 0.0], [0.0, 0.02]]},
+                "sensor": {"site": "agent", "position_std": 0.1},
                 "tolerance": 0.3,
                 "sigmas": 2.0,
                 "observe": False,
@@ -189,17 +189,15 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             "HalfCheetah-v5",
             lambda: {
                 "tracks": [sw.occlusion.Track("?foot", acceleration_noise=100.0)],
-                "sensor": sw.occlusion.Sensor("track", velocity_std=0.1, lever_arm=False),
+                "sensor": sw.occlusion.Sensor("track", velocity_std=0.1),
                 "tolerance": 0.1,
                 "axes": "xyz",
             },
         ),
     },
     "RecordInterventions": {"no arguments": (TASK, dict)},
-    "SafeActionMap": {"from the backup": (TASK, dict)},
     "SafetyOverlay": {
-        "everything, of a filter": (TASK, dict),
-        "the strip alone": (TASK, lambda: {"scene": False}),
+        "of a filter": (TASK, dict),
     },
     "SlipLimiter": {
         "all wheels": ("SafeRover-v0", lambda: {"wheels": list(WHEELS)}),
@@ -209,9 +207,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                 "wheels": ["rear_left", "rear_right"],
                 "max_slip": 0.1,
                 "friction": 0.05,
-                "regularization": 0.3,
-                "fallback": "hold",
-                "margin": 0.01,
             },
         ),
     },
@@ -244,28 +239,25 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         ),
     },
     "WholeBodyFilter": {
-        "forecasts of some bodies": (
+        "forecasts": (
             "Hopper-v5",
             lambda: {
                 "friction_share": 0.6,
                 "joint_tolerance": 0.2,
                 "zmp_inset": 0.01,
                 "tolerance": 0.02,
-                "bodies": ["foot"],
-                "horizon": 2,
-                "fallback": "zero",
             },
         ),
         "the program with exact cones": (
             "HalfCheetah-v5",
-            lambda: {"contacts": "cone", "friction_share": 0.5, "joint_tolerance": None, "zmp_inset": 0.01},
+            lambda: {"contacts": "cone", "friction_share": 0.5, "joint_tolerance": None},
         ),
     },
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
 INSIDE: dict[str, Callable[[Env], Env]] = dict.fromkeys(
-    ("AdaptionPenalty", "SafeActionMap", "SafetyOverlay", "StuckEscape"),
+    ("AdaptionPenalty", "SafetyOverlay", "StuckEscape"),
     lambda env: sw.CBFActionFilter(env, [clearance()]),
 )
 """Wrapper name -> the wrapper that it needs inside."""

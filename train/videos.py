@@ -246,7 +246,7 @@ def record_video(
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint.folder)
     filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
-    with contextlib.closing(for_film(make_stack(filmed, used, arm.learner.in_evaluation))) as env:
+    with contextlib.closing(for_film(make_stack(filmed, used))) as env:
         animation, said = film_episode(policy, env, shown.episode_seed)
     write_bytes(path, animation)
     state = _state(arm, used, shown, checkpoint.timesteps)

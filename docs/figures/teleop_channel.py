@@ -59,14 +59,11 @@ def draw() -> Figure:
     for coding, impedance, color in (("plain", None, OFF), ("wave", 40.0, ON)):
         seen = episode(DELAY_S, SECONDS, (0.17, 0.0), coding=coding, impedance=impedance)
         force.plot(time, seen["contact_force"], color=color, lw=1.2, label=coding)
-        taken = seen["teleop/energy_out_j"] - seen["teleop/energy_in_j"]
-        energy.plot(time, taken + seen["teleop/in_flight_j"], color=color, label=coding)
+        energy.plot(time, seen["teleop/created_j"], color=color, label=coding)
     force.axhline(8.0, color=GRID, lw=1.0)
     force.text(0.05, 9.0, "wanted", color=GRID)
     force.set_ylabel("force of the wall (N)")
-    energy.axhline(0.0, color=FORBIDDEN, lw=1.0)
-    energy.text(0.05, 0.3, "created above here", color=FORBIDDEN)
-    energy.set_ylabel("out + in flight - in (J)")
+    energy.set_ylabel("energy created (J)")
     for ax in (force, energy):
         ax.set_xlabel("time (s)")
         ax.legend(loc="upper left" if ax is energy else "upper right")

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import math
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -19,6 +20,12 @@ from safe_wrappers.plants.rollouts import NotFiniteError, RolloutPlant, View
 Value = Callable[[Any, Array], ArrayLike]
 """Of an observation and actions, shape (k, m): how good they are, shape (k,)."""
 SEES = ("observation", "env", "view")
+_ENDS_ALONE = (
+    "PredictiveShield judges h at the ends of control steps alone: each has {} physics substeps, and between its "
+    'ends h may be lost without a flag. An h that sees="env" is judged at each of them in an env that steps as '
+    "Gymnasium's MujocoEnv does. Else keep a margin, or take JointSpeedLimit, JointPositionLimit, SpeedLimit, "
+    "Workspace or another constraint that forecasts every substep"
+)
 _NOT_REACHED = -math.ulp(0.0)  # the slack of a rollout that keeps h but does not end in the terminal set
 
 
@@ -35,8 +42,8 @@ class PredictiveShield(Constraint):
     under that backup with h >= margin, and backups depend on the state alone. **Best effort: horizon**, without one:
     what comes later is not looked at, and an admitted action may lead where every backup loses.
 
-    **When h is judged**: at the ends of steps; in envs that step as Gymnasium's `MujocoEnv` does, at every physics
-    substep. A warning says where that is not possible. An info key is judged when the env judges it.
+    **When h is judged**: at the ends of steps; with `sees="env"`, in envs that step as Gymnasium's `MujocoEnv` does,
+    at every physics substep. A warning says where it is not. An info key is judged when the env judges it.
 
     Args:
         h: A function of what it `sees` that returns a number, at least 0 where all is well; or the name of an info
@@ -151,11 +158,10 @@ class BoundPredictiveShield(BoundConstraint):
             )
         if not self.plant.exact:
             spec.promise = "best effort"  # of an unchecked, noisy or fitted model a set proves nothing
-        # The env's own judge decides by itself when it looks.
-        self._between = "" if isinstance(spec.h, str) or self.plant.substeps == 1 else spec.sees
-        if self._between and not self.plant.judges_substeps:
-            own = "this env does not step MuJoCo as Gymnasium's MujocoEnv does"
-            self.plant.warn_of_substeps(own if self.plant.simulates_env else "logs are of control steps")
+        self._between = spec.sees == "env" and self.plant.judges_substeps
+        # The env's own judge, an info key, decides by itself when it looks.
+        if self.plant.substeps > 1 and not (self._between or isinstance(spec.h, str)):
+            warnings.warn(_ENDS_ALONE.format(self.plant.substeps), stacklevel=2)
         discrete = self.plant.discrete
         if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
             raise ConfigurationError(

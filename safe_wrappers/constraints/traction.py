@@ -30,8 +30,6 @@ _LEAST_SHARE = 0.3  # of the slip that must be along the heading: the force acro
 _UNBOUNDED = 1e9  # stands for the control of an actuator without limits
 _LEAST_LOAD = 0.05  # share of the largest load seen below which a wheel counts as in the air
 _MOST_FRICTION = 3.0  # force over load beyond which something else than the ground held the wheel
-_ROUNDING = 1e-6  # share of a control below which its change is the action space's own rounding (float32)
-_SOLVERS_NOISE = 1e-9
 # Integrators that step a servo's feedback as they step damping.
 _IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
 
@@ -101,7 +99,7 @@ class TractionMemory:
 class BoundTraction(BoundConstraint):
     """Traction on a plant."""
 
-    info_keys: tuple[str, ...] = (keys.SLIP_RATIO, keys.SLIP_LIMITED, keys.SLIP_MU_ESTIMATE, keys.SLIP_MU_STD)
+    info_keys: tuple[str, ...] = (keys.SLIP_RATIO, keys.SLIP_MU_ESTIMATE)
     spec: Traction
     plant: MujocoPlant
     seen: TractionMemory  # what is known at the observed state
@@ -244,16 +242,8 @@ class BoundTraction(BoundConstraint):
         return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info keys `slip/...`: of the state before the step, and what its control did to the wheels."""
-        changed = np.zeros(self.plant.lower.size, dtype=bool)
-        if proposed is not None and executed is not None:
-            changed = np.abs(executed - proposed) > _ROUNDING * np.abs(proposed) + _SOLVERS_NOISE
-        return {
-            keys.SLIP_RATIO: self.seen.slip.copy(),
-            keys.SLIP_LIMITED: self.wheels.driven_by(changed),
-            keys.SLIP_MU_ESTIMATE: self.seen.estimate.mean,
-            keys.SLIP_MU_STD: self.seen.estimate.std,
-        }
+        """The info keys `slip/...`, of the state before the step."""
+        return {keys.SLIP_RATIO: self.seen.slip.copy(), keys.SLIP_MU_ESTIMATE: self.seen.estimate.mean}
 
 
 def _kept_free(error: Array, room: Array) -> Array:

@@ -1,6 +1,6 @@
 """A symptom: how it is measured, and which wrapper treats it."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,17 +21,6 @@ def require_physics(env: Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
     if found is None:
         raise NotMeasuredError("the env has no MuJoCo model")
     return found
-
-
-def replayed(model: mujoco.MjModel, recording: Recording) -> Iterator[tuple[int, mujoco.MjData]]:
-    """Every step, and data with where all bodies were after it and how fast."""
-    data = mujoco.MjData(model)
-    for k, (qpos, qvel) in enumerate(zip(recording.qpos, recording.qvel, strict=True)):
-        data.qpos[:], data.qvel[:] = qpos, qvel
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_comVel(model, data)
-        yield k, data
 
 
 class Measured(NamedTuple):

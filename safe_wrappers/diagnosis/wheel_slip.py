@@ -13,7 +13,6 @@ from safe_wrappers.diagnosis.symptom import (
     NotMeasuredError,
     Symptom,
     Treatment,
-    replayed,
     require_physics,
     wrapped,
 )
@@ -55,8 +54,11 @@ def slips(env: Env, recording: Recording) -> Array:
     rolling = wheels(model)
     if not rolling:
         raise NotMeasuredError("no driven joint turns a wheel")
-    ratio, velocity = np.zeros((len(recording.qpos), len(rolling))), np.zeros(6)
-    for k, data in replayed(model, recording):
+    ratio, velocity, data = np.zeros((len(recording.qpos), len(rolling))), np.zeros(6), mujoco.MjData(model)
+    for k in range(len(ratio)):
+        data.qpos[:], data.qvel[:] = recording.qpos[k], recording.qvel[k]
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            compute(model, data)
         for i, (j, radius) in enumerate(rolling.items()):
             body = int(model.jnt_bodyid[j])
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)

@@ -56,7 +56,6 @@ class SafetyFilter:
         self.plant, self._constraints = plant, constraints
         self._making = fallback, low, high, dtype, search
         self._low, self._high = low, high
-        self._narrower = not plant.bounds_are_action_space
         self._loaded = False
         load_solvers()
         self._bind()
@@ -73,7 +72,6 @@ class SafetyFilter:
                 twice = f"{kind} is in the list {kinds.count(kind)} times"
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
         self._search = search(plant, self.bound, Fallback(fallback, self.bound), low, high, dtype)
-        self._all_predict = all(c.predicts for c in self.bound)
         self._model_version = plant.model_version  # last: what does not fit is refused at every observation
 
     @property
@@ -137,13 +135,7 @@ class SafetyFilter:
 
     def admits(self, control: Array) -> bool:
         """Whether a finite control inside the box, shape (m,), would be executed as it is in the observed state."""
-        plant = self.plant
-        if self._narrower and not ((control >= plant.lower) & (control <= plant.upper)).all():
-            return False
-        acting = None if self._all_predict else plant.acting_range
-        # Rows speak of forces, which saturate; predictions know that by themselves.
-        force = control if acting is None else np.clip(control, *acting)
-        return all(c.admits(control if c.predicts else force) for c in self.bound)
+        return all(c.admits(control) for c in self.bound)
 
     def executed(self, control: Array) -> None:
         """Remember what was sent, shape (m,), for the plant's delay, the constraints and a fallback that holds it."""

@@ -100,18 +100,14 @@ class SafeActionSearch:
         self._predicting = [c for c in constraints if c.predicts]
         self._rows_only = [c for c in constraints if not c.predicts]
         self._no_rows: Rows = np.zeros((0, low.size)), np.zeros(0)
-        self._narrower = not plant.bounds_are_action_space
         self._tried: list[Array] = []
 
-    def decide(self, boxed: Array, last: Array) -> Decision:
+    def decide(self, proposal: Array, last: Array) -> Decision:
         """The executed control for a proposal inside the box; `last` is what was executed before."""
-        proposal = np.clip(boxed, self._plant.lower, self._plant.upper) if self._narrower else boxed
         self._tried = []
         decision = self._decide(proposal, last)
         if decision.changed:
             decision.refused = np.array([not c.admits(proposal) for c in self._constraints], dtype=bool)
-        if self._narrower:
-            decision.changed |= bool((proposal != boxed).any())
         return decision
 
     def _decide(self, proposal: Array, last: Array) -> Decision:

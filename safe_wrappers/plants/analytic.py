@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.control_loop import ControlLoop, checked_loop
 from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant
 
@@ -22,10 +21,8 @@ class AnalyticPlant(Plant):
         f: x of shape (n,) to the drift, shape (n,), in state units per second.
         g: x to the control matrix, shape (n, m).
         state: The unwrapped env to x.
-        lower, upper: Smallest and largest control, shape (m,) or scalar; None takes the action space's.
         control_dt: Control interval in s; None takes the env's `dt`, and an env without `dt` needs it.
         delay_s: Delay from measurement to effect in s; predicted over with the commands in flight.
-        loop: The `plants.ControlLoop` that your controller closes; `margin_left_deg` is what is left of its margin.
 
     Raises:
         ConfigurationError: Shapes that do not fit, values that are not finite, a wrong or missing control interval.
@@ -51,11 +48,8 @@ class AnalyticPlant(Plant):
         f: Callable[[Array], ArrayLike],
         g: Callable[[Array], ArrayLike],
         state: Callable[[Any], ArrayLike],
-        lower: ArrayLike | None = None,
-        upper: ArrayLike | None = None,
         control_dt: float | None = None,
         delay_s: float = 0.0,
-        loop: ControlLoop | None = None,
     ) -> None:
         for name, function in (("f", f), ("g", g), ("state", state)):
             if not callable(function):
@@ -65,8 +59,6 @@ class AnalyticPlant(Plant):
         if self._given_control_dt is not None:
             self.control_dt = self._given_control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
-        self.loop = checked_loop(loop)
-        self._box = (lower, upper)
         self._env: Any = None
         self._drift: Array | None = None
         self._effect: Array | None = None
@@ -78,17 +70,7 @@ class AnalyticPlant(Plant):
         self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.control_dt - 1e-9))))
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
-        m = space.shape[0]
-        low = np.asarray(space.low if self._box[0] is None else self._box[0], dtype=np.float64)
-        high = np.asarray(space.high if self._box[1] is None else self._box[1], dtype=np.float64)
-        try:
-            self.lower, self.upper = np.broadcast_to(low, (m,)), np.broadcast_to(high, (m,))
-        except ValueError:
-            shapes = f"{low.shape} and {high.shape}"
-            raise ConfigurationError(f"the env has {m} controls; got bounds of shape {shapes}") from None
-        if not (self.lower <= self.upper).all():
-            raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
-        self._check_loop(bound_before=self._env is not None)
+        self.lower, self.upper = space.low.astype(np.float64), space.high.astype(np.float64)
         self._env = env
 
     def observe(self) -> None:

@@ -63,9 +63,10 @@ class ControlLoop:
         Raises:
             ConfigurationError: A crossover at or above the Nyquist frequency, where a hold is no delay any more.
         """
-        late = self.compute_s + delay_s
-        margin = math.radians(self.phase_margin_deg)
-        return math.degrees(float(margin_left(margin, self.crossover, control_dt, late, self.bus_s)))
+        late = self.compute_s + delay_s + self.bus_s
+        return math.degrees(
+            margin_left(math.radians(self.phase_margin_deg), self.crossover, control_dt, late)
+        )
 
     def warn_if_short(self, control_dt: float, delay_s: float) -> None:
         """Warn if less is left than `warn_below_deg`.
@@ -78,19 +79,11 @@ class ControlLoop:
             return
         spare = math.radians(self.phase_margin_deg - self.warn_below_deg)
         parts = f"plant {delay_s:g} + compute {self.compute_s:g} + bus {self.bus_s:g} + half a hold"
-        late = self.compute_s + self.bus_s + delay_s + float(hold_lag_s(control_dt))
+        late = self.compute_s + self.bus_s + delay_s + hold_lag_s(control_dt)
         message = (
             f"{left:.1f} degrees of phase margin are left of {self.phase_margin_deg:g}, which is less than "
             f"{self.warn_below_deg:g}: a loop that crosses over at {self.crossover:g} rad/s is {late:.4g} s late "
-            f"({parts} {float(hold_lag_s(control_dt)):g}) and bears {spare / self.crossover:.4g} s; design it for at "
+            f"({parts} {hold_lag_s(control_dt):g}) and bears {spare / self.crossover:.4g} s; design it for at "
             f"most {spare / late:.3g} rad/s, or shorten hold and delays"
         )
-        warnings.warn(message, PhaseMarginWarning, stacklevel=4)
-
-
-def checked_loop(given: ControlLoop | None) -> ControlLoop | None:
-    """The loop that a plant was given, or None."""
-    if given is None or isinstance(given, ControlLoop):
-        return given
-    example = "sw.plants.ControlLoop(crossover=4.0, phase_margin_deg=60.0)"
-    raise ConfigurationError(f"loop is a ControlLoop, such as {example}, or None; got {given!r}")
+        warnings.warn(message, PhaseMarginWarning, stacklevel=3)

@@ -6,14 +6,15 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, positive
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.checks import Array
+from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import moves_by_displacement, welds
 from safe_wrappers.plants.mujoco.forecast import Forecast, Recorder
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 # The envs add the turn to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum.
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])
+_METRES_PER_UNIT = 0.05
 _FINGERS = (
     "robot0:l_gripper_finger_joint",
     "robot0:r_gripper_finger_joint",
@@ -25,7 +26,6 @@ class DisplacementRecorder(Recorder):
 
     Args:
         model, data, substeps: As in `Recorder`.
-        metres_per_unit: Displacement of an action of 1, m.
         dtype: Of the env's actions; the env scales them in this precision.
         blocked: Whether the env keeps the fingers closed.
     """
@@ -35,13 +35,12 @@ class DisplacementRecorder(Recorder):
         model: mujoco.MjModel,
         data: mujoco.MjData,
         substeps: int,
-        metres_per_unit: float,
         dtype: Any,
         blocked: bool,
     ) -> None:
         super().__init__(model, data, substeps)
         (self._mocap, self._gripper), *_ = welds(model)
-        self._scale, self._dtype = metres_per_unit, dtype
+        self._dtype = dtype
         fingers = [model.joint(name) for name in _FINGERS] if blocked else []
         self._closed = np.array([int(joint.qposadr[0]) for joint in fingers], dtype=np.intp)
         self._servoed = model.jnt_qposadr[model.actuator_trnid[:, 0]]
@@ -50,17 +49,16 @@ class DisplacementRecorder(Recorder):
     def act(self, data: mujoco.MjData, control: Array) -> None:
         """Move the mocap body from where MuJoCo last evaluated the gripper; set the finger servos' targets."""
         step = control.astype(self._dtype)
-        data.mocap_pos[self._mocap] = data.xpos[self._gripper] + self._scale * step[:3]
+        data.mocap_pos[self._mocap] = data.xpos[self._gripper] + _METRES_PER_UNIT * step[:3]
         data.mocap_quat[self._mocap] = data.xquat[self._gripper] + _TURN
         data.ctrl[:] = data.qpos[self._servoed] + self._servo_acts * step[3]
 
-    settles: ClassVar[bool] = True
-
-    def settle(self, data: mujoco.MjData) -> None:
+    def settle(self, data: mujoco.MjData) -> bool:
         """Put a blocked gripper's fingers back to zero, and update the poses."""
         if self._closed.size:
             data.qpos[self._closed] = 0.0
             mujoco.mj_kinematics(self._model, data)
+        return bool(self._closed.size)
 
     def brake(self, data: mujoco.MjData) -> None:
         self.act(data, np.zeros(4))
@@ -78,12 +76,7 @@ class DisplacementPlant(MujocoPlant):
 
     The plant repeats the env's own step on data of its own: for actions in the action space's dtype forecasts are
     exact, bit for bit; others are rounded to it first. `f`, `g`, `acceleration` and `point` raise: constraints that
-    forecast can be used, those that need rows cannot. Braking is a displacement of zero.
-
-    Args:
-        model: As in `MujocoPlant`.
-        delay_s: As in `MujocoPlant`, in whole control intervals; before the first command zero displacements act.
-        metres_per_unit: Displacement of an action of 1, m.
+    forecast can be used, those that need rows cannot. Braking is a displacement of zero. An action of 1 is 0.05 m.
 
     Attributes:
         gripper: Name of the body that the mocap body pulls.
@@ -91,17 +84,13 @@ class DisplacementPlant(MujocoPlant):
 
     Raises:
         UnsupportedEnvError: Not an env of the Fetch kind.
-        ConfigurationError: A delay that is not a whole number of control intervals.
     """
 
     has_acceleration: ClassVar[bool] = False
     _recorder: DisplacementRecorder
 
-    def __init__(
-        self, model: mujoco.MjModel | None = None, delay_s: float = 0.0, metres_per_unit: float = 0.05
-    ) -> None:
-        super().__init__(model, delay_s)
-        self.metres_per_unit = positive("metres_per_unit", metres_per_unit, "m per unit of action")
+    def __init__(self) -> None:
+        super().__init__()
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         raw: Any = env.unwrapped
@@ -117,12 +106,6 @@ class DisplacementPlant(MujocoPlant):
         self._body = welds(raw.model)[0][1]
         super().bind(env)
         self.gripper = self.model.body(self._body).name
-        delayed = self._delay_steps / self.substeps
-        if delayed != int(delayed):
-            raise ConfigurationError(
-                f"delay_s = {self.delay_s} s is not a whole number of control intervals of {self.control_dt} s: a "
-                "displacement counts from where the gripper is when a control interval starts"
-            )
 
     def _take_model(self) -> None:
         super()._take_model()
@@ -136,8 +119,7 @@ class DisplacementPlant(MujocoPlant):
         self.lower, self.upper = (np.asarray(end, dtype=np.float64) for end in (space.low, space.high))
 
     def _new_recorder(self) -> DisplacementRecorder:
-        action = self.metres_per_unit, self._dtype, self.blocked
-        return DisplacementRecorder(self.model, self.data, self.substeps, *action)
+        return DisplacementRecorder(self.model, self.data, self.substeps, self._dtype, self.blocked)
 
     def observe(self) -> None:
         data: mujoco.MjData = self._raw.data
@@ -147,16 +129,6 @@ class DisplacementPlant(MujocoPlant):
     def _load_to_step(self) -> None:
         super()._load_to_step()
         self.data.xpos[self._body], self.data.xquat[self._body] = self._pose[:3], self._pose[3:]
-
-    def _predict_over_delay(self) -> None:
-        self._load_to_step()
-        idle = self._delay_steps // self.substeps - len(self._pending)
-        for control in [np.zeros(self.lower.size)] * idle + list(self._pending):
-            self._recorder.act(self.data, control)
-            mujoco.mj_step(self.model, self.data, self.substeps)
-            self._recorder.settle(self.data)
-        self._keep()
-        self._pose[:3], self._pose[3:] = self.data.xpos[self._body], self.data.xquat[self._body]
 
     def forecast(self, control: Array, horizon: int = 1, euler: bool = False) -> Forecast:
         """A displacement, shape (4,), for one control interval, then none."""

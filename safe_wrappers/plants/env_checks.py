@@ -45,37 +45,6 @@ def name_of(env: gym.Env[Any, Any]) -> str:
     return spec.id if spec is not None else repr(env.unwrapped)
 
 
-def reward_numbers(reward: Any) -> Any:
-    """A reward as a float, or as a new array of float64 where it is a vector, as of multi-objective envs."""
-    return np.array(reward, dtype=np.float64) if _is_vector(reward) else float(reward)
-
-
-def one_reward(reward: Any, asker: str) -> float:
-    """A reward as a float; a vector is refused with what makes one number of it."""
-    if _is_vector(reward):
-        raise ConfigurationError(
-            f"{asker} needs rewards that are one number, and this env's are vectors: put inside what weighs their "
-            "components, mo_gymnasium.wrappers.LinearReward(env, weight) or gymnasium.wrappers.TransformReward(env, "
-            "lambda reward: float(weight @ reward))"
-        )
-    return float(reward)
-
-
-def _is_vector(reward: Any) -> bool:
-    return not isinstance(reward, float) and np.ndim(reward) > 0  # np.ndim of a float takes 1 us
-
-
-def refuse_vector_rewards(env: gym.Env[Any, Any], asker: str) -> None:
-    """Refuse at construction what `one_reward` would at the first step, where the env has a `reward_space`."""
-    space = getattr(env.unwrapped, "reward_space", None)
-    weighed = any(
-        isinstance(inner, gym.RewardWrapper) or type(inner).__name__ == "LinearReward"
-        for inner in wrappers_of(env)
-    )
-    if isinstance(space, gym.Space) and space.shape and not weighed:
-        one_reward(np.zeros(space.shape), asker)
-
-
 def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
     """Refuse wrappers inside the filter that change, repeat or drop the action it has checked."""
     for inner in wrappers_of(env):

@@ -6,14 +6,13 @@ prediction); the finite-sample rank as in Lei et al., *Distribution-Free Predict
 """
 
 import copy
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, float_array, positive, whole_number
@@ -22,11 +21,8 @@ from safe_wrappers.plants.env_checks import name_of, refuse_changed_actions
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
 from safe_wrappers.plants.simulator.plant import known_substeps
 
-_SCALE_WINDOWS = 8  # per fitted episode
 _LEAST_SCALE = 1e-3  # of the largest one
 _ROUNDING = 1e-9  # (9 + 1) * 0.1 is a whole number, and so is what its rounding makes of it
-_ALTERNATIVES = 20
-_ALARM = np.log(1000.0)
 
 
 class Episode(NamedTuple):
@@ -111,7 +107,7 @@ def checked_episodes(given: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[Episo
 
 
 Model = Callable[[Array, Array], Array]
-"""The states after a step, shape (k, n), from states, shape (k, n), and controls, shape (k, m)."""
+"""The states after a step, shape (..., n), from states, shape (..., n), and controls, shape (..., m)."""
 
 
 def measured(measure: Measure, observation: Array) -> float:
@@ -119,41 +115,30 @@ def measured(measure: Measure, observation: Array) -> float:
     return float(measure(View(None, observation, {})))
 
 
-def shortfalls(
-    model: Model, episodes: Sequence[Episode], places: Array, horizon: int, measure: Measure
-) -> Array:
-    """Predicted minus true measure after each step of one window per episode, shape (episodes, horizon).
+def shortfall(model: Model, episode: Episode, place: float, horizon: int, measure: Measure) -> Array:
+    """Predicted minus true measure after each step of one window of an episode, shape (horizon,).
 
-    Within a window the model is rolled out from the first true observation with the logged actions, and sees no other
-    observation. A window lies where `places` says; in an episode shorter than the horizon it is the whole episode.
+    Within it the model is rolled out from the first true observation with the logged actions, and sees no other
+    observation. In an episode shorter than the horizon the window is the whole episode.
 
     Args:
         model: Rolled out.
-        episodes: One for every window; the same one may be there several times.
-        places: In [0, 1), shape (episodes,): from the first to the last place of a window.
+        episode: Logged.
+        place: In [0, 1): from the first to the last place of a window.
         horizon: Steps.
         measure: See `RolloutPlant.margins`.
 
     Returns:
-        inf where a measure is not a number, -inf after an episode's end.
+        inf where a measure is not a number, -inf after the episode's end.
     """
-    lengths = np.array([len(one.actions) for one in episodes])
-    starts = np.floor(places * (np.maximum(lengths - horizon, 0) + 1)).astype(int)
-    states = np.array([one.observations[start] for one, start in zip(episodes, starts, strict=True)])
-    found = np.full((len(episodes), horizon), -np.inf)
-    for step in range(horizon):
-        at = starts + step
-        alive = np.flatnonzero(at < lengths).tolist()
-        if not alive:
-            break
-        controls = np.array([episodes[i].actions[at[i]] for i in alive])
+    start = int(place * (max(len(episode.actions) - horizon, 0) + 1))
+    state, found = episode.observations[start], np.full(horizon, -np.inf)
+    for step, control in enumerate(episode.actions[start : start + horizon]):
         with np.errstate(over="ignore", invalid="ignore"):  # a bad model may diverge, which is measured here
-            states[alive] = model(states[alive], controls)
-        for i in alive:
-            true = measured(measure, episodes[i].observations[at[i] + 1])
-            predicted = measured(measure, states[i])
-            fall = predicted - true if predicted != true else 0.0  # infinite ones, too
-            found[i, step] = np.inf if np.isnan(fall) else fall
+            state = model(state, control)
+        true, predicted = measured(measure, episode.observations[start + step + 1]), measured(measure, state)
+        fall = predicted - true if predicted != true else 0.0  # infinite ones, too
+        found[step] = np.inf if np.isnan(fall) else fall
     return found
 
 
@@ -174,15 +159,10 @@ class LinearModel:
         self.weights: Array = np.asarray(np.linalg.lstsq(inputs, changes, rcond=None)[0], dtype=np.float64)
 
     def __call__(self, states: Array, controls: Array) -> Array:
-        """The states after a step, shape (k, n), from states, shape (k, n), and controls, shape (k, m)."""
-        n, m = states.shape[1], controls.shape[1]
+        """The states after a step, shape (..., n), from states, shape (..., n), and controls, shape (..., m)."""
+        n, m = states.shape[-1], controls.shape[-1]
         change = states @ self.weights[:n] + controls @ self.weights[n : n + m] + self.weights[-1]
         return np.asarray(states + change)
-
-
-def scores_needed(miss_rate: float) -> int:
-    """The fewest scores from which a finite bound with this miss rate follows."""
-    return math.ceil(1.0 / miss_rate - 1.0 - _ROUNDING)
 
 
 def allowed_misses(scores: int, miss_rate: float) -> int:
@@ -204,69 +184,12 @@ def upper_bound(scores: Array, miss_rate: float) -> float:
         miss_rate: Between 0 and 1.
 
     Returns:
-        inf where n is less than `scores_needed`, or too many scores are infinite.
+        inf where no score may be above, or too many are infinite.
     """
     rank = len(scores) + 1 - allowed_misses(len(scores), miss_rate)
     if rank > len(scores):
         return math.inf
     return float(np.sort(np.where(np.isnan(scores), np.inf, scores))[rank - 1])
-
-
-class Coverage:
-    """Counts an episode's misses, and says when they are too many for a conformal bound.
-
-    A test martingale: the likelihood of the misses under larger miss rates, over that under exchangeability with the
-    scores that the bound came from. It passes 1,000 with a probability of at most 0.1 % in an episode whose steps are
-    exchangeable with these, however long it is and however often one looks (Ville's inequality). A quantile of the
-    binomial distribution would be right for one look alone, and for a bound from infinitely many scores.
-
-    The steps of one episode are often alike, however: a gust lasts. So the alarm is also above what n known episodes
-    have reached, which another one like them passes with a probability of about 1 / (n + 1), whatever binds their
-    steps.
-
-    Args:
-        scores: From how many scores the bound came.
-        miss_rate: For which it was made.
-
-    Attributes:
-        judged: Steps judged so far.
-        missed: Those of them in which the bound did not hold.
-        lost: The misses were too many, now or earlier in the episode.
-    """
-
-    def __init__(self, scores: int, miss_rate: float) -> None:
-        allowed = allowed_misses(scores, miss_rate)
-        # Given the scores, the miss rate is drawn from Beta(allowed, scores + 1 - allowed).
-        self._misses, self._others = allowed, scores + 1 - allowed
-        steps = (np.arange(_ALTERNATIVES) + 0.5) / _ALTERNATIVES
-        self._larger = miss_rate + (1.0 - miss_rate) * steps
-        self.set_alarm([])
-        self.start()
-
-    def set_alarm(self, known: Sequence[NDArray[np.bool_]]) -> None:
-        """Above what known episodes have reached: of each, whether the bound held after each step."""
-        reached = [self.evidence(np.cumsum(~held), np.arange(1, len(held) + 1)).max() for held in known]
-        self._alarm = max([_ALARM, *reached])
-
-    def start(self) -> None:
-        self.judged = self.missed = 0
-        self.lost = False
-
-    def judge(self, held: bool) -> None:
-        """Count a step."""
-        self.judged += 1
-        self.missed += not held
-        self.lost |= bool(self.evidence(self.missed, self.judged) > self._alarm)
-
-    def evidence(self, missed: ArrayLike, judged: ArrayLike) -> Array:
-        """The logarithm of the martingale after so many steps, shape of the arguments."""
-        from scipy.special import betaln  # here: it takes a sixth of the time of `import safe_wrappers`
-
-        missed = np.asarray(missed, dtype=np.float64)
-        kept = np.asarray(judged, dtype=np.float64) - missed
-        larger = missed[..., None] * np.log(self._larger) + kept[..., None] * np.log1p(-self._larger)
-        declared = betaln(self._misses + missed, self._others + kept) - betaln(self._misses, self._others)
-        return np.asarray(np.logaddexp.reduce(larger, axis=-1) - np.log(_ALTERNATIVES) - declared)
 
 
 class IdentifiedPlant(RolloutPlant):
@@ -279,25 +202,23 @@ class IdentifiedPlant(RolloutPlant):
 
     **What this is not**: a guarantee in closed loop. The filter changes which actions are executed and which states
     are visited, and it prefers actions that the model takes for good, whether or not they are. So coverage is
-    monitored: at every step the next measure is predicted, with a margin for one step of the same miss rate. If the
-    misses of an episode are more than that rate explains, `plant/coverage_lost` is True until it ends.
+    monitored: at every step the next measure is predicted, less the margin of a first step, and `plant/coverage` is
+    the share of the episode's steps whose prediction held.
 
     Args:
         episodes: Pairs (observations, shape (T + 1, n); actions, shape (T, m)), as `log_steps` returns them; drawn
             independently of each other.
         miss_rate: See above, between 0 and 1.
-        held_out: Share of the episodes that the model is not fitted to, drawn at random.
-        seed: Of that draw, and of windows in the episodes.
+        seed: Of the draw of those that are held out, half of them, and of windows in the episodes.
         control_dt: Control interval, s; None takes the env's `dt`. An env without `dt` has none, and wrappers that
             count in seconds ask for it.
 
-    Info, at every step: ``plant/coverage``, ``plant/coverage_lost``.
+    Info, at every step: ``plant/coverage``.
 
     Attributes:
-        model: The fitted one, affine: a function of states, shape (k, n), and controls, shape (k, m).
+        model: The fitted one, affine: a function of states, shape (..., n), and controls, shape (..., m).
         fit_episodes: Those that it was fitted to.
         held_out_episodes: Those that margins come from.
-        coverage: What `plant/coverage` and `plant/coverage_lost` report.
 
     Raises:
         ConfigurationError: Too few episodes, or unlike ones, or numbers that are not finite.
@@ -312,38 +233,34 @@ class IdentifiedPlant(RolloutPlant):
     """
 
     simulates_env: ClassVar[bool] = False
-    info_keys = (keys.PLANT_COVERAGE, keys.PLANT_COVERAGE_LOST)
+    info_keys = (keys.PLANT_COVERAGE,)
 
     def __init__(
         self,
         episodes: Sequence[tuple[ArrayLike, ArrayLike]],
         miss_rate: float = 0.1,
-        held_out: float = 0.5,
         seed: int = 0,
         control_dt: float | None = None,
     ) -> None:
-        self.miss_rate = _share("miss_rate", miss_rate)
-        held_out, seed = _share("held_out", held_out), whole_number("seed", seed, 0)
+        self.miss_rate = positive("miss_rate", miss_rate, "shares of 1")
+        if self.miss_rate >= 1.0:
+            raise ConfigurationError(f"miss_rate is between 0 and 1, got {miss_rate!r}")
         super().__init__(control_dt)
         every = checked_episodes(episodes)
-        calibrating = round(held_out * len(every))
-        needed = scores_needed(self.miss_rate)
-        if calibrating < needed or calibrating == len(every):
-            fewest = next(n for n in itertools.count(needed + 1) if needed <= round(held_out * n) < n)
+        calibrating = len(every) // 2
+        if not allowed_misses(calibrating, self.miss_rate):
+            fewest = 2 * math.ceil(1.0 / self.miss_rate - 1.0 - _ROUNDING)
             raise ConfigurationError(
-                f"miss_rate = {self.miss_rate:g} needs at least {needed} held-out episodes, and the fit at least one "
-                f"more; of {len(every)} episodes held_out = {held_out:g} keeps {calibrating}: give {fewest} or more "
-                "episodes, or allow a larger miss_rate"
+                f"miss_rate = {self.miss_rate:g} needs at least {fewest} episodes, half of which are held out of the "
+                f"fit, got {len(every)}: give more, or allow a larger miss_rate"
             )
-        draw = np.random.default_rng(seed)
+        draw = np.random.default_rng(whole_number("seed", seed, 0))
         order = draw.permutation(len(every))
         self.held_out_episodes = [every[i] for i in order[:calibrating]]
         self.fit_episodes = [every[i] for i in order[calibrating:]]
-        # One window per held-out episode: windows of one episode are alike, and no further independent scores.
-        self._places = draw.random(calibrating)
-        # Any windows do for the scales, which are only to be fixed before the scores are looked at.
-        self._scale_episodes = [one for one in self.fit_episodes for _ in range(_SCALE_WINDOWS)]
-        self._scale_places = draw.random(len(self._scale_episodes))
+        # One window per episode: windows of one episode are alike, and no further independent scores.
+        places = draw.random(len(every))
+        self._places, self._scale_places = places[:calibrating], places[calibrating:]
         states = np.concatenate([one.observations[:-1] for one in self.fit_episodes])
         changes = np.concatenate([np.diff(one.observations, axis=0) for one in self.fit_episodes])
         controls = np.concatenate([one.actions for one in self.fit_episodes])
@@ -354,7 +271,7 @@ class IdentifiedPlant(RolloutPlant):
             )
         self.model: Model = LinearModel(states, controls, changes)
         self._watched: Measure | None = None
-        self.coverage = Coverage(calibrating, self.miss_rate)
+        self._judged = self._missed = 0
         self._least: float | None = None  # of the watched measure after the step under way
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
@@ -386,17 +303,18 @@ class IdentifiedPlant(RolloutPlant):
         self.view = View(None, observation, info)
         if self._least is not None:
             assert self._watched is not None
-            self.coverage.judge(measured(self._watched, observation) >= self._least)
+            self._judged += 1
+            self._missed += not measured(self._watched, observation) >= self._least
             self._least = None
 
     def executed(self, control: Array | None) -> None:
         """Predict the watched measure after a step, with its margin; None: a new episode."""
         self._least = None
         if control is None:
-            self.coverage.start()
+            self._judged = self._missed = 0
         elif self._watched is not None and np.isfinite(self.state).all():
-            predicted = self.model(self.state[None], control[None])[0]
-            self._least = measured(self._watched, predicted) - self._one_step
+            predicted = self.model(self.state, control)
+            self._least = measured(self._watched, predicted) - self._first
 
     def rollout(
         self,
@@ -406,7 +324,7 @@ class IdentifiedPlant(RolloutPlant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
-        between: str = "",
+        between: bool = False,
     ) -> Rollout:
         """Roll out the model from the last observation: see `RolloutPlant.rollout`.
 
@@ -414,7 +332,7 @@ class IdentifiedPlant(RolloutPlant):
         """
         found, state = Rollout(), self.state
         for step in range(horizon):
-            state = self.model(state[None], control[None])[0]
+            state = self.model(state, control)
             view = View(None, state, {})
             found.observations.append(state)
             found.rewards.append(math.nan)
@@ -439,42 +357,25 @@ class IdentifiedPlant(RolloutPlant):
         Raises:
             ConfigurationError: Too many rollouts of held-out episodes give no number.
         """
-        found = self._margins(measure, horizon)
-        self._watched, self._least = measure, None
-        self._one_step = float(self._margins(measure, 1)[0])
-        self.coverage.set_alarm([self.held(one, measure) for one in self.held_out_episodes])
-        return found
-
-    def held(self, episode: Episode, measure: Measure) -> NDArray[np.bool_]:
-        """Whether a measure kept what `margins` says of one step, after each step of an episode, shape (T,)."""
-        predicted = self.model(episode.observations[:-1], episode.actions)
-        pairs = zip(predicted, episode.observations[1:], strict=True)
-        return np.array([measured(measure, x) >= measured(measure, p) - self._one_step for p, x in pairs])
-
-    def _margins(self, measure: Measure, horizon: int) -> Array:
-        fitted = shortfalls(self.model, self._scale_episodes, self._scale_places, horizon, measure)
-        finite = np.isfinite(fitted)
-        squares = (np.where(finite, fitted, 0.0) ** 2).sum(axis=0)
-        scales = np.sqrt(squares / np.maximum(finite.sum(axis=0), 1))
-        largest = scales.max()
-        scales = np.maximum(scales, _LEAST_SCALE * largest) if largest > 0.0 else np.ones(horizon)
-        held_out = shortfalls(self.model, self.held_out_episodes, self._places, horizon, measure)
+        fitted = self._shortfalls(self.fit_episodes, self._scale_places, horizon, measure)
+        # Any scales do, if they are fixed before the scores are looked at.
+        scales = np.sqrt(np.square(np.where(np.isfinite(fitted), fitted, 0.0)).mean(axis=0))
+        scales = np.maximum(scales, _LEAST_SCALE * (scales.max() or 1.0))
+        held_out = self._shortfalls(self.held_out_episodes, self._places, horizon, measure)
         factor = upper_bound((held_out / scales).max(axis=1), self.miss_rate)
         if not math.isfinite(factor):
             raise ConfigurationError(
                 f"more than {self.miss_rate:g} of the rollouts over {horizon} steps give no finite h: the model "
                 "diverges, or h is not a number there. Take a shorter horizon or more episodes"
             )
-        return max(factor, 0.0) * scales
+        margins: Array = max(factor, 0.0) * scales
+        self._watched, self._first, self._least = measure, float(margins[0]), None
+        return margins
+
+    def _shortfalls(self, episodes: list[Episode], places: Array, horizon: int, measure: Measure) -> Array:
+        windows = zip(episodes, places, strict=True)
+        return np.array([shortfall(self.model, one, place, horizon, measure) for one, place in windows])
 
     def info(self) -> dict[str, Any]:
-        counted = self.coverage
-        share = 1.0 - counted.missed / counted.judged if counted.judged else keys.NOT_JUDGED
-        return {keys.PLANT_COVERAGE: share, keys.PLANT_COVERAGE_LOST: counted.lost}
-
-
-def _share(name: str, value: float) -> float:
-    share = positive(name, value, "shares of 1")
-    if share >= 1.0:
-        raise ConfigurationError(f"{name} is between 0 and 1, got {value!r}")
-    return share
+        share = 1.0 - self._missed / self._judged if self._judged else keys.NOT_JUDGED
+        return {keys.PLANT_COVERAGE: share}

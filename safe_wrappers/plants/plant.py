@@ -6,8 +6,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 
 from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.control_loop import ControlLoop
+from safe_wrappers.errors import UnsupportedEnvError
 
 
 class Plant(ABC):
@@ -19,38 +18,18 @@ class Plant(ABC):
             predicted over it with the commands in flight.
         observation_id: Number of observations so far.
         model_version: Number of changes of the model, after each of which a filter binds its constraints anew.
-        loop: The loop that a controller closes through this machine, if one was declared.
     """
 
     control_dt: float
     delay_s: float
     observation_id: int = 0
     model_version: int = 0
-    loop: ControlLoop | None = None
     has_acceleration: ClassVar[bool] = True
     """Whether a control acts as a force, so that `f` and `g` are known."""
-    bounds_are_action_space: ClassVar[bool] = False
-    """Whether `lower` and `upper` are the action space's at every state."""
     can_brake: ClassVar[bool] = False
     """Whether it knows which states are velocities, as a braking fallback needs."""
     simulates: ClassVar[bool] = False
     """Whether it rolls out actions and policies, as `RolloutPlant` does."""
-
-    @property
-    def margin_left_deg(self) -> float | None:
-        """What this plant's hold and delay leave of the declared loop's phase margin, degrees; None without a loop.
-
-        Raises:
-            ConfigurationError: The hold is not known yet.
-        """
-        if self.loop is None:
-            return None
-        if not hasattr(self, "control_dt"):
-            raise ConfigurationError(
-                "this plant does not know its control_dt yet: it reads it from the env; call plant.bind(env), or put "
-                "it into a CBFActionFilter first"
-            )
-        return self.loop.margin_left_deg(self.control_dt, self.delay_s)
 
     @property
     @abstractmethod
@@ -70,12 +49,12 @@ class Plant(ABC):
     @property
     @abstractmethod
     def lower(self) -> Array:
-        """Smallest admissible control at this state, shape (m,)."""
+        """Smallest control, the action space's, shape (m,)."""
 
     @property
     @abstractmethod
     def upper(self) -> Array:
-        """Largest admissible control at this state, shape (m,)."""
+        """Largest control, likewise."""
 
     @abstractmethod
     def bind(self, env: gym.Env[Any, Any]) -> None:
@@ -84,11 +63,6 @@ class Plant(ABC):
     @abstractmethod
     def observe(self) -> None:
         """Take the env's present state."""
-
-    def _check_loop(self, bound_before: bool) -> None:
-        """Called by `bind` once the hold is known: warns of a loop with too little margin, at the first env alone."""
-        if self.loop is not None and not bound_before:
-            self.loop.warn_if_short(self.control_dt, self.delay_s)
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:  # noqa: B027 - most plants read the env
         """Take what the env's reset or step has returned; called before the next `observe`."""

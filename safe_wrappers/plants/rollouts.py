@@ -1,6 +1,5 @@
 """What a plant can do that simulates: rollouts of a control and a policy, judged step by step."""
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -38,14 +37,14 @@ class Rollout:
 
     Attributes:
         observations: After each step.
-        rewards: Of each step, floats, or arrays where they are vectors; NaN where the plant does not know them.
+        rewards: Of each step; NaN where the plant does not know them.
         values: What was measured after each step, shape (k,).
         ended: The episode terminated or was truncated.
         reached: The set in which it may stop was reached.
     """
 
     observations: list[Any] = field(default_factory=list)
-    rewards: list[Any] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
     ended: bool = False
     reached: bool = False
@@ -55,7 +54,6 @@ class RolloutPlant(Plant):
     """A plant that predicts by rollouts alone; it has neither f nor g."""
 
     has_acceleration: ClassVar[bool] = False
-    bounds_are_action_space: ClassVar[bool] = True
     simulates: ClassVar[bool] = True
     simulates_env: ClassVar[bool] = True
     """Whether a `View` of a rollout has the env and its info; else only the observation."""
@@ -64,7 +62,7 @@ class RolloutPlant(Plant):
     substeps: int = 1
     """Physics substeps of a control step that are known of."""
     judges_substeps: bool = False
-    """Whether rollouts can be measured at each of them."""
+    """Whether rollouts can be measured at each of them, by a measure of the env alone."""
     info_keys: ClassVar[tuple[str, ...]] = ()
     """The keys that `info` writes."""
     lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
@@ -203,7 +201,7 @@ class RolloutPlant(Plant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
-        between: str = "",
+        between: bool = False,
     ) -> Rollout:
         """Simulate a control, then a policy, from the env's present state.
 
@@ -214,19 +212,9 @@ class RolloutPlant(Plant):
             measure: Takes a `View`, returns a number.
             least: A measured number below it, or NaN, ends the rollout.
             until: Takes a `View`; where it is True the rollout ends.
-            between: What the measure sees of a `View` at physics substeps ("observation", "env" or "view"), where the
-                plant `judges_substeps`; the least of a step counts. "": it is not asked there.
+            between: Measure the env at physics substeps, too, where the plant `judges_substeps`; the least of a
+                step counts. The `View` has no observation there.
         """
-
-    def warn_of_substeps(self, why: str) -> None:
-        """Say that a measure is not taken at the physics substeps, and what takes it there."""
-        warnings.warn(
-            f"PredictiveShield judges h at the ends of control steps alone, since {why}: each has {self.substeps} "
-            "physics substeps, and between its ends h may be lost without a flag. Keep a margin for that, or take "
-            "JointSpeedLimit, JointPositionLimit, SpeedLimit, Workspace or another constraint that forecasts every "
-            "substep",
-            stacklevel=2,
-        )
 
     @abstractmethod
     def margins(self, measure: Measure, horizon: int) -> Array:

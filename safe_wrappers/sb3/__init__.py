@@ -8,11 +8,9 @@ except ImportError as missing:
 
 from safe_wrappers.sb3.callbacks import (
     InterventionCallback,
-    InterventionEvalCallback,
     LagrangianMultiplier,
     MarginCurriculum,
 )
-from safe_wrappers.sb3.gymnasium_vec_env import GymnasiumVecEnv
 from safe_wrappers.sb3.replay_buffers import (
     ExecutedActionDictReplayBuffer,
     ExecutedActionHerReplayBuffer,
@@ -23,9 +21,7 @@ __all__ = [
     "ExecutedActionDictReplayBuffer",
     "ExecutedActionHerReplayBuffer",
     "ExecutedActionReplayBuffer",
-    "GymnasiumVecEnv",
     "InterventionCallback",
-    "InterventionEvalCallback",
     "LagrangianMultiplier",
     "MarginCurriculum",
 ]

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -12,7 +12,6 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.sb3.gymnasium_vec_env import GymnasiumVecEnv
 
 
 class InterventionCallback(BaseCallback):
@@ -38,21 +37,12 @@ class InterventionCallback(BaseCallback):
     def _on_step(self) -> bool:
         log_steps(self.logger, self.locals["infos"])
         for info in self.locals["infos"]:
-            log_episode(self.logger, info, "interventions/")
+            for key, value in info.get(keys.EPISODE_SUMMARY, {}).items():
+                # SB3 already logs length and return of an episode as rollout/ep_len_mean and ep_rew_mean.
+                if key not in ("length", "return"):
+                    name = "rate" if key == "intervention_rate" else key
+                    self.logger.record_mean(f"interventions/{name}", float(value))
         return True
-
-
-class InterventionEvalCallback(EvalCallback):
-    """Logs `RecordInterventions`' episode values under `eval/interventions/`, beside `eval/mean_reward`.
-
-    Same arguments as SB3's `EvalCallback`, which dumps the log before any child callback runs.
-    """
-
-    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        # SB3's hook into `evaluate_policy`, called at every step of every evaluation env, before the dump.
-        super()._log_success_callback(locals_, globals_)
-        if locals_["done"]:
-            log_episode(self.logger, locals_["info"], "eval/interventions/")
 
 
 def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:
@@ -61,14 +51,6 @@ def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:
         for key in keys.KEYS.values():
             if key.log and key.name in info and (number := key.number(info[key.name])) == number:
                 logger.record_mean(f"interventions/step_{key.log}", number)
-
-
-def log_episode(logger: Logger, info: Mapping[str, Any], prefix: str) -> None:
-    """Adds an episode's summary, if this info has one, to the logger's running means."""
-    for key, value in info.get(keys.EPISODE_SUMMARY, {}).items():
-        # SB3 already logs length and return of an episode as rollout/ep_len_mean and ep_rew_mean.
-        if key not in ("length", "return"):
-            logger.record_mean(prefix + ("rate" if key == "intervention_rate" else key), float(value))
 
 
 class LagrangianMultiplier(BaseCallback):
@@ -87,7 +69,6 @@ class LagrangianMultiplier(BaseCallback):
     Args:
         cost_limit: Cost per episode that is allowed, at least 0.
         rate: Of the multiplier, in reward per cost, for each unit of cost above the limit. Above 0.
-        initial: The multiplier at the start, reward per cost, at least 0.
 
     Raises:
         ConfigurationError: Numbers outside these ranges; in training: an env that reports no cost or one that is
@@ -102,16 +83,15 @@ class LagrangianMultiplier(BaseCallback):
         >>> _ = model.learn(128, callback=LagrangianMultiplier(cost_limit=25.0))
     """
 
-    def __init__(self, cost_limit: float, rate: float = 1e-3, initial: float = 0.0) -> None:
+    def __init__(self, cost_limit: float, rate: float = 1e-3) -> None:
         super().__init__()
         self.cost_limit = non_negative("cost_limit", cost_limit, "cost per episode")
         self.rate = positive("rate", rate, "reward per cost, for each unit of cost")
-        self.initial = non_negative("initial", initial, "reward per cost")
 
     @property
     def multiplier(self) -> float:
         """Reward per cost."""
-        return float(getattr(self.model, "lagrangian_multiplier", self.initial))
+        return float(getattr(self.model, "lagrangian_multiplier", 0.0))
 
     def _on_training_start(self) -> None:
         if isinstance(self.model, OffPolicyAlgorithm) and self.model.get_vec_normalize_env() is not None:
@@ -194,11 +174,6 @@ class MarginCurriculum(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._margin = None
-        if isinstance(self.training_env.unwrapped, GymnasiumVecEnv):
-            raise ConfigurationError(
-                "MarginCurriculum changes the filters of single envs, and a GymnasiumVecEnv decides for all at once;"
-                " use a DummyVecEnv of protected envs"
-            )
         if not self.training_env.has_attr("added_margin"):
             raise ConfigurationError(
                 "MarginCurriculum needs envs in a CBFActionFilter, such as sw.protect(env)"

@@ -1,11 +1,9 @@
 """Replay buffers with the action that the filter executed."""
 
-import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Final
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -55,9 +53,8 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         buffer_size: Env steps to keep, over all envs; a changed step counts once.
         observation_space: Not a Dict; for those there is `ExecutedActionDictReplayBuffer`.
         action_space: A bounded Box.
-        device, n_envs, handle_timeout_termination, more: As in SB3.
-        optimize_memory_usage: As in SB3, mode "safe_action" only.
-        mode: "safe_action" or "both".
+        mode: "safe_action" or "both"; for "both" without `optimize_memory_usage`.
+        args, more: As in SB3.
 
     Attributes:
         actions, rewards: In mode "both" the policy's actions and penalised rewards.
@@ -73,23 +70,20 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
     """
 
     modes: ClassVar[Sequence[str]] = ("safe_action", "both")
-    others: ClassVar[str] = "the naive learner and the adaption penalty alone use SB3's own ReplayBuffer"
 
     def __init__(
         self,
         buffer_size: int,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
-        device: th.device | str = "auto",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
-        handle_timeout_termination: bool = True,
+        *args: Any,
         mode: str = "safe_action",
         **more: Any,
     ) -> None:
         if mode not in self.modes:
             expected = " or ".join(map(repr, self.modes))
-            raise ConfigurationError(f"mode: expected {expected}, got {mode!r}; {self.others}")
+            others = "the naive learner and the adaption penalty alone use SB3's own buffer"
+            raise ConfigurationError(f"mode: expected {expected}, got {mode!r}; {others}")
         if not (isinstance(action_space, spaces.Box) and action_space.is_bounded()):
             raise ConfigurationError(f"expected a bounded Box of actions, got {action_space}")
         if isinstance(observation_space, spaces.Dict) != isinstance(self, DictReplayBuffer):
@@ -97,11 +91,9 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
                 "use ExecutedActionDictReplayBuffer for Dict observations (with HER: ExecutedActionHerReplayBuffer)"
                 f" and ExecutedActionReplayBuffer for all others; {type(self).__name__} got {observation_space}"
             )
-        if mode == "both" and optimize_memory_usage:
+        if mode == "both" and more.get("optimize_memory_usage"):
             raise ConfigurationError("mode 'both' does not work with optimize_memory_usage; leave it out")
-        more |= {"device": device, "n_envs": n_envs, "optimize_memory_usage": optimize_memory_usage}
-        more["handle_timeout_termination"] = handle_timeout_termination
-        super().__init__(buffer_size, observation_space, action_space, **more)
+        super().__init__(buffer_size, observation_space, action_space, *args, **more)
         self.mode = mode
         self._low, self._high = action_space.low, action_space.high
         if mode == "both":
@@ -130,47 +122,38 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         if self.mode == "safe_action":
             super().add(obs, next_obs, executed, reward, done, infos)
             return
-        task = np.array([info[keys.ADAPTION_TASK_REWARD] for info in infos], dtype=np.float64)
-        self._keep(infos, executed, task, changed, finite)
+        task = reward + np.array([info[keys.ADAPTION_PENALTY] for info in infos])
+        self.executed_actions[self.pos], self.task_rewards[self.pos] = executed, task
+        self.changed[self.pos] = changed & finite
         policy = np.where(finite[:, None], policy, executed)
         super().add(obs, next_obs, policy, np.where(finite, reward, task), done, infos)
-
-    def _keep(self, infos: Infos, executed: Values, task: Values, changed: Flags, finite: Flags) -> None:
-        """Store what SB3's buffer has no place for, at the present slot."""
-        if self.mode == "both":
-            self.executed_actions[self.pos], self.task_rewards[self.pos] = executed, task
-            self.changed[self.pos] = changed & finite
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """Draws a batch, uniformly from all stored transitions, with replacement."""
         if self.mode == "safe_action":
             return super().sample(batch_size, env)
-        slots, envs, second = drawn = self._draw(batch_size)
+        slots, envs, second = self._draw(batch_size)
         rewards = np.where(second, self.task_rewards[slots, envs], self.rewards[slots, envs])
-        before, after = (picked(part, slots, envs) for part in (self.observations, self.next_observations))
-        return self._batch(drawn, before, after, rewards, env)
-
-    def _batch(self, drawn: Indices, before: Any, after: Any, rewards: Any, env: VecNormalize | None) -> Any:
-        """The drawn transitions with these observations and rewards, as SB3 takes them."""
-        slots, envs, second = drawn
-        actions = self.actions[slots, envs]
-        if self.mode == "both":
-            actions = np.where(second[:, None], self.executed_actions[slots, envs], actions)
+        executed = self.executed_actions[slots, envs]
+        actions = np.where(second[:, None], executed, self.actions[slots, envs])
         dones = self.dones[slots, envs] * (1 - self.timeouts[slots, envs])
         kind: Any = DictReplayBufferSamples if isinstance(self, DictReplayBuffer) else ReplayBufferSamples
         return kind(
-            observations=self._observed(before, env),
+            observations=self._observed(self.observations, slots, envs, env),
             actions=self.to_torch(actions),
-            next_observations=self._observed(after, env),
+            next_observations=self._observed(self.next_observations, slots, envs, env),
             dones=self.to_torch(dones.reshape(-1, 1)),
             rewards=self.to_torch(self._normalize_reward(rewards.reshape(-1, 1), env)),
         )
 
-    def _observed(self, observations: Any, env: VecNormalize | None) -> Any:
-        seen: Any = self._normalize_obs(observations, env)
-        if isinstance(seen, Mapping):
+    def _observed(self, stored: Any, slots: Indices, envs: Indices, env: VecNormalize | None) -> Any:
+        """A copy of the observations of some slots and envs, as SB3 takes them."""
+        if isinstance(stored, Mapping):
+            picked: Any = {key: part[slots, envs] for key, part in stored.items()}
+            seen: Any = self._normalize_obs(picked, env)
             return {key: self.to_torch(value) for key, value in seen.items()}
-        return self.to_torch(seen)
+        single: Any = self._normalize_obs(stored[slots, envs], env)
+        return self.to_torch(single)
 
     def _draw(self, count: int) -> Indices:
         """Slots, envs and which of the two transitions (1 is the executed one), shape (3, count), uniformly."""
@@ -200,9 +183,9 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
                         f"env {at} has no info[{key!r}]: ExecutedActionReplayBuffer needs a CBFActionFilter inside"
                         " the env; without a filter use SB3's own ReplayBuffer"
                     )
-            if self.mode != "safe_action" and keys.ADAPTION_PENALTY not in info:
+            if self.mode == "both" and keys.ADAPTION_PENALTY not in info:
                 raise ConfigurationError(
-                    f"env {at} has no info[{keys.ADAPTION_PENALTY!r}]: mode {self.mode!r} stores a penalised"
+                    f"env {at} has no info[{keys.ADAPTION_PENALTY!r}]: mode 'both' stores a penalised"
                     " transition; wrap the env in AdaptionPenalty(env, penalty=...), or use mode 'safe_action'"
                 )
             if self.mode == "safe_action" and keys.ADAPTION_PENALTY in info:
@@ -219,29 +202,17 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         )
 
 
-def picked(stored: Any, slots: Indices, envs: Indices) -> Any:
-    """A copy of the observations of some slots and envs."""
-    if isinstance(stored, Mapping):
-        return {key: part[slots, envs] for key, part in stored.items()}
-    return stored[slots, envs]
-
-
 class ExecutedActionDictReplayBuffer(ExecutedActionReplayBuffer, DictReplayBuffer):
     """`ExecutedActionReplayBuffer` for Dict observations; same arguments and modes."""
 
 
 class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer):
-    """SB3's `HerReplayBuffer`, with the action that the filter executed and with the penalty in relabelled rewards.
+    """SB3's `HerReplayBuffer`, with the action that the filter executed.
 
     HER (Andrychowicz et al., NeurIPS 2017) replays most transitions with a goal g' that the episode did reach, and
-    the task's reward for it, r' = `compute_reward(achieved, g', info)`. Of a step that the filter changed
-
-    - mode "safe_action" replays (s, g', a_safe, s', r');
-    - mode "adaption_penalty" replays (s, g', a, s', r' - penalty), with what `AdaptionPenalty` took at the time;
-    - mode "both" replays both.
-
-    Unchanged steps are drawn as SB3 draws them, bit for bit with the same seed. The reward has to be a function of
-    the goals alone: wrappers that change rewards, such as `OcclusionPenalty`, are not in `compute_reward`.
+    the task's reward for it, r' = `compute_reward(achieved, g', info)`. Of a step that the filter changed this
+    replays (s, g', a_safe, s', r'). The reward has to be a function of the goals alone: what wrappers take off
+    rewards, `AdaptionPenalty` and `OcclusionPenalty`, is not in `compute_reward`.
 
     Example:
         >>> import gymnasium as gym, gymnasium_robotics, safe_wrappers as sw
@@ -253,73 +224,15 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
         ...     sw.protect(gym.make("FetchReach-v4")),
         ...     buffer_size=1000,
         ...     replay_buffer_class=ExecutedActionHerReplayBuffer,
-        ...     replay_buffer_kwargs={"mode": "safe_action", "n_sampled_goal": 4},
+        ...     replay_buffer_kwargs={"n_sampled_goal": 4},
         ... )
 
     Args:
         env, n_sampled_goal, goal_selection_strategy, copy_info_dict: As in `HerReplayBuffer`; SB3 passes `env`.
         args, more: The others as in `ExecutedActionReplayBuffer`; observations as in `HerReplayBuffer`.
 
-    Attributes:
-        penalties: Modes "both" and "adaption_penalty": of each step, (buffer_size, n_envs), reward.
-
     Raises:
         ConfigurationError, ActionError: As `ExecutedActionReplayBuffer`.
     """
 
-    modes: ClassVar[Sequence[str]] = ("safe_action", "both", "adaption_penalty")
-    others: ClassVar[str] = "the naive learner uses SB3's own HerReplayBuffer"
-
-    def __init__(self, *args: Any, **more: Any) -> None:
-        super().__init__(*args, **more)
-        if self.mode != "safe_action":
-            # In double precision, so that a penalty comes off a relabelled reward as it came off the task's own.
-            self.penalties = np.zeros(self.rewards.shape)
-
-    def _keep(self, infos: Infos, executed: Values, task: Values, changed: Flags, finite: Flags) -> None:
-        super()._keep(infos, executed, task, changed, finite)
-        self.penalties[self.pos] = np.where(finite, [info[keys.ADAPTION_PENALTY] for info in infos], 0.0)
-
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
-        """Draws a batch, uniformly from all transitions of whole episodes; most of them get a new goal.
-
-        Raises:
-            RuntimeError: No episode has ended yet (SB3's: give a larger `learning_starts`).
-        """
-        if self.mode == "safe_action" or not self.ep_length.any():
-            return HerReplayBuffer.sample(self, batch_size, env)
-        slots, envs, _ = drawn = self._draw(batch_size)
-        replayed = int(self.her_ratio * batch_size)
-        goals = self._sample_goals(slots[:replayed], envs[:replayed])
-        # SB3 puts the transitions with their own goals first.
-        slots, envs, second = drawn = np.roll(drawn, -replayed, axis=1)
-        real = batch_size - replayed
-        before, after = (picked(part, slots, envs) for part in (self.observations, self.next_observations))
-        before["desired_goal"][real:] = after["desired_goal"][real:] = goals
-        rewards = self.rewards[slots, envs]
-        if self.mode == "both":
-            rewards = np.where(second, self.task_rewards[slots, envs], rewards)
-        penalties = np.where(second, 0.0, self.penalties[slots, envs])
-        relabelled = self._task_rewards(after["achieved_goal"][real:], goals, slots[real:], envs[real:])
-        rewards[real:] = relabelled - penalties[real:]
-        return self._batch(drawn, before, after, rewards, env)
-
-    def _draw(self, count: int) -> Indices:
-        """Slots, envs and which of the two transitions, uniformly from whole episodes, by SB3's own random calls."""
-        whole = self.ep_length > 0
-        first = np.flatnonzero(whole)
-        second = np.flatnonzero(whole & self.changed) if self.mode == "both" else first[:0]
-        drawn = np.random.choice(len(first) + len(second), size=count, replace=True)
-        slots, envs = np.unravel_index(np.concatenate([first, second])[drawn], whole.shape)
-        return np.stack([slots, envs, drawn >= len(first)])
-
-    def _task_rewards(self, achieved: Values, goals: Values, slots: Indices, envs: Indices) -> Values:
-        """The task's rewards for having reached `achieved`, (n,)."""
-        if self.env is None:
-            raise ConfigurationError(
-                "this buffer was loaded and has no env to relabel rewards with: call set_env(vec_env), or load it"
-                " with the model's load_replay_buffer"
-            )
-        infos: Any = copy.deepcopy(self.infos[slots, envs]) if self.copy_info_dict else [{} for _ in slots]
-        (rewards,) = self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])
-        return np.asarray(rewards, dtype=np.float64)
+    modes: ClassVar[Sequence[str]] = ("safe_action",)

@@ -168,16 +168,21 @@ class CBFActionFilter(LayerWrapper):
         self.started = self._observed = False
         self.filter.start()
         margin, unsafe = self._margin()
-        report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
+        report = self._quiet_report()
         report[keys.CBF_MARGIN] = margin
         report[keys.CBF_UNSAFE] = unsafe
-        report[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
         # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
         report[keys.PROPOSED_ACTION] = np.zeros(self._shape)
         report[keys.EXECUTED_ACTION] = np.zeros(self._shape)
-        report[keys.CBF_STAGE] = int(Stage.PROPOSAL)
         report |= self.filter.info(None, None)
         self.started = True
+        return report
+
+    def _quiet_report(self) -> dict[str, Any]:
+        """The info keys of a step that changes nothing, but for margin and actions."""
+        report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
+        report[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
+        report[keys.CBF_STAGE] = int(Stage.PROPOSAL)
         return report
 
     def step(self, action: Any) -> Step:

@@ -14,7 +14,7 @@ from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
-from safe_wrappers.plants.env_checks import check_actions, check_timing, reward_numbers
+from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
@@ -70,8 +70,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         plant: For the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
-        limits: Of the machine, which every blend keeps between its ends, too: it is stretched until it does, or its
-            chunk is refused.
+        limits: Of the machine, which every "quintic" keeps between its ends, too: it is stretched until it does, or
+            its chunk is refused.
         flexible: A `plants.rigid_model_check`, or "auto", which makes one now: where it finds that springs ring on,
             `blend_time` and `rate_limit` are so strict that a blend over the whole action range leaves at most 1 % of
             the energy that a step of torque leaves in the springs, and smoothsteps that the next seam comes before
@@ -191,7 +191,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             executed = np.array(info.get(keys.EXECUTED_ACTION, command.control), dtype=np.float64)
             self._fallback.executed(executed)
             self._executed.append(executed)
-            total = total + reward_numbers(reward)
+            total += float(reward)
             infos.append(dict(info))  # the env may use the same one again
             commands.append(command)
             if terminated or truncated:
@@ -205,10 +205,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     def now_s(self) -> float:
         """Seconds of the episode so far, on the clock of control steps."""
         return self._queue.now * self.control_dt
-
-    def switch(self, source: str) -> None:
-        """Name the source of the chunks from now on; the change is blended, from the last command."""
-        self._queue.switch(source)
 
     def _springs(self, flexible: Any) -> RigidModelCheck | None:
         """What the user or the env's model says about springs that ring on; None where there are none."""

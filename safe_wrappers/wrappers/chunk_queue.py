@@ -50,7 +50,7 @@ class ChunkQueue:
     """Which command comes next, counted in control steps.
 
     A chunk that was observed at step k and is there at step t is consumed from its entry t - k on. A chunk of one has
-    no left-over to blend with: only a change of its source (`switch`), to and from the fallback too, is faded over.
+    no left-over to blend with: only a change to and from the fallback is faded over.
 
     Args:
         space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
@@ -86,22 +86,18 @@ class ChunkQueue:
         self._low = np.maximum(np.asarray(space.low, np.float64), -largest)
         self._high = np.minimum(np.asarray(space.high, np.float64), largest)
         self._none = np.zeros((0, self._low.size))
-        self._source = ""
         self.reset()
 
     def reset(self) -> None:
-        """A new episode: nothing sent, nothing planned; the source stays the one that was named last."""
+        """A new episode: nothing sent, nothing planned."""
         self.now = 0
         self._observed = -1
         self._sent = self._none
         self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
         self._asked = self._none  # the chunk in force as it came; it ends with the plan
         self._coming: list[Chunk] = []
-        self._in_force = self._source
-        self._acting: str | None = None
-        self._fade: tuple[Array, int, int] | None = (
-            None  # a change of source: the latched command, steps, done
-        )
+        self._starved: bool | None = None
+        self._fade: tuple[Array, int, int] | None = None  # the latched command, steps, done
 
     def submit(self, commands: Array, observed: int, due: int) -> bool:
         """A chunk, shape (h, m), observed at a control step, is on its way; False if it is refused.
@@ -115,10 +111,6 @@ class ChunkQueue:
         boxed = np.clip(commands, self._low, self._high)
         self._coming.append(Chunk(boxed, observed, due))
         return True
-
-    def switch(self, source: str) -> None:
-        """Chunks that take over from now on are somebody else's; the change is blended, from the last command."""
-        self._source = source
 
     def next(self, admits: Callable[[Array], bool], fallback: Callable[[], Array]) -> Command:
         """The command of this control step.
@@ -140,12 +132,11 @@ class ChunkQueue:
         starved = control is None
         if control is None:
             control = np.clip(fallback(), self._low, self._high)
-        acting = None if starved else self._in_force
-        if acting != self._acting and len(self._sent) and not seam and self._blend in BLENDS:
+        if starved != self._starved and len(self._sent) and not seam and self._blend in BLENDS:
             # A longer chunk that takes over blends by itself; everything else starts from the last command.
             blend_steps = self._fade_steps(control)
             self._fade = (self._sent[-1], blend_steps, 0)
-        self._acting = acting
+        self._starved = starved
         sent, held = self._sendable(self._faded(control))
         self._sent = np.concatenate([self._sent[-LOOK_BACK + 1 :], sent[None].astype(np.float64)])
         self.now += 1
@@ -172,7 +163,7 @@ class ChunkQueue:
             if joined is None:
                 return None
         self._coming = [c for c in self._coming if c.observed > chunk.observed]
-        self._observed, self._in_force = chunk.observed, self._source
+        self._observed = chunk.observed
         if joined is None:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
             return self._blend == REPLACE and len(self._sent) > 0, 0
@@ -190,16 +181,17 @@ class ChunkQueue:
             fresh = np.clip(fresh, self._low, self._high)
             prior = drawn_out(prior, len(fresh))
         blend: Any = self._blend  # checked by the wrapper
-        motion = self._sent, prior, fresh
         return join(
-            *motion,
+            self._sent,
+            prior,
+            fresh,
             self._control_dt,
             blend=blend,
             fewest=self._fewest,
             rate_limit=self._rate_limit,
             low=self._low,
             high=self._high,
-            accepts=None if self._check is None else partial(self._check.accepts, blend, *motion),
+            accepts=None if self._check is None else partial(self._check.accepts, self._sent, fresh),
             hold_back=not self._overlap,
         )
 
@@ -267,21 +259,14 @@ class ChunkSizes(NamedTuple):
             raise ConfigurationError(f"steps_per_entry = {apart}: one entry leads to no other")
         size = (entries - 1) * apart + 1
         delay = _delay(inference_delay)
-        if horizon > size:
-            has = _size(entries, apart, "")
-            raise ConfigurationError(
-                f"execution_horizon = {horizon} is more than {has}: choose it up to {size}"
-            )
         if not delay[1] <= horizon <= size - delay[1]:
-            late, between = (
-                delay[1],
-                f"choose s from {max(delay[1], 1)} to {size - delay[1]}, or longer chunks",
+            given = f"inference_delay d = {delay[1]}, execution_horizon s = {horizon}, chunk_size {entries}"
+            fits = (
+                f"choose s from {max(delay[1], 1)} to {size - delay[1]}"
+                if 2 * delay[1] < size
+                else "no s fits"
             )
-            fits = between if 2 * late <= size else f"no s fits, choose H >= {2 * late}"
-            raise ConfigurationError(
-                f"inference_delay d = {late}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} "
-                f"break d <= s <= H - d: a late chunk has {max(size - late, 0)} commands left; {fits}"
-            )
+            raise ConfigurationError(f"{given}, H = {size} control steps: d <= s <= H - d must hold; {fits}")
         return cls(entries, apart, size, horizon, delay)
 
 
@@ -306,6 +291,8 @@ def blend_bounds(
                 f"{baseline}: blend_time, rate_limit, limits and flexible are for {bounded}"
             )
         return fewest, rate_limits
+    if limits is not None and blend != "quintic":
+        raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
     if blend_time is not None:
         fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
@@ -342,12 +329,6 @@ def bounds_for_springs(
     own = np.full(space.shape, np.inf) if rate_limit is None else _rate_limits(rate_limit, space.shape[0])
     rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / shortest, own)
     return max(shortest, blend_time or 0.0), rates.tolist() if np.isfinite(rates).all() else rate_limit
-
-
-def _size(entries: int, apart: int, letter: str) -> str:
-    if apart == 1:
-        return f"chunk_size{letter} = {entries}"
-    return f"chunk_size {entries} at {apart} control steps per entry, H = {(entries - 1) * apart + 1} control steps"
 
 
 def _delay(value: Any) -> tuple[int, int]:

@@ -10,7 +10,6 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, whole_number
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards, reward_numbers
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
@@ -52,7 +51,7 @@ class ActionRepeat(LayerWrapper):
         infos = []
         for _ in range(self.repeat):
             observation, reward, terminated, truncated, info = self._pass_on(action)
-            total = total + reward_numbers(reward)
+            total += float(reward)
             infos.append(info)
             if terminated or truncated:
                 break
@@ -65,16 +64,15 @@ class AdaptionPenalty(LayerWrapper):
     The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty + per_correction * c` for a
     correction c = |a_safe - a| (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023).
 
-    Wrappers that scale or clip rewards belong inside, and `RecordInterventions` and SB3's `Monitor` too. With
-    hindsight replay use `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the penalty off relabelled
-    rewards too.
+    Wrappers that scale or clip rewards belong inside, and `RecordInterventions` and SB3's `Monitor` too. Not
+    for hindsight replay, which asks the task for rewards anew.
 
     Args:
         env: With a `CBFActionFilter` inside.
         penalty: For every changed step, in units of the task's reward, at least 0.
         per_correction: For each unit of `cbf/correction` (L2 norm, action units) of a changed step, at least 0.
 
-    Info, at every step: ``adaption/penalty`` and ``adaption/task_reward`` (float), whose difference is the reward.
+    Info, at every step: ``adaption/penalty`` (float); with it added back, the reward is the task's own.
 
     Raises:
         ConfigurationError: No filter inside, a second AdaptionPenalty, no penalty, or one that is negative.
@@ -84,16 +82,15 @@ class AdaptionPenalty(LayerWrapper):
         >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
         >>> env = sw.AdaptionPenalty(env, penalty=0.1)
         >>> _ = env.reset(seed=0)
-        >>> _, reward, _, _, info = env.step(env.action_space.sample())
-        >>> float(reward) == info["adaption/task_reward"] - info["adaption/penalty"]
-        True
+        >>> info = env.step(env.action_space.high)[4]
+        >>> bool(info["cbf/intervened"]), info["adaption/penalty"]
+        (True, 0.1)
     """
 
     layer: ClassVar = Layer.ADAPTION
 
     def __init__(self, env: Env, penalty: float = 0.0, per_correction: float = 0.0) -> None:
         LayerWrapper.__init__(self, env)
-        refuse_vector_rewards(env, "AdaptionPenalty")
         if filter_inside(env) is None:
             example = "AdaptionPenalty(sw.protect(env), penalty=...)"
             raise ConfigurationError(f"AdaptionPenalty needs a CBFActionFilter inside: {example}")
@@ -112,14 +109,13 @@ class AdaptionPenalty(LayerWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Resets the env; its info holds the keys of a step, as 0."""
         observation, info = self.env.reset(seed=seed, options=options)
-        info[keys.ADAPTION_PENALTY] = info[keys.ADAPTION_TASK_REWARD] = 0.0
+        info[keys.ADAPTION_PENALTY] = 0.0
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Steps the env; an unchanged step's reward passes through untouched."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         penalty = 0.0
-        info[keys.ADAPTION_TASK_REWARD] = one_reward(reward, "AdaptionPenalty")
         changed, correction = info[keys.CBF_INTERVENED], info[keys.CBF_CORRECTION]
         if info.get(keys.CBF_ESCAPING, False):  # StuckEscape gave the filter another action than this one
             changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))

@@ -1,7 +1,7 @@
 """LeaseExpiry: a command is in force only while the machine could still stop behind it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from numpy.typing import NDArray
@@ -10,14 +10,13 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.handover.smoothstep import smoothstep
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.admission import Admission, Measured
+from safe_wrappers.wrappers.admission import Admission
 from safe_wrappers.wrappers.commands import CommandGate, FallbackController
 from safe_wrappers.wrappers.layer import Env, Reset, Step, action_array, whole_steps
 from safe_wrappers.wrappers.stopping_budget import BoundBudget, BudgetLike, budget_from
@@ -46,15 +45,13 @@ class LeaseExpiry(CommandGate):
         min_lease_s: Every fresh command gets a lease of at least so long, s; above 0 only with a CBFActionFilter
             inside. Behind a `ChunkHandover` give the time of one `execution_horizon`.
         blend_time: s, of the way back from the fallback to a fresh command.
-        motion_limits: For actions that are position setpoints: {"max_acceleration": ..., "max_speed": ...,
-            "max_jerk": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
-        measured: For `motion_limits`: a function of the env that returns positions, velocities and, for an arrival at
-            rest with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
+        motion_limits: For actions that are setpoints of the lengths of MuJoCo's actuators: {"max_acceleration": ...,
+            "max_speed": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
         fallback: "brake", "hold", "zero", or a function of the plant.
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
 
-    Info, at every step: ``lease/remaining_s`` (float), ``lease/expired``, ``lease/refused``, ``lease/braking``
+    Info, at every step: ``lease/remaining_s`` (float), ``lease/refused``, ``lease/braking``
     (bool); without a filter inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
@@ -90,7 +87,6 @@ class LeaseExpiry(CommandGate):
         min_lease_s: float = 0.0,
         blend_time: float = 0.1,
         motion_limits: Mapping[str, Any] | None = None,
-        measured: Measured | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
         control_dt: float | None = None,
@@ -119,11 +115,7 @@ class LeaseExpiry(CommandGate):
         plant = self._budget.plant_of(plant)
         self._fallback = FallbackController(env, fallback, plant, self._budget.constraint)
         self._budget.bind(plant, self._fallback.constraint)
-        if motion_limits is None and measured is not None:
-            raise ConfigurationError("measured is for motion_limits, which is missing: give both, or neither")
-        self._admission: Admission | None = None
-        if motion_limits is not None:
-            self._admission = Admission(env, motion_limits, measured, self._low.size)
+        self._admission = None if motion_limits is None else Admission(env, motion_limits, self._low.size)
         self._start({})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -134,7 +126,7 @@ class LeaseExpiry(CommandGate):
         self._budget.reset()
         self._start(info)
         info[keys.LEASE_REMAINING_S] = 0.0
-        info.update(dict.fromkeys((keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
+        info.update(dict.fromkeys((keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
         self.started = True
         return observation, info
 
@@ -155,7 +147,6 @@ class LeaseExpiry(CommandGate):
         if fresh:
             refused |= not self._grant(now)
         covered = now + self.control_dt <= self._until_s + self._same_s
-        expired = not covered and self._until_s > -math.inf
         if covered:
             if arrived:
                 self._command = given
@@ -164,21 +155,15 @@ class LeaseExpiry(CommandGate):
             # The env gets a copy as well: it may scale in place what is still in force.
             sent = self._command.copy() if self._blend is None else self._blended(self._command)
         else:
-            self._until_s = -math.inf
             self._braking, self._blend = True, None
             sent = self._fallback.command().astype(self._dtype)
         self._executed, answer = self._execute(sent)
         self._observed_s = self.now_s
         info = answer[4]
         info[keys.LEASE_REMAINING_S] = max(self._until_s - self.now_s, 0.0)
-        info[keys.LEASE_EXPIRED] = expired
         info[keys.LEASE_REFUSED] = refused
         info[keys.LEASE_BRAKING] = not covered
         return answer
-
-    def look(self) -> Sequence[BoundConstraint]:
-        """The constraint that leases are worked out from, in the env's present state, for who looks on."""
-        return self._budget.look()
 
     def admits(self, end: Array, steps: int) -> bool:
         """Whether the end of a chunk of setpoints is within `motion_limits`; a refusal is in the next step's info."""

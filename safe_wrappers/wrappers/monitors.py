@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.control.contact.impact import complementarity_residuals
 from safe_wrappers.control.legged.support import support_distances
@@ -81,7 +80,7 @@ class StepMonitor(LayerWrapper, ABC):
 
 
 class ContactMonitor(StepMonitor):
-    """Reports forces, impulses and violations of a MuJoCo env's contacts; changes nothing.
+    """Reports forces and violations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
     of its own, from the state before it and with the inputs that the env has left. An env that changes its inputs or
@@ -93,8 +92,8 @@ class ContactMonitor(StepMonitor):
         against: Names of what they touch, "world" among them; None is everything. A contact counts if one of its
             bodies is in each list.
 
-    Info, at every step: ``contact/peak_force`` (N), ``contact/impulse`` (N s), ``contact/penetration`` (m),
-    ``contact/residual`` (N m; 0 for rigid contacts), NaN where the simulation's contacts are not finite, and
+    Info, at every step: ``contact/peak_force`` (N), ``contact/penetration`` (m), ``contact/residual`` (N m; 0 for
+    rigid contacts), NaN where the simulation's contacts are not finite, and
     ``contact/partial`` (bool), see `safe_wrappers.info`. After a reset they are 0 and False.
 
     Raises:
@@ -149,7 +148,7 @@ class ContactMonitor(StepMonitor):
             self._contacts = Contacts(model, self.bodies, self.against)
         self._gaps: list[float] = []
         self._forces: list[float] = []
-        self._impulse = self._peak = 0.0
+        self._peak = 0.0
         self._peak_bodies: tuple[int, int] | None = None
 
     def _visit(self, data: mujoco.MjData, time_s: float) -> None:
@@ -157,24 +156,22 @@ class ContactMonitor(StepMonitor):
         for bodies, gap, force in self._contacts.read(data):
             self._gaps.append(gap)
             self._forces.append(force)
-            self._impulse += force * time_s
             pairs[bodies] = pairs.get(bodies, 0.0) + force
         for bodies, force in pairs.items():
             if force > self._peak:
                 self._peak, self._peak_bodies = force, bodies
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
-        peak, impulse, depth, residual = self._peak, self._impulse, 0.0, 0.0
+        peak, depth, residual = self._peak, 0.0, 0.0
         if self._gaps:
             gaps, forces = np.array(self._gaps), np.array(self._forces)
             if np.isfinite(gaps).all() and np.isfinite(forces).all():
                 residuals = complementarity_residuals(gaps, forces)
                 depth, residual = float(residuals.penetration.max()), float(residuals.product.max())
             else:
-                peak = impulse = depth = residual = math.nan
+                peak = depth = residual = math.nan
         return {
             keys.CONTACT_PEAK_FORCE: peak,
-            keys.CONTACT_IMPULSE: impulse,
             keys.CONTACT_PENETRATION: depth,
             keys.CONTACT_RESIDUAL: residual,
         }
@@ -194,18 +191,16 @@ class BalanceMonitor(StepMonitor):
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
-        friction_share: Of the model's friction coefficient that is taken as the whole, in (0, 1].
-        inset: Kept inside the support polygon, m.
         bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves.
 
     Info, at every step: ``balance/linear_momentum`` (kg m/s), ``balance/angular_momentum`` (kg m^2/s), arrays (3,),
-    ``balance/friction_used``, ``balance/zmp_margin`` (m), ``balance/airborne``, and ``balance/partial`` (bool), see
-    `safe_wrappers.info`. After a reset they are 0 and False, the margin NaN.
+    ``balance/friction_used``, ``balance/zmp_margin`` (m), and ``balance/partial`` (bool), see `safe_wrappers.info`.
+    After a reset they are 0 and False, the margin NaN.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.
         UnknownNameError: No body of that name; the message lists those there are.
-        ConfigurationError: A share or an inset out of its range, bodies that do not move, or a wrong order.
+        ConfigurationError: Bodies that do not move, or a wrong order.
 
     Source: appendix "Centroidal Dynamics and Floating-Base Control".
 
@@ -214,24 +209,18 @@ class BalanceMonitor(StepMonitor):
         >>> env = sw.BalanceMonitor(gym.make("Ant-v5"))
         >>> _ = env.reset(seed=0)
         >>> infos = [env.step(0 * env.action_space.low)[4] for _ in range(20)]
-        >>> infos[0]["balance/airborne"], infos[-1]["balance/airborne"]
-        (1.0, 0.0)
+        >>> infos[0]["balance/friction_used"], infos[-1]["balance/friction_used"] > 0.0
+        (0.0, True)
     """
 
     partial: ClassVar = keys.BALANCE_PARTIAL
 
-    def __init__(
-        self, env: Env, friction_share: float = 1.0, inset: float = 0.0, bodies: Sequence[str] | None = None
-    ) -> None:
+    def __init__(self, env: Env, bodies: Sequence[str] | None = None) -> None:
         StepMonitor.__init__(self, env)
         raw: Any = env.unwrapped
-        self.friction_share = positive("friction_share", friction_share, "shares of the model's friction")
-        if self.friction_share > 1.0:
-            raise ConfigurationError(f"friction_share is in (0, 1], got {friction_share}")
-        self.inset = non_negative("inset", inset, "m")
         self._robot = _Robot(raw.model, bodies)
         self.bodies = None if bodies is None else list(bodies)
-        self._record({"friction_share": self.friction_share, "inset": self.inset, "bodies": self.bodies})
+        self._record({"bodies": self.bodies})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env; its info holds the keys of a step, as 0."""
@@ -260,16 +249,13 @@ class BalanceMonitor(StepMonitor):
         if not found.steps:
             return dict(_NOTHING)
         normal, tangential = normal_and_tangential(found.force, found.normal)
-        held = self.friction_share * found.friction * normal
+        held = found.friction * normal
         loaded = (normal >= PRESSING * self._robot.weight_n()) & (held > 0.0)
         used = np.linalg.norm(tangential[loaded], axis=1) / held[loaded]
         distances = support_distances(found.step, found.point, found.normal, found.force)
         return {
             keys.BALANCE_FRICTION_USED: float(used.max(initial=0.0)),
-            keys.BALANCE_ZMP_MARGIN: float(distances.min()) - self.inset
-            if distances.size
-            else keys.NOT_JUDGED,
-            keys.BALANCE_AIRBORNE: (found.steps - np.unique(found.step).size) / found.steps,
+            keys.BALANCE_ZMP_MARGIN: float(distances.min()) if distances.size else keys.NOT_JUDGED,
         }
 
 
@@ -277,7 +263,6 @@ _MOMENTA: Final = (keys.BALANCE_LINEAR_MOMENTUM, keys.BALANCE_ANGULAR_MOMENTUM)
 _NOTHING: Final = {
     keys.BALANCE_FRICTION_USED: 0.0,
     keys.BALANCE_ZMP_MARGIN: keys.NOT_JUDGED,
-    keys.BALANCE_AIRBORNE: 0.0,
 }
 
 

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
-from safe_wrappers.control.estimation.covariance import checked_covariance, checked_noise
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.dead_reckoning import (
     DeadReckoning,
     from_sensor,
@@ -38,7 +37,6 @@ class Imu:
         gyro_std: Of the noise of a control step's mean turn rate, and of that at its end, rad/s.
         fix_every_s: How often the true pose and velocity of the body are given to the reckoning, s; None: at a reset
             alone.
-        lever_arm: Whether the reckoning knows where on the body the unit sits; False takes the body's origin.
 
     Raises:
         ConfigurationError: A number outside its range.
@@ -48,7 +46,6 @@ class Imu:
     accelerometer_std: float = 0.0
     gyro_std: float = 0.0
     fix_every_s: float | None = None
-    lever_arm: bool = True
 
     def __post_init__(self) -> None:
         if not isinstance(self.site, str):
@@ -56,7 +53,6 @@ class Imu:
         check_fields(self, non_negative, ["accelerometer_std"], "m/s^2")
         check_fields(self, non_negative, ["gyro_std"], "rad/s")
         check_fields(self, positive, ["fix_every_s"], "s")
-        self.lever_arm = true_or_false("lever_arm", self.lever_arm)
 
 
 class EgoMotion(DeadReckoning):
@@ -81,8 +77,7 @@ class EgoMotion(DeadReckoning):
             raise ConfigurationError(f"the IMU's site {imu.site!r} is on the body {where}")
         axes = np.zeros(9)
         mujoco.mju_quat2Mat(axes, model.site_quat[self._site])
-        arm = model.site_pos[self._site] if imu.lever_arm else np.zeros(3)
-        super().__init__(rigid_transform(axes.reshape(3, 3), arm), model.opt.gravity)
+        super().__init__(rigid_transform(axes.reshape(3, 3), model.site_pos[self._site]), model.opt.gravity)
         self.specific_force = self.rate = np.zeros(3)
         self._since_fix_s = 0.0
         self._at_site = np.zeros(3), np.eye(3)
@@ -145,12 +140,8 @@ class Sensor:
         site: name of a site, which looks along its own z.
         view_deg: Full opening angle of the cone that it sees, degrees. None: a camera's `fovy`, a site's all around.
         range_m: Farther away it sees nothing, m; None: as far as there is.
-        occluder_groups: Geom groups (0 to 5) that block its sight; None: all of them.
-        position_std: Of a measured position, m: a number for every axis, or a covariance matrix (d x d, m^2) in world
-            axes. None: it does not measure positions.
-        velocity_std: Likewise of a measured velocity, m/s and m^2/s^2. None: it does not measure velocities.
-        dropout: Probability that a measurement of what is in sight is lost, for each track and step, below 1.
-        lever_arm: Whether the estimator knows where on its body the sensor sits; False takes the body's origin.
+        position_std: Of a measured position along each axis, m. None: it does not measure positions.
+        velocity_std: Of a measured velocity along each axis, m/s. None: it does not measure velocities.
         imu: An `Imu` on the same body, from which the estimator reckons where that body is, or the dict of one; None:
             it knows.
 
@@ -162,11 +153,8 @@ class Sensor:
     site: str | None = None
     view_deg: float | None = None
     range_m: float | None = None
-    occluder_groups: Sequence[int] | None = None
-    position_std: Any = 0.05
-    velocity_std: Any = None
-    dropout: float = 0.0
-    lever_arm: bool = True
+    position_std: float | None = 0.05
+    velocity_std: float | None = None
     imu: Imu | dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -178,29 +166,19 @@ class Sensor:
                 raise ConfigurationError(f"{name} is a name, got {getattr(self, name)!r}")
         check_fields(self, positive, ["view_deg"], "degrees")
         check_fields(self, positive, ["range_m"], "m")
-        check_fields(self, non_negative, ["dropout"], "probability per step")
-        if self.dropout >= 1.0:
-            raise ConfigurationError(f"dropout is a probability below 1, got {self.dropout}")
-        if self.occluder_groups is not None:
-            self.occluder_groups = _groups(self.occluder_groups)
+        if self.position_std is not None:
+            self.position_std = positive("position_std", self.position_std, "m")
+        check_fields(self, positive, ["velocity_std"], "m/s")
         if self.position_std is None and self.velocity_std is None:
             raise ConfigurationError("the sensor measures nothing: give position_std, velocity_std or both")
-        self.lever_arm = true_or_false("lever_arm", self.lever_arm)
         if self.imu is not None:
             self.imu = settings_from(Imu, self.imu, "imu")
-        for name in ("position_std", "velocity_std"):
-            setattr(self, name, plain_numbers(getattr(self, name)))
 
     def matrices(self, coordinates: int) -> tuple[Array, Array]:
         """C (m, 2d) and the noise covariance R (m, m) for states (position, velocity) of d coordinates."""
-        state = np.eye(2 * coordinates)
-        parts = {"position_std": state[:coordinates], "velocity_std": state[coordinates:]}
-        measured = {name: part for name, part in parts.items() if getattr(self, name) is not None}
-        noise = np.zeros((coordinates * len(measured),) * 2)
-        for i, name in enumerate(measured):
-            block = slice(i * coordinates, (i + 1) * coordinates)
-            noise[block, block] = _noise(name, getattr(self, name), coordinates)
-        return np.concatenate(list(measured.values())), noise
+        stds = np.repeat(np.array([self.position_std, self.velocity_std], dtype=np.float64), coordinates)
+        measured = ~np.isnan(stds)  # None is not a number
+        return np.eye(2 * coordinates)[measured], np.diag(stds[measured] ** 2)
 
     def measured(
         self, sight: LineOfSight, d: int, truth: Array, velocities: Array | None, ego: EgoMotion | None = None
@@ -212,11 +190,11 @@ class Sensor:
         body = np.array(sight.data.xpos[sight.body])
         eye, axes = sight.position, sight.rotation
         if ego is None:
-            turned, believed = np.eye(3), eye if self.lever_arm else body
+            turned, believed = np.eye(3), eye
         else:
             # From the world's axes to where the body's believed orientation puts what is seen along them.
             turned = ego.rotation @ np.array(sight.data.xmat[sight.body]).reshape(3, 3).T
-            believed = ego.position + (turned @ (eye - body) if self.lever_arm else 0.0)
+            believed = ego.position + turned @ (eye - body)
         parts = []
         if self.position_std is not None:
             parts.append(from_sensor(to_sensor(truth, axes, eye), turned @ axes, believed)[:, :d])
@@ -233,20 +211,6 @@ class Sensor:
     def data(self) -> dict[str, Any]:
         """Plain data, from which it can be made again."""
         return asdict(self)
-
-
-def _groups(given: Any) -> list[int]:
-    groups = list(given) if isinstance(given, Sequence | np.ndarray) else []
-    if not groups or not all(isinstance(g, int | np.integer) and 0 <= g < mujoco.mjNGROUP for g in groups):
-        wanted = f"a list of geom groups, 0 to {mujoco.mjNGROUP - 1}, or None for all"
-        raise ConfigurationError(f"occluder_groups is {wanted}; got {given!r}")
-    return [int(g) for g in groups]
-
-
-def _noise(name: str, given: Any, coordinates: int) -> Array:
-    if not isinstance(given, list):
-        return positive(name, given, "m or m/s") ** 2 * np.eye(coordinates)
-    return checked_noise(f"{name} as a covariance", given, coordinates)
 
 
 def sensor_from(given: Any) -> Sensor:
@@ -268,15 +232,15 @@ class Track:
         bodies: Name of a body, or a pattern ("car*", "car[012]") for every body that fits, in the model's order.
         published: Instead of bodies: name of an attribute of the env, positions of shape (k, 2) or (k, 3), m.
         acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds
-            q t^3 / 3 to the variance of a position. A number, one per coordinate (0 along a coordinate that does not
-            wander), or a matrix, d x d. It has no default.
+            q t^3 / 3 to the variance of a position. A number, or one per coordinate (0 along a coordinate that does
+            not wander). It has no default.
         reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
         mean_velocity: m/s, one per coordinate; None: zeros.
         start_position_std: m, a number or one per coordinate.
         start_velocity_std: m/s, a number or one per coordinate.
 
     Raises:
-        ConfigurationError: Bodies and published points at once, or neither; a number or matrix out of its range.
+        ConfigurationError: Bodies and published points at once, or neither; a number out of its range.
     """
 
     bodies: str | None = None
@@ -308,7 +272,8 @@ class Track:
         mean = 0.0 if self.mean_velocity is None else self.mean_velocity
         velocity = _each("mean_velocity", mean, coordinates, "m/s", signed=True)
         reversion_s = np.inf if self.reversion_s is None else self.reversion_s
-        return Motion(_intensity(self.acceleration_noise, coordinates), reversion_s, velocity)
+        noise = np.diag(_each("acceleration_noise", self.acceleration_noise, coordinates, "m^2/s^3"))
+        return Motion(noise, reversion_s, velocity)
 
     def start(self, coordinates: int) -> Array:
         """Standard deviations of position and velocity at a reset, shape (2d,)."""
@@ -335,12 +300,6 @@ def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = Fal
     for value in () if signed else values:
         non_negative(name, value, unit)
     return values
-
-
-def _intensity(given: Any, coordinates: int) -> Array:
-    if isinstance(given, list) and any(isinstance(row, list) for row in given):
-        return checked_covariance("acceleration_noise", given, coordinates)
-    return np.diag(_each("acceleration_noise", given, coordinates, "m^2/s^3"))
 
 
 def track_from(given: Any) -> Track:

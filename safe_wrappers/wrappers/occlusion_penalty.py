@@ -13,7 +13,7 @@ from safe_wrappers.checks import Array, non_negative, positive, true_or_false
 from safe_wrappers.control.estimation.observability import unobservable_directions
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
-from safe_wrappers.plants.env_checks import one_reward, read_attribute, refuse_vector_rewards
+from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer
@@ -96,7 +96,6 @@ class OcclusionPenalty(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
-        refuse_vector_rewards(env, "OcclusionPenalty")
         raw: Any = env.unwrapped
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
             raise UnsupportedEnvError(f"OcclusionPenalty needs MuJoCo's .model and .data; {raw} has none")
@@ -134,7 +133,7 @@ class OcclusionPenalty(LayerWrapper):
         """Resolve names on a model."""
         s = self.sensor
         range_m = math.inf if s.range_m is None else s.range_m
-        self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m, s.occluder_groups)
+        self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m)
         imu = s.imu
         self.ego_motion = EgoMotion(imu, self._sight) if isinstance(imu, Imu) else None
         self._things = tracked_things(model, self.tracks, self._published)
@@ -201,7 +200,7 @@ class OcclusionPenalty(LayerWrapper):
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
         info[keys.OCCLUSION_PENALTY] = penalty
         if penalty:
-            reward = one_reward(reward, "OcclusionPenalty") - penalty
+            reward = float(reward) - penalty
         return self._observed(observation), reward, terminated, truncated, info
 
     @property
@@ -239,8 +238,6 @@ class OcclusionPenalty(LayerWrapper):
         seen = self._sight.sees(truth, self._bodies)
         # Drawn for every track, seen or not, so that the noise of one does not depend on another's sight.
         noise = self._random.draw.standard_normal((n, self._noise.shape[0])) @ self._noise_root.T
-        if self.sensor.dropout:
-            seen &= self._random.draw.random(n) >= self.sensor.dropout
         which = np.flatnonzero(seen)
         if which.size:
             among = None if velocities is None else velocities[which]

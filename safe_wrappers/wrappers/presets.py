@@ -13,9 +13,6 @@ from safe_wrappers.constraints.limits.joints import JointPositionLimit, refuse_u
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.default import own_plant
-from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.layer import Env, refuse_vector_env
 
@@ -23,22 +20,19 @@ from safe_wrappers.wrappers.layer import Env, refuse_vector_env
 class SlipLimiter(CBFActionFilter):
     """Keeps every driven wheel on what seems the stable side of its traction curve, with friction unknown.
 
-    It is `CBFActionFilter` with one `Traction`. **What it guarantees.** What `CBFActionFilter` does. **What it does
-    not.** A wheel that comes to another ground overshoots for a few control steps, which ``slip/ratio`` shows and no
-    flag marks; sideways slip is not limited. See `Traction`.
+    It is `CBFActionFilter` with one `Traction`, whose brake acts as hard as the slip limit allows. **What it
+    guarantees.** What `CBFActionFilter` does. **What it does not.** A wheel that comes to another ground overshoots
+    for a few control steps, which ``slip/ratio`` shows and no flag marks; sideways slip is not limited. See
+    `Traction`.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.
         wheels: Names of the driven wheels' hinges.
         max_slip: Largest slip ratio, normalised, in (0, 1).
         friction: Declared lower bound on the peak friction coefficient; None counts on nothing but what it measures.
-        regularization: Speed below which slip is counted against it, m/s.
-        plant: None reads the env's model.
-        fallback: As of `CBFActionFilter`. "brake" here brakes as hard as the slip limit allows.
-        margin: Slip kept free below the limit.
 
     Info, at every step: the keys of `CBFActionFilter` (``cbf/margin`` stays 0), and arrays with one entry
-    per wheel: ``slip/ratio``, ``slip/limited``, ``slip/mu_estimate``, ``slip/mu_std``.
+    per wheel: ``slip/ratio``, ``slip/mu_estimate``.
 
     Raises:
         ConfigurationError: A joint that is no driven wheel, a radius of zero, or a number out of its range.
@@ -51,7 +45,7 @@ class SlipLimiter(CBFActionFilter):
         >>> env = sw.SlipLimiter(env, wheels=["front_left", "front_right", "rear_left", "rear_right"])
         >>> _ = env.reset(seed=0)
         >>> info = env.step(env.action_space.high)[4]
-        >>> bool(info["slip/limited"].all())
+        >>> bool(info["cbf/intervened"])
         True
     """
 
@@ -61,22 +55,17 @@ class SlipLimiter(CBFActionFilter):
         wheels: Sequence[str],
         max_slip: float = 0.15,
         friction: float | None = None,
-        regularization: float = 0.5,
-        plant: Plant | None = None,
-        fallback: str | FallbackFunction = "brake",
-        margin: float = 0.0,
     ) -> None:
         arguments = dict(locals())
-        traction = Traction(wheels, max_slip, friction, regularization, margin)
-        plant = own_plant(plant)
-        self._record(arguments, wheels=list(wheels), plant=plant)
-        CBFActionFilter.__init__(self, env, [traction], plant=plant, fallback=fallback)
+        traction = Traction(wheels, max_slip, friction)
+        self._record(arguments, wheels=list(wheels))
+        CBFActionFilter.__init__(self, env, [traction])
 
 
 TOLERANCE = 0.01
 """By how much a contact force may miss its cone unless told otherwise, as a share of the robot's weight."""
 HOLDS = 3
-"""Control steps to look ahead for the joints unless told otherwise."""
+"""Control steps to look ahead for the joints, of which braking takes so many."""
 
 
 class WholeBodyFilter(CBFActionFilter):
@@ -97,18 +86,14 @@ class WholeBodyFilter(CBFActionFilter):
         friction_share: Of the model's friction coefficient that may be counted on, in (0, 1].
         joint_tolerance: How far a joint may press its stop, rad or m. None leaves the joints alone.
         zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, positive, wherever
-            there is a polygon. None sets no bound.
+            there is a polygon, for forecasts. None sets no bound.
         tolerance: By how much a forecast force may miss its cone, as a share of the robot's weight; None is 0.01.
-        bodies: Names of the bodies whose contacts count, for forecasts; None is every moving body.
-        horizon: Control steps to look ahead for the joints, for forecasts: as many as braking takes; None is 3.
-        plant: None reads the env's model.
-        fallback: As of `CBFActionFilter`.
 
-    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/contacts``, ``whole_body/cone_margin``, and for
-    forecasts with a `zmp_inset` ``whole_body/zmp_margin``.
+    Info, at every step: the keys of `CBFActionFilter`, ``whole_body/cone_margin``, and with a `zmp_inset`
+    ``whole_body/zmp_margin``.
 
     Raises:
-        ConfigurationError: A share outside (0, 1], a negative tolerance, or a body that does not move.
+        ConfigurationError: A share outside (0, 1], or a negative tolerance.
         UnsupportedEnvError: Not a MuJoCo env, or a robot that touches nothing.
 
     Example:
@@ -128,10 +113,6 @@ class WholeBodyFilter(CBFActionFilter):
         joint_tolerance: float | None = 0.1,
         zmp_inset: float | None = None,
         tolerance: float | None = None,
-        bodies: Sequence[str] | None = None,
-        horizon: int | None = None,
-        plant: Plant | None = None,
-        fallback: str | FallbackFunction = "brake",
     ) -> None:
         arguments = dict(locals())
         refuse_vector_env(env, type(self).__name__)
@@ -143,30 +124,24 @@ class WholeBodyFilter(CBFActionFilter):
             refuse_uncovered_stops(model)
             if not stops(model)[0]:
                 raise UnsupportedEnvError("no driven joint has a range: pass joint_tolerance=None")
-        elif horizon is not None:
-            raise ConfigurationError(
-                "horizon is how far joints are foreseen; joint_tolerance=None ignores them"
-            )
         constraints: list[Constraint]
         if contacts in ("pyramid", "cone"):
-            for name in ("tolerance", "bodies", "horizon"):
+            for name in ("zmp_inset", "tolerance"):
                 if arguments[name] is not None:
                     raise ConfigurationError(f'{name} is for contacts="forecast", not for {contacts!r}')
             cone: Any = "exact" if contacts == "cone" else "pyramid"
-            constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance, zmp_inset=zmp_inset)]
+            constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance)]
         elif contacts == "forecast":
             tolerance = TOLERANCE if tolerance is None else tolerance
-            constraints = [ContactFeasibility(friction_share, tolerance, bodies)]
+            constraints = [ContactFeasibility(friction_share, tolerance)]
             if zmp_inset is not None:
                 constraints.append(SupportMargin(zmp_inset))
             if joint_tolerance is not None:
                 joints, low, high = stops(model)
                 ranges = (low - joint_tolerance).tolist(), (high + joint_tolerance).tolist()
                 names = [model.joint(j).name for j in joints]
-                horizon = HOLDS if horizon is None else horizon
-                constraints.append(JointPositionLimit(*ranges, joints=names, horizon=horizon))
+                constraints.append(JointPositionLimit(*ranges, joints=names, horizon=HOLDS))
         else:
             raise UnknownNameError(f'contacts is "forecast", "pyramid" or "cone", got {contacts!r}')
-        plant = own_plant(plant)
-        self._record(arguments, bodies=None if bodies is None else list(bodies), plant=plant)
-        CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback)
+        self._record(arguments)
+        CBFActionFilter.__init__(self, env, constraints)

@@ -11,15 +11,11 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import one_reward, refuse_vector_rewards, reward_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
 
 COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
 """The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""
-
-
-_FILE: Final = "RecordInterventions(path=...), whose file has a return in a cell,"
 
 
 class _Tally:
@@ -89,16 +85,12 @@ class RecordInterventions(LayerWrapper):
     What nobody reported is not zero: it is missing in the summary, and an empty cell in the file. The same holds for
     a 0 that was not reported at every step; a count above 0 is a lower bound.
 
-    Rewards may be vectors, as mo-gymnasium's: `return` is then an array, the sum of each component. A file needs
-    rewards that are one number.
-
     Args:
         env: The env to record.
         path: A CSV file, one for each env, that gains one row per finished episode; an existing one is continued.
 
     Raises:
-        ConfigurationError: `path` is a folder, or a file with other columns, or rewards are vectors; or a
-            `ChunkHandover` inside.
+        ConfigurationError: `path` is a folder, or a file with other columns; or a `ChunkHandover` inside.
 
     Example:
         >>> import gymnasium as gym
@@ -112,13 +104,11 @@ class RecordInterventions(LayerWrapper):
     """
 
     layer: ClassVar = Layer.RECORDER
-    _return: Any  # a number, or an array where rewards are vectors
 
     def __init__(self, env: Env, path: str | os.PathLike[str] | None = None) -> None:
         LayerWrapper.__init__(self, env)
         text = None if path is None else os.fspath(path)
         if text is not None:
-            refuse_vector_rewards(env, _FILE)
             _continue_file(Path(text))
         self._record({"path": text})
         self.path = text
@@ -145,8 +135,7 @@ class RecordInterventions(LayerWrapper):
         observation, reward, terminated, truncated, info = self._pass_on(action)
         self._steps += 1
         penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
-        earned = reward_numbers(reward) if self.path is None else one_reward(reward, _FILE)
-        self._return = self._return + earned + float(penalties)
+        self._return += float(reward) + float(penalties)
         for tally in self._tallies:
             tally.add(info)
         if terminated or truncated:

@@ -10,11 +10,10 @@ from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.drawing.scene import arrows, find_renderer, put
 from safe_wrappers.drawing.strip import Strip
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import name_of, wrappers_of
+from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
-from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 
 _MODES: Final = ("rgb_array", "human")
 
@@ -23,11 +22,10 @@ class SafetyOverlay(LayerWrapper):
     """Draws what the filter inside knows and does into the env's own frames.
 
     In MuJoCo's scene, in frames and in the window: what every constraint keeps free, and the way that its backup
-    would take from here (`BoundConstraint.draw`), of a `LeaseExpiry` the clearance that its leases are worked out
-    from; the proposed action as an orange arrow and the executed one as a blue one, where it is known which way
-    an action pushes. Over the lower edge of a frame a strip: what was done to the last action, margin, lease and
-    slip as far as they are in info, a column per step as high as the margin, and the actions as bars. Envs that
-    are not MuJoCo's get the strip alone; so does an env without a filter.
+    would take from here (`BoundConstraint.draw`); the proposed action as an orange arrow and the executed one as a
+    blue one, where it is known which way an action pushes. Over the lower edge of a frame a strip: what was done to
+    the last action, margin, lease and slip as far as they are in info, a column per step as high as the margin, and
+    the actions as bars. Envs that are not MuJoCo's get the strip alone; so does an env without a filter.
 
     It only looks: actions, observations, rewards, infos and random numbers are bit for bit those without it.
 
@@ -36,11 +34,9 @@ class SafetyOverlay(LayerWrapper):
 
     Args:
         env: With a render mode "rgb_array" or "human".
-        scene: Draw marks and arrows.
-        strip: Draw the strip.
 
     Raises:
-        ConfigurationError: Another render mode or none; a window of an env that is not MuJoCo's; nothing to draw.
+        ConfigurationError: Another render mode or none; a window of an env that is not MuJoCo's.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -50,26 +46,20 @@ class SafetyOverlay(LayerWrapper):
 
     layer: ClassVar = Layer.OVERLAY
 
-    def __init__(self, env: Env, scene: bool = True, strip: bool = True) -> None:
-        arguments = dict(locals())
+    def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
         if env.render_mode not in _MODES:
             raise ConfigurationError(
                 f"SafetyOverlay draws into the frames of {name_of(env)}, whose render_mode is {env.render_mode!r}: "
                 "make the env with gym.make(..., render_mode='rgb_array'), or 'human' for a window"
             )
-        if not (scene or strip):
-            raise ConfigurationError("SafetyOverlay has nothing to draw: leave scene or strip True")
-        in_scene = find_renderer(env) is not None
-        if env.render_mode == "human" and not in_scene:
+        if env.render_mode == "human" and find_renderer(env) is None:
             raise ConfigurationError(
                 f"SafetyOverlay draws into the windows of MuJoCo envs alone, which {name_of(env)} is not: take "
                 "render_mode='rgb_array', whose frames get a strip"
             )
-        self._record(arguments)
-        self.scene, self.strip = scene, strip
+        self._record({})
         self._inside = filter_inside(env)
-        self._lease = next((inner for inner in wrappers_of(env) if isinstance(inner, LeaseExpiry)), None)
         self._strip = Strip()
         if isinstance(env.action_space, Box) and env.action_space.is_bounded():
             self._strip = Strip(np.ravel(env.action_space.low), np.ravel(env.action_space.high))
@@ -96,20 +86,16 @@ class SafetyOverlay(LayerWrapper):
         """The env's frame with the overlay, of the same shape."""
         self._prepare()
         frame = self.env.render()
-        return self._strip.on(frame) if self.strip and isinstance(frame, np.ndarray) else frame
+        return self._strip.on(frame) if isinstance(frame, np.ndarray) else frame
 
     def marks(self) -> list[Mark]:
-        """What is drawn into the scene in the present state; nothing before a reset, or without filter and lease."""
-        if self._last is None:
+        """What is drawn into the scene in the present state; nothing before a reset, or without a filter."""
+        if self._last is None or self._inside is None:
             return []
-        bound = () if self._inside is None else self._inside.look()
-        shown = list(bound)
-        for constraint in () if self._lease is None else self._lease.look():
-            if all(repr(constraint.spec) != repr(other.spec) for other in bound):  # drawn already
-                shown.append(constraint)
-        found = [mark for constraint in shown for mark in constraint.draw()]
+        bound = self._inside.look()
+        found = [mark for constraint in bound for mark in constraint.draw()]
         proposed, executed = (self._last.get(key) for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION))
-        if self._inside is not None and bound and proposed is not None and executed is not None:
+        if bound and proposed is not None and executed is not None:
             specs = [constraint.spec for constraint in bound]
             found += arrows(self._inside.plant, specs, proposed, executed)
         return found
@@ -119,9 +105,8 @@ class SafetyOverlay(LayerWrapper):
         renderer = find_renderer(self.env)
         if renderer is None:
             return
-        if self.scene:
-            put(self.marks(), renderer, str(self.render_mode))
-        if self.strip and self.render_mode == "human":
+        put(self.marks(), renderer, str(self.render_mode))
+        if self.render_mode == "human":
             viewer = renderer._get_viewer("human")
             for word in self._strip.words:
                 viewer.add_overlay(2, word, "")  # mjGRID_BOTTOMLEFT

@@ -1,7 +1,7 @@
 """StoppingBudget: what a stop inside a clearance takes, and how long any command may go on before it."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -88,14 +88,12 @@ class StoppingBudget:
         return not isinstance(self.clearance, Constraint) or self.clearance.measures_approach
 
 
-BudgetLike = StoppingBudget | dict[str, Any] | Constraint | ClearanceFunction
+BudgetLike = StoppingBudget | dict[str, Any]
 
 
 def budget_from(given: Any) -> StoppingBudget:
-    """A budget itself, from the dict of one, or from a clearance that needs no more than itself."""
-    if isinstance(given, StoppingBudget) or (isinstance(given, Mapping) and "kind" not in given):
-        return settings_from(StoppingBudget, given, "budget")
-    return StoppingBudget(given)
+    """A budget itself, or from the dict of one."""
+    return settings_from(StoppingBudget, given, "budget")
 
 
 class BoundBudget:
@@ -161,16 +159,6 @@ class BoundBudget:
         value = np.asarray(self._bound.value(), dtype=np.float64)
         self.clearance = value[value != np.inf]
         self.speed = np.zeros(self.clearance.shape)
-
-    def look(self) -> Sequence[BoundConstraint]:
-        """The constraint in the present state, for who looks on; none where that is not finite or there is none."""
-        if self._bound is None:
-            return ()
-        plant = self._bound.plant
-        count = plant.observation_id
-        self.measure()
-        plant.observation_id = count
-        return (self._bound,) if self.readable else ()
 
     @property
     def readable(self) -> bool:

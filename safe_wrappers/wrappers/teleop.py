@@ -2,7 +2,6 @@
 
 import heapq
 import math
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Final, NamedTuple
 
@@ -15,10 +14,12 @@ from safe_wrappers.wrappers.faults import OnOffProcess, probability
 from safe_wrappers.wrappers.layer import Env, WrapperRng
 from safe_wrappers.wrappers.stopping_budget import BoundBudget, BudgetLike, budget_from
 
-__all__ = ["Link", "RoundTripCeiling", "TeleopPort"]
+__all__ = ["Link", "RoundTripCeiling"]
 
 LONGEST_DELAY_S: Final = 10.0
 """What a line remembers, s."""
+_RELEASE: Final = 0.8
+"""Authority comes back only when the round trip is below this share of the ceiling."""
 
 
 @dataclass(frozen=True)
@@ -125,67 +126,38 @@ class Line:
         return found
 
 
-@dataclass(frozen=True)
-class TeleopPort:
-    """A pair of effort and flow whose product is power; plain data.
+class Port(NamedTuple):
+    """A pair of effort and flow whose product is power, as an env publishes it."""
 
-    Args:
-        flow: Entries of the action, in m/s (or rad/s).
-        effort: Entries of the observation, in N (or N m), in the same order: how the command pushes the machine now.
-        feedthrough: Change of the effort at once per change of the flow, N s/m: a damper before the machine.
-
-    Raises:
-        ConfigurationError: No entries, as many of the one as not of the other, or one twice.
-    """
-
-    flow: Sequence[int]
-    effort: Sequence[int]
-    feedthrough: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("flow", "effort"):
-            given = getattr(self, name)
-            whole = isinstance(given, Sequence) and all(
-                isinstance(i, int | np.integer) and not isinstance(i, bool) and i >= 0 for i in given
-            )
-            if not whole or not given or len(set(given)) != len(given):
-                indices = "a list of indices, each at least 0 and once"
-                raise ConfigurationError(f"{name} of a port is {indices}; got {given!r}")
-            object.__setattr__(self, name, [int(i) for i in given])
-        if len(self.flow) != len(self.effort):
-            given = f"flow {list(self.flow)} and effort {list(self.effort)}"
-            raise ConfigurationError(f"a port has as many efforts as flows; got {given}")
-        check_fields(self, non_negative, ["feedthrough"], "N s/m")
+    flow: list[int]  # entries of the action, in m/s (or rad/s)
+    effort: list[int]  # entries of the observation, in N (or N m): how the command pushes the machine now
+    feedthrough: (
+        float  # change of the effort at once per change of the flow, N s/m: a damper before the machine
+    )
 
 
-def port_from(given: Any, env: Env) -> TeleopPort | None:
-    """A port itself, from the dict of one, or what the env publishes; None if it publishes none."""
-    if given is not None:
-        port = settings_from(TeleopPort, given, "port")
-    elif env.has_wrapper_attr("port_flow"):
-        flow, effort = (list(env.get_wrapper_attr(name)) for name in ("port_flow", "port_effort_observed"))
-        port = TeleopPort(flow, effort, env.get_wrapper_attr("port_feedthrough"))
-    else:
+def port_of(env: Env) -> Port | None:
+    """What the env publishes; None if it publishes nothing."""
+    if not env.has_wrapper_attr("port_flow"):
         return None
+    flow, effort = (list(env.get_wrapper_attr(name)) for name in ("port_flow", "port_effort_observed"))
     action, observation = env.action_space, env.observation_space
     box = isinstance(observation, gym.spaces.Box) and len(observation.shape) == 1
     if not box or not np.issubdtype(observation.dtype or np.int64, np.floating):
         raise ConfigurationError(f"a port needs observations of one axis and floats, got {observation}")
-    for name, indices, space in (("flow", port.flow, action), ("effort", port.effort, observation)):
-        assert space.shape is not None
-        if max(indices) >= space.shape[0]:
-            wrong = f"{name} of the port is entry {max(indices)}"
-            raise ConfigurationError(f"{wrong}, but there are only {space.shape[0]}: {space}")
-    return port
+    assert action.shape is not None and observation.shape is not None
+    if len(flow) != len(effort) or max(flow) >= action.shape[0] or max(effort) >= observation.shape[0]:
+        entries = f"flow {flow} and effort {effort}"
+        raise ConfigurationError(f"no port of {action} and {observation} has {entries}")
+    return Port(flow, effort, float(env.get_wrapper_attr("port_feedthrough")))
 
 
 class PortReading:
-    """The effort at a port of an env: as observed, as foreseen, and as the env says that it acted."""
+    """The effort at the port of an env: as observed, and as the env says that it acted."""
 
-    def __init__(self, env: Env, port: TeleopPort) -> None:
+    def __init__(self, env: Env, port: Port) -> None:
         self._env, self._port = env, port
         self.feedthrough = port.feedthrough  # N s/m
-        self._publishes = env.has_wrapper_attr("port_effort_acted")
 
     def reset(self, observation: Array) -> None:
         """At rest, the effort as observed."""
@@ -198,14 +170,10 @@ class PortReading:
         return self.effort - self.feedthrough * self._last_flow
 
     def acted(self, flow: Array, observation: Array) -> Array:
-        """The effort during the step that was made with this flow: as the env publishes it, else as foreseen, N."""
-        if self._publishes:
-            acted = np.array(self._env.get_wrapper_attr("port_effort_acted"), dtype=np.float64)
-        else:
-            acted = self.effort + self.feedthrough * (flow - self._last_flow)
+        """The effort during the step that was made with this flow, as the env publishes it, N."""
         self._last_flow = flow
         self.effort = self.of(observation)
-        return acted
+        return np.array(self._env.get_wrapper_attr("port_effort_acted"), dtype=np.float64)
 
     def of(self, observation: Array) -> Array:
         """The effort that an observation shows, N."""
@@ -229,10 +197,9 @@ class RoundTripCeiling:
         video_s: T_video, exposure, encoding and display, without the downlink, s.
         human_s: T_human, the operator's reaction, s.
         longest_s: No ceiling is higher, s: an operator who is silent for longer loses authority at rest, too.
-        release: Authority comes back only when the round trip is below this share of the ceiling.
 
     Raises:
-        ConfigurationError: A time or share that cannot be, or a clearance that measures no approach.
+        ConfigurationError: A time that cannot be, or a clearance that measures no approach.
     """
 
     budget: BudgetLike
@@ -240,7 +207,6 @@ class RoundTripCeiling:
     video_s: float = 0.1
     human_s: float = 0.25
     longest_s: float = 1.0
-    release: float = 0.8
 
     def __post_init__(self) -> None:
         budget = budget_from(self.budget)
@@ -250,9 +216,6 @@ class RoundTripCeiling:
         object.__setattr__(self, "budget", budget)
         check_fields(self, non_negative, ["video_s", "human_s"], "s")
         check_fields(self, positive, ["longest_s"], "s")
-        check_fields(self, positive, ["release"], "a share of the ceiling")
-        if self.release > 1.0:
-            raise ConfigurationError(f"release is a share of the ceiling, at most 1; got {self.release}")
 
 
 class RoundTripWatch:
@@ -289,7 +252,7 @@ class RoundTripWatch:
         """Revoke authority, or give it back, for a command (m,) made from the image that was taken at `seen_s`."""
         allowed_s = self.ceiling_s
         if self.revoked and allowed_s > 0.0:
-            allowed_s *= self._ceiling.release
+            allowed_s *= _RELEASE
         trusted = self.readable and round_trip_s <= allowed_s + self._slack_s
         if self.revoked:
             trusted = trusted and seen_s >= self._revoked_s - self._slack_s

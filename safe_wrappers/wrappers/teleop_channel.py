@@ -23,9 +23,8 @@ from safe_wrappers.wrappers.teleop import (
     Link,
     RoundTripCeiling,
     RoundTripWatch,
-    TeleopPort,
     link_from,
-    port_from,
+    port_of,
 )
 from safe_wrappers.wrappers.teleop_coding import Coding, Down, Up, coding_from
 
@@ -41,7 +40,7 @@ class TeleopChannel(CommandGate):
     **What it guarantees.** With a ceiling whose bounds are what they are declared to be, the machine stops inside the
     clearance whatever operator and network do, from a start where it can: proved where the clearance is a distance
     along a line that the brake acts along, best effort elsewhere or with an unverified fallback. With wave coding
-    and the effort that the port says, never more energy has come out than went in, less what is in flight.
+    and the effort that the env says, never more energy has come out than went in, less what is in flight.
     **What it does not.** Passivity limits neither force nor displacement. Plain coding bounds no energy.
 
     Args:
@@ -51,17 +50,15 @@ class TeleopChannel(CommandGate):
         coding: "plain" or "wave".
         impedance: Characteristic impedance b of the waves, N s/m; for "wave".
         ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
-        port: A `TeleopPort` or the dict of one; None: what the env publishes, if it does.
         fallback: The local brake: "brake", "hold", "zero", or a function of the plant.
         plant: For the ceiling's constraint and the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
 
-    Info, at every step: ``teleop/round_trip_s``, ``teleop/ceiling_s``, ``teleop/energy_in_j``,
-    ``teleop/energy_out_j``, ``teleop/in_flight_j``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
+    Info, at every step: ``teleop/round_trip_s``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
     ``teleop/lost`` (int); without a filter inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
-        ConfigurationError: A link, a port, an impedance or a ceiling that cannot be, or a wrong order.
+        ConfigurationError: A link, an impedance or a ceiling that cannot be, or a wrong order.
 
     Example:
         >>> import gymnasium as gym, numpy as np, safe_wrappers as sw
@@ -83,7 +80,6 @@ class TeleopChannel(CommandGate):
         coding: Coding = "plain",
         impedance: float | None = None,
         ceiling: RoundTripCeiling | dict[str, Any] | None = None,
-        port: TeleopPort | dict[str, Any] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
         control_dt: float | None = None,
@@ -100,10 +96,9 @@ class TeleopChannel(CommandGate):
             uplink=plain_data(self.uplink),
             downlink=plain_data(self.downlink),
             ceiling=plain_data(limit),
-            port=plain_data(port),
             plant=plant,
         )
-        self.port = port_from(port, env)
+        self.port = port_of(env)
         self._coding = coding_from(env, self.port, self.control_dt, coding, impedance)
         self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
         self._down = Line(self.downlink, "TeleopChannel down 0", self._same_s)
@@ -130,7 +125,7 @@ class TeleopChannel(CommandGate):
         self._start(info)
         self._lost = 0
         self._images: list[float] = [0.0]  # when the image was taken that was shown after each step
-        self._report(info, 0.0, self._ceiling_s)
+        self._report(info, 0.0)
         self.started = True
         return observation, info
 
@@ -145,7 +140,6 @@ class TeleopChannel(CommandGate):
         if flow is not None:
             command = self._with_flow(command, flow)
         round_trip_s = now_s - seen_s
-        ceiling_s = self._ceiling_s
         if self._watch is not None:
             self._watch.judge(self._boxed(command), seen_s, round_trip_s, now_s)
         if self.revoked:
@@ -157,7 +151,7 @@ class TeleopChannel(CommandGate):
         shown = self._send_down(executed, observation, obeyed)
         if self._watch is not None:
             self._watch.look()
-        self._report(info, round_trip_s, ceiling_s)
+        self._report(info, round_trip_s)
         return shown, reward, terminated, truncated, info
 
     @property
@@ -200,18 +194,18 @@ class TeleopChannel(CommandGate):
 
     def _flow_of(self, command: Any) -> Array | None:
         """In the box, as the machine will take it."""
-        return None if self.port is None else self._boxed(command)[list(self.port.flow)]
+        return None if self.port is None else self._boxed(command)[self.port.flow]
 
     def _with_flow(self, command: Any, flow: Array) -> Any:
         assert self.port is not None
         whole = np.asarray(command, dtype=np.float64).copy()
-        whole[list(self.port.flow)] = flow
+        whole[self.port.flow] = flow
         return self._boxed(whole).astype(self._dtype)
 
     def _send_down(self, executed: Array, observation: Any, obeyed: bool) -> Any:
         """Send the observation, and return the one that the operator sees."""
         now_s, coding = self.now_s, self._coding
-        flow = executed[list(self.port.flow)] if self.port is not None else executed
+        flow = executed[self.port.flow] if self.port is not None else executed
         extra, given = coding.settle(flow, observation, obeyed)
         sequence, lost = self._down.send(Down(_copy(observation), now_s, extra), now_s)
         coding.sent(False, sequence, extra, lost)
@@ -224,19 +218,10 @@ class TeleopChannel(CommandGate):
             coding.account(self._moved, shown, given)
         return shown
 
-    @property
-    def _ceiling_s(self) -> float:
-        """The ceiling of the present state, s; inf where it is not watched."""
-        return math.inf if self._watch is None else self._watch.ceiling_s
-
-    def _report(self, info: dict[str, Any], round_trip_s: float, ceiling_s: float) -> None:
+    def _report(self, info: dict[str, Any], round_trip_s: float) -> None:
         info[keys.TELEOP_ROUND_TRIP_S] = round_trip_s
-        info[keys.TELEOP_CEILING_S] = ceiling_s
         info[keys.TELEOP_LOST] = self._lost
         info[keys.TELEOP_REVOKED] = self.revoked
-        info[keys.TELEOP_ENERGY_IN_J] = self._coding.energy_in_j
-        info[keys.TELEOP_ENERGY_OUT_J] = self._coding.energy_out_j
-        info[keys.TELEOP_IN_FLIGHT_J] = self._coding.stored_j
         info[keys.TELEOP_CREATED_J] = self._coding.ledger.created_j
 
 

@@ -12,7 +12,7 @@ from safe_wrappers.control.teleop.wave_line import WaveLine
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.wrappers.layer import Env
-from safe_wrappers.wrappers.teleop import Packet, PortReading, TeleopPort
+from safe_wrappers.wrappers.teleop import Packet, Port, PortReading
 
 Coding = Literal["plain", "wave"]
 
@@ -53,7 +53,6 @@ class PlainCoding:
         """A new episode, whose first observation the operator knows."""
         self._seen_s = 0.0
         self.ledger = ChannelLedger()
-        self.energy_in_j = self.energy_out_j = 0.0
         if self._reading is not None:
             self._reading.reset(observation)
             self._still = np.zeros(self._reading.effort.size)
@@ -91,8 +90,6 @@ class PlainCoding:
         felt = self._reading.of(shown)
         moved = np.zeros_like(felt) if moved is None else moved
         self.ledger.add(felt, moved, *given, self._tick_s, self.stored_j)
-        self.energy_in_j += port_energy(felt, moved, self._tick_s)
-        self.energy_out_j += port_energy(*given, self._tick_s)
 
     @property
     def stored_j(self) -> float:
@@ -183,7 +180,7 @@ class WaveCoding(PlainCoding):
 
 
 def coding_from(
-    env: Env, port: TeleopPort | None, tick_s: float, coding: Coding, impedance: float | None
+    env: Env, port: Port | None, tick_s: float, coding: Coding, impedance: float | None
 ) -> PlainCoding:
     """The coding that a channel's arguments ask for; an error if they do not go together or a port is missing."""
     reading = None if port is None else PortReading(env, port)
@@ -192,8 +189,8 @@ def coding_from(
             raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
         return PlainCoding(reading, tick_s)
     if reading is None:
-        wanted = 'coding="wave" needs a port, such as port={"flow": [0], "effort": [2]}'
-        raise ConfigurationError(f"{wanted}; {env.unwrapped!r} publishes none")
+        published = "port_flow, port_effort_observed, port_feedthrough and port_effort_acted"
+        raise ConfigurationError(f'coding="wave" needs a port: {env.unwrapped!r} publishes no {published}')
     refuse_changed_actions(env)
     if impedance is None:
         raise ConfigurationError('coding="wave" needs an impedance, in N s/m')

@@ -145,8 +145,6 @@ def loop(env, driver, steps, share=0.7, tolerance=0.01, bodies=None, seed=1):
         # What it reports is what the env's own contacts were.
         reported = info["whole_body/cone_margin"]
         assert reported == (pytest.approx(-excess, abs=1e-7) if np.isfinite(excess) else 0.0)
-        count = sum(bodies is None or body in bodies for body, *_ in judge.instants[0])
-        assert info["whole_body/contacts"] == count or bodies is not None
         if terminated or truncated:
             env.reset()
     return seen

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 from asking import Asked
-from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -123,12 +122,8 @@ def test_with_a_terminal_set_nothing_is_ever_violated(driver):
     assert violations == 0 and flagged == 0 and (changed > 0 or driver == "random")
 
 
-def test_nothing_is_proved_on_a_plant_that_was_not_checked_or_has_other_noise():
-    for options, promise in (
-        ({}, "proved"),
-        ({"check_steps": 0}, "best effort"),
-        ({"same_noise": False}, "best effort"),
-    ):
+def test_nothing_is_proved_on_a_plant_that_was_not_checked():
+    for options, promise in (({}, "proved"), ({"check_steps": 0}, "best effort")):
         env = sw.CBFActionFilter(Cart(), [shield()], plant=sw.SimulatorPlant(**options))
         assert env.constraints[0].promise == promise
     logs = sw.plants.log_steps(Cart(), episodes=20, max_steps=20)
@@ -335,16 +330,12 @@ def against(speeds):
 SEES = {
     "observation": (lambda x: LIMIT - np.abs(x[11:17]).max(), lambda x: against(x[11:17])),
     "env": (lambda env: LIMIT - np.abs(env.data.qvel[3:]).max(), lambda env: against(env.data.qvel[3:])),
-    "view": (
-        lambda view: LIMIT - np.abs(view.observation[11:17]).max(),
-        lambda view: against(view.env.data.qvel[3:]),
-    ),
 }
 
 
-def shielded(env, sees="observation", h=None):
-    usual, backup = SEES[sees]
-    shield = PredictiveShield(h or usual, 4, backup=backup, candidates=6, sees=sees)
+def shielded(env, sees):
+    h, backup = SEES[sees]
+    shield = PredictiveShield(h, 4, backup=backup, candidates=6, sees=sees)
     return sw.CBFActionFilter(env, [shield], plant=sw.SimulatorPlant(check_steps=20))
 
 
@@ -367,10 +358,9 @@ def played(env, steps):
         yield min(left), left[-1], info
 
 
-@pytest.mark.parametrize("sees", SEES)
-def test_no_substep_is_violated_without_a_flag(sees):
+def test_no_substep_is_violated_without_a_flag():
     changed = 0
-    for least, _, info in played(shielded(gym.make("HalfCheetah-v5"), sees), 60):
+    for least, _, info in played(shielded(gym.make("HalfCheetah-v5"), "env"), 60):
         flagged = info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]
         assert least >= 0.0 or flagged
         assert not info["cbf/mismatch"]  # looking at substeps changes nothing, bit for bit
@@ -378,57 +368,11 @@ def test_no_substep_is_violated_without_a_flag(sees):
     assert changed > 10
 
 
-class Sensed(HalfCheetahEnv):
-    """What it sees is noisy."""
-
-    def _get_obs(self):
-        return super()._get_obs() + 1e-3 * self.np_random.standard_normal(17)
-
-
-class Counting(HalfCheetahEnv):
-    """It counts how often it was seen, and that changes what it does."""
-
-    seen = 0
-
-    def _get_obs(self):
-        self.seen += 1
-        return super()._get_obs() + 1e-6 * self.seen
-
-
-class Reporting(gym.Wrapper):
-    """Its resets report as its steps do."""
-
-    def reset(self, **options):
-        observation, info = self.env.reset(**options)
-        return observation, info | {"x_position": 0.0}
-
-
-UNSEEN = {
-    "a wrapper inside the filter changes the observation": lambda: (
-        gym.wrappers.TransformObservation(gym.make("HalfCheetah-v5"), lambda x: 0.5 * x, None),
-        "observation",
-        None,
-    ),
-    "not the same twice": lambda: (Sensed(), "observation", None),
-    "changes what it does|not the same twice": lambda: (Counting(), "view", None),
-    "h reads 'x_position' of info": lambda: (
-        Reporting(gym.make("HalfCheetah-v5")),
-        "view",
-        lambda view: 9.0 - view.info["x_position"],
-    ),
-}
-
-
-@pytest.mark.parametrize("why", UNSEEN)
-def test_where_substeps_cannot_be_judged_it_says_so_once_and_goes_on_as_it_was(why):
-    env, sees, h = UNSEEN[why]()
-    env = shielded(env, sees, h)
-    env.reset(seed=0)
-    with pytest.warns(
-        UserWarning, match=f"ends of control steps alone.*({why}).*5 physics substeps.*JointSpeedLimit"
-    ):
-        info = env.step(np.zeros(6, np.float32))[4]
-    assert not info["cbf/mismatch"]
+def test_where_substeps_are_not_judged_it_says_so_once_and_judges_the_ends():
+    with pytest.warns(UserWarning, match=r'ends of control steps alone.*5 physics substeps.*sees="env"'):
+        env = shielded(gym.make("HalfCheetah-v5"), "observation")
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert not env.step(np.zeros(6, np.float32))[4]["cbf/mismatch"]
+        warnings.simplefilter("error", UserWarning)
+        for _, least, info in played(env, 30):
+            assert least >= 0.0 or info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]
+            assert not info["cbf/mismatch"]

@@ -116,34 +116,20 @@ def test_its_answer_is_that_of_the_whole_program(share, cone):
 
 
 @pytest.mark.parametrize("cone", ["pyramid", "exact"])
-@pytest.mark.parametrize("hopeless", ["slope", "inset"])
-def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone, hopeless):
-    env = table(gravity="0 4 -9", friction=0.05) if hopeless == "slope" else table()
-    more = {"zmp_inset": 0.5} if hopeless == "inset" else {}
-    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7, cone, **STANCE, **more)])
+def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone):
+    env = table(gravity="0 4 -9", friction=0.05)
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7, cone, **STANCE)])
     filtered.reset()
     standing = 0
     for _ in range(25):
         info = filtered.step(STILL)[4]
         assert np.isfinite(info["executed_action"]).all() and np.isfinite(info["whole_body/cone_margin"])
-        if info["whole_body/contacts"] == 4:
+        problem = filtered.filter.bound[0]._problem
+        if problem is not None and len(problem.normals) == 4:
             standing += 1
             assert info["cbf/infeasible"] and info["cbf/fallback"]
-            if hopeless == "slope":
-                assert info["whole_body/cone_margin"] < 0.0
+            assert info["whole_body/cone_margin"] < 0.0
     assert standing > 5
-
-
-def test_an_inset_of_the_zero_moment_point_is_kept_by_the_forces():
-    # On a slope of 15 degrees the point is 0.3 tan(15 deg) off the middle, of 0.3 m to the edge.
-    tilt = np.radians(15.0)
-    env = table(gravity=f"{9.81 * np.sin(tilt)} 0 {-9.81 * np.cos(tilt)}", friction=2.0)
-    verdicts = []
-    for inset in (0.3 - 0.34 * np.tan(tilt) - 0.1, 0.3 - 0.2 * np.tan(tilt)):
-        stance = settled(env, sw.constraints.Stance(1.0, zmp_inset=inset, **STANCE), STILL)
-        verdicts.append(stance.admits(STILL))
-        assert stance.problem(STILL).force_rows is not None
-    assert verdicts == [True, False]
 
 
 def test_joints_are_predicted_to_stay_in_range():
@@ -222,7 +208,6 @@ def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
         ({"friction_share": 1.1}, r"\(0, 1\]"),
         ({"cone": "round"}, "pyramid"),
         ({"joint_tolerance": -0.1}, "joint_tolerance"),
-        ({"zmp_inset": 0.0}, "zmp_inset"),
     ],
 )
 def test_bad_arguments_are_refused_in_words(arguments, words):

@@ -51,7 +51,9 @@ def test_the_truth_lies_within_the_estimates_standard_deviations(steering):
         for k, action in enumerate(pulses(steering)):
             info = env.step(action)[4]
             if k > 20:
-                errors.append(np.abs(info["slip/mu_estimate"] - truth) / info["slip/mu_std"])
+                errors.append(
+                    np.abs(info["slip/mu_estimate"] - truth) / env.filter.bound[0].seen.estimate.std
+                )
     assert np.mean(np.array(errors) < 2.0) > 0.99
     assert np.max(errors) < 3.0
 

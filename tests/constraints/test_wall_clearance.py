@@ -218,8 +218,6 @@ def test_other_plants_and_machines_are_refused_with_the_alternative():
         f=lambda x: np.zeros(4),
         g=lambda x: np.zeros((4, 2)),
         state=lambda env: np.zeros(4),
-        lower=-1.0,
-        upper=1.0,
         control_dt=0.01,
     )
     with pytest.raises(UnsupportedEnvError, match=r"MujocoPlant.*Clearance"):

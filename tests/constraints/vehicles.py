@@ -39,7 +39,7 @@ OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": 
 def rover(**options):
     """SafeRover under a SlipLimiter of all its wheels."""
     env = gym.make("SafeRover-v0", max_episode_steps=100_000)
-    return sw.SlipLimiter(env, wheels=env.unwrapped.wheels, **options)
+    return sw.CBFActionFilter(env, [sw.constraints.Traction(env.unwrapped.wheels, **options)])
 
 
 class Trolley(gym.Env[Any, Any]):

@@ -36,7 +36,7 @@ READ_A_PLANT = (*FILTERED, "FilterObservation", "LeaseExpiry")
 """They ask one for its state at every step, or before it."""
 FLAGS = (
     "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/intervened", "handover/refused",
-    "handover/starved", "handover/limited", "lease/refused", "lease/braking", "lease/expired", "teleop/revoked",
+    "handover/starved", "handover/limited", "lease/refused", "lease/braking", "teleop/revoked",
     "teleop/lost", "action/clipped",
     "contact/partial", "balance/partial", "occlusion/expired",
 )  # fmt: skip

@@ -9,12 +9,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from safe_wrappers.control.estimation.covariance import (
-    checked_covariance,
-    checked_noise,
     discretise,
     discretise_drift,
 )
-from safe_wrappers.errors import ConfigurationError
 
 INTEGRATOR = np.array([[0.0, 1.0], [0.0, 0.0]])
 seeds = st.integers(0, 10**6)
@@ -134,59 +131,3 @@ def test_growth_is_the_integrated_equation(seed, n, time):
     expected = integrated(lambda p: a @ p + p @ a.T + q, start, time)
     grown = blind_covariance(start, a, q, time)
     np.testing.assert_allclose(grown, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
-
-
-# Bad input --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("matrix", "words"),
-    [
-        ([[1.0, 2.0], [0.0, 1.0]], ["symmetric", "2"]),
-        ([[1.0, 2.0], [2.0, 1.0]], ["semidefinite", "-1"]),
-        (np.diag([1e-12, -1e-13]), ["semidefinite", "-1e-13"]),
-        ([[0.0, 1e-12], [0.0, 0.0]], ["symmetric", "1e-12"]),
-        ([[1.0, np.nan], [np.nan, 1.0]], ["finite"]),
-        ([1.0, 2.0], ["square", "(2,)"]),
-        (np.ones((2, 3)), ["square", "(2, 3)"]),
-        (np.eye(3), ["2 x 2", "(3, 3)"]),
-        ("wide", ["number"]),
-    ],
-)
-def test_what_is_no_covariance_is_refused(matrix, words):
-    with pytest.raises(ConfigurationError) as refusal:
-        checked_covariance("P0", matrix, 2)
-    assert all(word in str(refusal.value) for word in ["P0", *words]), refusal.value
-
-
-def test_a_covariance_passes_singular_and_rounded():
-    assert checked_covariance("Q", np.zeros((2, 2))).shape == (2, 2)
-    root = np.random.default_rng(0).normal(size=(5, 2))
-    rounded = root @ root.T + 1e-13 * np.random.default_rng(1).normal(size=(5, 5))
-    checked = checked_covariance("P", rounded)
-    assert np.array_equal(checked, checked.T)
-    with pytest.raises(ConfigurationError, match=r"positive definite .* smallest eigenvalue is"):
-        checked_noise("R", np.diag([1.0, 0.0]))
-    with pytest.raises(ConfigurationError, match="R must be positive definite"):
-        checked_noise("R", np.diag([1.0, -0.5]))
-    assert checked_noise("R", np.diag([1.0, 1e-6]))[1, 1] == 1e-6
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: discretise(INTEGRATOR, np.eye(2), -0.1), ["time_s", "-0.1", "backwards"]),
-        (lambda: discretise(INTEGRATOR, np.eye(2), np.inf), ["time_s", "finite"]),
-        (lambda: discretise(INTEGRATOR, -np.eye(2), 1.0), ["Q", "semidefinite"]),
-        (lambda: discretise(INTEGRATOR, np.eye(3), 1.0), ["Q", "2 x 2"]),
-        (lambda: discretise(np.ones((2, 3)), np.eye(2), 1.0), ["A", "square"]),
-        (lambda: discretise([[10.0]], [[1.0]], 100.0), ["unstable", "100"]),
-        (lambda: discretise_drift(INTEGRATOR, [1.0], 1.0), ["b must have 2"]),
-        (lambda: discretise_drift(INTEGRATOR, [0.0, 1.0], -1.0), ["backwards"]),
-        (lambda: discretise_drift([[10.0]], [1.0], 100.0), ["unstable"]),
-    ],
-)
-def test_bad_input_is_refused_and_named(call, words):
-    with pytest.raises(ConfigurationError) as refusal:
-        call()
-    assert all(word in str(refusal.value) for word in words), refusal.value

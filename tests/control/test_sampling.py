@@ -43,7 +43,7 @@ def test_the_margin_that_is_left_is_the_sampled_loop_s(name, late_by):
     sampled = ct.sample_system(loop, hold, "zoh") * z**-late_by
     # margin() reports the worst phase margin of a sampled loop: these cross over once below Nyquist
     _, found, _, at = ct.margin(sampled)
-    predicted = margin_left(np.radians(margin), crossover, hold, compute_s=late_by * hold)
+    predicted = margin_left(np.radians(margin), crossover, hold, late_by * hold)
     assert at == pytest.approx(crossover, rel=0.01)
     assert np.radians(found) == pytest.approx(predicted, abs=0.012)
     assert np.radians(margin) - predicted > 0.06 * (1 + 2 * late_by)  # what the two agree on is not small

@@ -31,8 +31,8 @@ class StillPlant(sw.AnalyticPlant):
     acting_range = None
 
 
-def still_plant(acting=None, **bounds):
-    plant = StillPlant(lambda x: 0.0 * x, lambda x: np.zeros((1, 2)), lambda env: np.zeros(1), **bounds)
+def still_plant(acting=None):
+    plant = StillPlant(lambda x: 0.0 * x, lambda x: np.zeros((1, 2)), lambda env: np.zeros(1))
     plant.acting_range = acting and tuple(map(np.array, acting))
     return plant
 
@@ -97,8 +97,8 @@ def only(*controls):
     return lambda u: 1.0 if any(np.allclose(u, c, atol=1e-6) for c in controls) else -1.0
 
 
-def search(*constraints, fallback="brake", **bounds):
-    plant = still_plant(**bounds)
+def search(*constraints, fallback="brake", acting=None):
+    plant = still_plant(acting)
     plant.bind(Still())
     plant.observe()
     low, high = -np.ones(2), np.ones(2)

@@ -95,12 +95,6 @@ def test_refused_names_those_that_do_not_admit_the_proposal():
     assert decision.refused.tolist() == [True, False, True, False]
 
 
-def test_a_plants_own_bounds_hold_before_anything_is_asked():
-    decision = decide((1.0, 0.5), Predicting(lambda u: 1.0), lower=-0.4, upper=0.4)
-    keeps(decision, 0.4, 0.4)
-    assert decision.stage is Stage.PROPOSAL and decision.changed
-
-
 def test_changes_are_counted_in_shares_of_what_acts():
     # The first control saturates at 0.5: in shares of what acts it costs twice as much to change.
     decision = decide((1.0, 1.0), Rows(((1.0, 1.0), 0.5)), acting=((-0.5, -1.0), (0.5, 1.0)))

@@ -52,20 +52,6 @@ def mujoco_plant(loop=None, delay_s=0.0):
     return sw.MujocoPlant(delay_s=delay_s, loop=loop)
 
 
-def analytic_plant(loop=None, delay_s=0.0, control_dt=0.01):
-    return sw.AnalyticPlant(
-        f=lambda x: np.array([x[1], 0.0]),
-        g=lambda x: np.array([[0.0], [0.5]]),
-        state=lambda env: np.concatenate([env.data.qpos, env.data.qvel]),
-        control_dt=control_dt,
-        delay_s=delay_s,
-        loop=loop,
-    )
-
-
-PLANTS = pytest.mark.parametrize("make", [mujoco_plant, analytic_plant])
-
-
 def swing(margin, crossover, late_by):
     """Amplitude of a PD loop on the cart after 30 s, commands `late_by` holds late; it starts with 1."""
     env = Cart()
@@ -81,17 +67,17 @@ def swing(margin, crossover, late_by):
     return max(recent)
 
 
-@PLANTS
 @pytest.mark.parametrize(("margin", "crossover"), [(np.radians(45), 5.0), (np.radians(60), 8.0)])
-def test_the_cart_s_loop_is_stable_where_something_is_left_and_only_there(make, margin, crossover):
+def test_the_cart_s_loop_is_stable_where_something_is_left_and_only_there(margin, crossover):
     env = Cart()
     holds = margin / crossover / 0.01 - 0.5  # the delay, in holds, that uses the margin up
     for late_by, stable in ((int(holds) - 1, True), (int(holds) + 2, False)):
-        plant = make(ControlLoop(crossover, np.degrees(margin), warn_below_deg=0.0), late_by * 0.01)
+        loop = ControlLoop(crossover, np.degrees(margin), warn_below_deg=0.0)
+        plant = mujoco_plant(loop, late_by * 0.01)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore" if not stable else "error", PhaseMarginWarning)
             plant.bind(env)
-        left = plant.margin_left_deg
+        left = loop.margin_left_deg(plant.control_dt, plant.delay_s)
         assert left == pytest.approx(np.degrees(margin - crossover * (late_by * 0.01 + 0.005)), rel=1e-12)
         assert (left > 0) == stable
         amplitude = swing(margin, crossover, late_by)
@@ -99,16 +85,15 @@ def test_the_cart_s_loop_is_stable_where_something_is_left_and_only_there(make, 
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning:control", "ignore:stability_margins:UserWarning")
-@PLANTS
 @pytest.mark.parametrize(("compute", "bus", "plant_delay"), [(0, 0, 0), (1, 0, 0), (0, 2, 0), (1, 1, 4)])
-def test_what_is_left_is_the_margin_that_python_control_finds(make, compute, bus, plant_delay):
+def test_what_is_left_is_the_margin_that_python_control_finds(compute, bus, plant_delay):
     """Delays in holds. The plant's own f and g, held, sampled and delayed, under a PD controller."""
     margin, crossover, hold = np.radians(70), 3.0, 0.01
     kp, kd = 2 * crossover**2 * np.cos(margin), 2 * crossover * np.sin(margin)
     declared = ControlLoop(crossover, 70.0, compute * hold, bus * hold, warn_below_deg=0.0)
     env = Cart()
     env.reset(seed=0)
-    plant = make(declared, plant_delay * hold)
+    plant = mujoco_plant(declared, plant_delay * hold)
     plant.bind(env)
     plant.observe()
     machine = ct.ss([[0, 1], [0, 0]], plant.g, [[kp, kd]], [[0]])
@@ -116,13 +101,13 @@ def test_what_is_left_is_the_margin_that_python_control_finds(make, compute, bus
     late_by = ct.tf([1], [1, *[0] * (compute + bus + plant_delay)], hold)
     _, found, _, at = ct.margin(ct.tf(ct.sample_system(machine, hold, "zoh")) * late_by)
     assert at == pytest.approx(crossover, rel=1e-3)
-    assert plant.margin_left_deg == pytest.approx(found, abs=0.1)
+    left = declared.margin_left_deg(plant.control_dt, plant.delay_s)
+    assert left == pytest.approx(found, abs=0.1)
     assert 70.0 - found > 0.8
 
 
-@PLANTS
-def test_too_little_margin_is_said_once_with_its_numbers(make):
-    plant, env = make(ControlLoop(4.0, 60.0, compute_s=0.05, bus_s=0.02), 0.1), Cart()
+def test_too_little_margin_is_said_once_with_its_numbers():
+    plant, env = mujoco_plant(ControlLoop(4.0, 60.0, compute_s=0.05, bus_s=0.02), 0.1), Cart()
     with pytest.warns(PhaseMarginWarning) as said:
         plant.bind(env)
         plant.bind(env)

@@ -100,46 +100,6 @@ def test_after_the_held_action_a_forecast_brakes_as_steps_of_zero_do(env_id):
         assert np.array_equal(forecast.qpos[end], data.qpos) and np.array_equal(forecast.qvel[end], data.qvel)
 
 
-# Other masses, delays -----------------------------------------------------------------------------------------
-
-
-class Late(gym.ActionWrapper):
-    """Actions arrive so many steps late; until the first has, nothing moves."""
-
-    def __init__(self, env, steps):
-        super().__init__(env)
-        self.late = steps
-
-    def reset(self, **options):
-        self.queue = [np.zeros(4, np.float32)] * self.late
-        return super().reset(**options)
-
-    def action(self, action):
-        self.queue.append(action)
-        return self.queue.pop(0)
-
-
-@pytest.mark.parametrize("steps", [1, 3])
-@pytest.mark.parametrize("env_id", ["FetchReach-v4", "FetchPickAndPlace-v4"])
-def test_under_a_delay_it_is_where_the_commands_in_flight_lead(env_id, steps):
-    env = gym.make(env_id)
-    plant = bound(env, delay_s=steps * 0.04)
-    late = Late(env, steps)
-    late.reset(seed=0)
-    plant.executed(None)
-    sent, predicted = list(actions(3, 14)), []
-    data = env.unwrapped.data
-    for k, action in enumerate(sent):
-        plant.observe()
-        predicted.append((plant.qpos.copy(), plant.forecast(action.astype(np.float64)).qpos[-1]))
-        if k >= steps:  # the state that it foresaw so many steps ago
-            assert np.array_equal(predicted[k - steps][0], data.qpos)
-        if k > steps:
-            assert np.array_equal(predicted[k - steps - 1][1], data.qpos)
-        late.step(action)
-        plant.executed(action.astype(np.float64))
-
-
 # What it is not -----------------------------------------------------------------------------------------------
 
 

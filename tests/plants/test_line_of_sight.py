@@ -28,8 +28,8 @@ def world(inside, robot="", eye='pos="0 0 0.5"'):
     return model, mujoco.MjData(model)
 
 
-def looking(model, data, camera="cam", site=None, view_deg=360.0, range_m=np.inf, groups=None):
-    sight = LineOfSight(model, None if site else camera, site, view_deg, range_m, groups)
+def looking(model, data, camera="cam", site=None, view_deg=360.0, range_m=np.inf):
+    sight = LineOfSight(model, None if site else camera, site, view_deg, range_m)
     sight.read(data)
     return sight
 
@@ -54,7 +54,7 @@ def hidden_by_circles(eye, point, centres, radius):
 
 def test_on_the_crossing_it_is_what_circles_and_cones_say():
     env = gym.make("OccludedCrossing-v0").unwrapped
-    sight = LineOfSight(env.model, "eye", None, 120.0, 6.0, None)
+    sight = LineOfSight(env.model, "eye", None, 120.0, 6.0)
     bodies = np.array([env.model.body(name).id for name in env.car_bodies])
     rng = np.random.default_rng(0)
     env.reset(seed=0)

@@ -2,7 +2,7 @@
 
 import gymnasium as gym
 import numpy as np
-from line_world import HOLD, PENALTIES, WALL, BehindTheWall, Line, drift, push, read
+from line_world import HOLD, WALL, BehindTheWall, Line, drift, push, read
 from stable_baselines3.common.monitor import Monitor
 
 import safe_wrappers as sw
@@ -42,7 +42,3 @@ class GoalLine(Line):
 def filtered(wall=WALL, task=GoalLine):
     plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=HOLD)
     return Monitor(sw.RecordInterventions(sw.CBFActionFilter(task(), [BehindTheWall(wall)], plant=plant)))
-
-
-def penalised(wall=WALL, task=GoalLine):
-    return sw.AdaptionPenalty(filtered(wall, task), **PENALTIES)

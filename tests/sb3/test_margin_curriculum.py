@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.sb3 import GymnasiumVecEnv, MarginCurriculum
+from safe_wrappers.sb3 import MarginCurriculum
 
 FRACTION = st.floats(0.0, 1.0)
 
@@ -71,13 +71,6 @@ def test_a_training_that_goes_on_has_the_margin_of_where_it_stands(tmp_path):
         96, callback=[MarginCurriculum(1.0, 0.0), rest], reset_num_timesteps=False
     )
     assert margins.seen[32:] == rest.seen == [0.75] * 32 + [0.5] * 32 + [0.25] * 32
-
-
-def test_a_filter_of_many_envs_is_refused():
-    same = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
-    envs = gym.make_vec("Reacher-v5", 2, vectorization_mode="sync", vector_kwargs=same)
-    with pytest.raises(ConfigurationError, match="DummyVecEnv of protected envs"):
-        learner(GymnasiumVecEnv(sw.protect(envs))).learn(64, callback=MarginCurriculum(0.1))
 
 
 def trace(env, steps, change=None, at=0, seed=3):

@@ -179,7 +179,7 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
         for path in (folder / "episodes.csv", folder / "evaluation" / "filter_off.csv"):
             for row in read_rows(path):
                 assert not {"cost", "cost_substep", "violations", "collisions", "spin_outs"} & row.keys()
-                assert not {"lease_expired", "lease_refused", "lease_braking"} & row.keys()
+                assert not {"lease_refused", "lease_braking"} & row.keys()
                 assert row["length"] == 20
         written = tags(folder)
         assert {"interventions/goals_reached", "evaluation_filter_off/return"} <= written

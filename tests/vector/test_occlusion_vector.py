@@ -23,7 +23,7 @@ def make(_index=0):
     cars = sw.occlusion.Track(
         "car*", acceleration_noise=[0.0225, 0.0], reversion_s=2.0, start_position_std=[0.3, 0.0]
     )
-    eye = sw.occlusion.Sensor("eye", view_deg=120, range_m=6.0, dropout=0.2)
+    eye = sw.occlusion.Sensor("eye", view_deg=120, range_m=6.0)
     task = gym.make("OccludedCrossing-v0", max_episode_steps=LENGTH)
     env = sw.OcclusionPenalty(task, [cars], eye, tolerance=0.5, weight=0.1)
     return sw.RecordInterventions(sw.protect(env, cars="estimated"))

@@ -154,7 +154,8 @@ class AtSpeed(gym.Wrapper):
 def rover(index=0):
     """What the limiter has learnt of the ground is its state; the friction declared admits some random torques."""
     env = AtSpeed(gym.make("SafeRover-v0", max_episode_steps=7 + 2 * index))
-    limiter = sw.SlipLimiter(env, wheels=["rear_left", "rear_right"], friction=2.0, fallback="hold")
+    traction = sw.constraints.Traction(["rear_left", "rear_right"], friction=2.0)
+    limiter = sw.CBFActionFilter(env, [traction], fallback="hold")
     return CountUnsafeWarnings(sw.RecordInterventions(limiter))
 
 

@@ -188,7 +188,7 @@ class Book:
         self.fade = None
 
     def step(self, action, stamp, see):
-        """The control to be sent, and expired, refused, braking, remaining; `see` reads clearance and speed."""
+        """The control to be sent, and refused, braking, remaining; `see` reads clearance and speed."""
         now, same = self.k * self.hold, 1e-6 * self.hold
         comes, refused, fresh = stamp is not None, False, False
         if comes:
@@ -196,7 +196,6 @@ class Book:
             usable &= self.newest - same <= stamp <= now + same
             comes, refused = bool(usable), not usable
             fresh = comes and stamp > self.newest + same
-        had_lease = self.end is not None
         if fresh:
             self.newest = stamp
             old = max(now - stamp, 0.0)
@@ -205,7 +204,7 @@ class Book:
             if self.granted:
                 self.end = now + lease
             else:
-                self.end, had_lease, refused = None, False, True
+                self.end, refused = None, True
         covered = self.end is not None and now + self.hold <= self.end + same
         if covered:
             if comes:
@@ -225,7 +224,7 @@ class Book:
         self.last = target
         self.k += 1
         remaining = 0.0 if self.end is None else max(self.end - self.k * self.hold, 0.0)
-        return target, had_lease and not covered, refused, not covered, remaining
+        return target, refused, not covered, remaining
 
     def _switch(self, acting, steps):
         self.acting = acting

@@ -49,8 +49,6 @@ class Slow:
     now: int = 0
     newest_heard: int = -1
     in_force: int = -1
-    source: str = ""
-    source_in_force: str = ""
     acting: str = ""
     fade: tuple | None = None
 
@@ -70,7 +68,7 @@ class Slow:
         if not all(math.isfinite(x) for row in chunk for x in row):
             return False
         rows = [self.box(row) for row in chunk]
-        self.coming.append({"rows": rows, "observed": observed, "due": due, "source": self.source})
+        self.coming.append({"rows": rows, "observed": observed, "due": due})
         return True
 
     def tick(self, fallback):
@@ -81,7 +79,7 @@ class Slow:
         if tick.starved:
             control, exact, limited = self.box(fallback), True, False
         tick.limited = limited
-        acting = "the fallback" if tick.starved else "source " + self.source_in_force
+        acting = "the fallback" if tick.starved else "the chunks"
         if self.sent and acting != self.acting:
             if self.blend in BLENDS and not tick.seam:
                 change = max(abs(a - b) for a, b in zip(control, self.sent[-1], strict=True))
@@ -137,7 +135,7 @@ class Slow:
         self.coming = [c for c in self.coming if c["observed"] > newest["observed"]]
         age = self.now - newest["observed"]
         tick.latency = age
-        self.in_force, self.source_in_force = newest["observed"], newest["source"]
+        self.in_force = newest["observed"]
         fresh = newest["rows"][age:]
         if self.blend == "replace":
             self.plan = [(row, True, False) for row in fresh]

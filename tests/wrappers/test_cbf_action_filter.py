@@ -340,8 +340,6 @@ def pendulum(gravity=10.0, dt=0.05, **options):
         f=pendulum_f(gravity),
         g=lambda x: np.array([[0.0], [3.0]]),
         state=lambda env: env.state,
-        lower=-2.0,
-        upper=2.0,
         control_dt=dt,
     )
     return sw.CBFActionFilter(

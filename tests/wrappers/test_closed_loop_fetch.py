@@ -134,24 +134,3 @@ def test_a_task_is_solved_as_well_as_without_the_filter(env_id, policy, steps):
                 observation, _, _, over, info = env.step(policy(observation, memory).astype(np.float32))
             solved[filtered] += int(info["is_success"])
     assert solved == {False: 4, True: 4}
-
-
-# Starts, other limits, other layers ---------------------------------------------------------------------------
-
-
-def test_commands_in_flight_are_counted_on():
-    missed = {}
-    for delay_s in (0.0, 0.08):
-        bare = fetch("FetchReach-v4", 60)
-        env = sw.protect(bare, plant=sw.plants.DisplacementPlant(delay_s=delay_s))
-        late = bare.unwrapped
-        arrive = late.step
-        queue = [np.zeros(4, np.float32)] * 2
-
-        def step(action, arrive=arrive, queue=queue):
-            queue.append(action)
-            return arrive(queue.pop(0))
-
-        late.step = step
-        missed[delay_s] = drive(env, "corner-seeking", 60)["violations"]
-    assert missed[0.0] > 5 and missed[0.08] == 0

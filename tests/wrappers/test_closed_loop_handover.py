@@ -1,7 +1,5 @@
 """ChunkHandover in closed loops on real envs: hundreds of seams, the limit kept, and what a seam leaves ringing."""
 
-import math
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -97,26 +95,3 @@ def test_a_filter_inside_may_break_the_limit_and_then_it_shows():
         above += peak > limit
     assert np.abs(np.diff(recorder.commands, axis=0)).max() <= limit * env.control_dt
     assert above > 0
-
-
-def test_control_goes_from_a_policy_to_a_human_and_back_on_an_arm():
-    """Single actions as chunks of one: the policy swings, the human pulls the other way."""
-    limit = 30.0
-    recorder = Recorder(gym.make("FlexJointReach-v0"))
-    env = sw.ChunkHandover(recorder, 1, 1, rate_limit=limit)
-    env.reset(seed=0)
-    high = env.action_space.high
-    asked = np.array(
-        [high * (-0.9 if 40 <= t < 80 else 0.7 * math.sin(0.01 * t)) for t in range(120)], np.float32
-    )
-    for t, chunk in enumerate(asked):
-        if t in (40, 80):
-            env.switch("human" if t == 40 else "policy")
-        env.step(chunk)
-    commands = np.array(recorder.commands)
-    assert np.abs(np.diff(commands, axis=0)).max() <= limit * env.control_dt
-    executed = commands.astype(np.float32)
-    assert executed[:40].tobytes() == asked[:40, 0].tobytes()
-    for start in (40, 80):
-        assert (executed[start] != asked[start, 0]).any(), "blended"
-        assert executed[start + 39].tobytes() == asked[start + 39, 0].tobytes(), "and handed over"

@@ -12,10 +12,10 @@ from meddling import Meddling
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.control.contact.impact import complementarity_residuals
+from safe_wrappers.plants.mujoco.contacts import Contacts, Replay
 
 FLOATS = (
     keys.CONTACT_PEAK_FORCE,
-    keys.CONTACT_IMPULSE,
     keys.CONTACT_PENETRATION,
     keys.CONTACT_RESIDUAL,
 )
@@ -31,7 +31,7 @@ def by_hand(env, data, substeps, bodies=None):
     """The figures of one Euler step from some data on, substep by substep, by MuJoCo's own functions."""
     model = env.model
     data.ctrl[:] = env.data.ctrl
-    peak = impulse = depth = residual = 0.0
+    peak = depth = residual = 0.0
     wrench = np.zeros(6)
     for _ in range(substeps):
         mujoco.mj_step(model, data)
@@ -43,11 +43,10 @@ def by_hand(env, data, substeps, bodies=None):
                 continue
             mujoco.mj_contactForce(model, data, i, wrench)
             pairs[pair] = pairs.get(pair, 0.0) + wrench[0]
-            impulse += wrench[0] * model.opt.timestep
             missed = complementarity_residuals(contact.dist, wrench[0])
             depth, residual = max(depth, missed.penetration), max(residual, missed.product)
         peak = max([peak, *pairs.values()])
-    return peak, impulse, depth, residual
+    return peak, depth, residual
 
 
 @pytest.mark.parametrize(
@@ -86,10 +85,15 @@ def test_the_physics_stays_the_same_bit_for_bit(env_id):
 
 def test_a_runner_with_runge_kutta_balances_its_weight():
     # Upwards, the floor's normal force and the weight are all there is, but for what a soft foot's turning adds.
-    env = sw.ContactMonitor(gym.make("Ant-v5", terminate_when_unhealthy=False), against=["world"])
+    env = gym.make("Ant-v5", terminate_when_unhealthy=False)
     raw = env.unwrapped
     env.reset(seed=0)
+    replay, floor = Replay(raw), Contacts(raw.model, None, ["world"])
     weight, impulse, time = float(raw.model.body_mass.sum()) * 9.81, 0.0, 0.0
+
+    def visit(data, time_s):
+        nonlocal impulse
+        impulse += time_s * sum(force for *_, force in floor.read(data))
 
     def upwards():
         mujoco.mj_forward(raw.model, raw.data)
@@ -98,9 +102,10 @@ def test_a_runner_with_runge_kutta_balances_its_weight():
 
     before = upwards()
     for action in actions(env, 200):
-        info = env.step(action)[4]
-        assert not info[keys.CONTACT_PARTIAL]
-        impulse, time = impulse + info[keys.CONTACT_IMPULSE], time + raw.dt
+        replay.before()
+        env.step(action)
+        assert replay.after(visit)
+        time += raw.dt
     assert impulse == pytest.approx(upwards() - before + weight * time, rel=1e-3)
 
 
@@ -140,9 +145,7 @@ def test_a_step_that_cannot_be_replayed_is_said_to_be_and_the_next_is_whole_agai
                 for i in range(raw.data.ncon):
                     mujoco.mj_contactForce(raw.model, raw.data, i, wrench)
                     forces.append(wrench[0])
-                assert forces and info[keys.CONTACT_IMPULSE] == pytest.approx(
-                    sum(forces) * raw.model.opt.timestep
-                )
+                assert forces and info[keys.CONTACT_PEAK_FORCE] >= max(forces) * (1.0 - 1e-9)
             assert env.peak_bodies is not None or not info[keys.CONTACT_PEAK_FORCE]
     assert partial == [25, 30]
     assert sum("contact/partial" in str(w.message) for w in caught) == 1  # once
@@ -156,7 +159,7 @@ def test_numbers_that_are_none_are_reported_as_none():
     assert np.isnan([info[k] for k in FLOATS]).all()
 
 
-def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
+def test_inside_a_chunk_peaks_are_the_largest():
     single, chunked = (gym.make("HalfCheetah-v5") for _ in range(2))
     single = sw.ContactMonitor(single)
     chunked = sw.ChunkHandover(sw.ContactMonitor(chunked), 5, 5, rate_limit=1e6)
@@ -164,7 +167,6 @@ def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
     for chunk in actions(single, 100).reshape(20, 5, -1):
         macro = chunked.step(chunk)[4]
         infos = [single.step(a)[4] for a in chunk]
-        assert macro[keys.CONTACT_IMPULSE] == pytest.approx(sum(i[keys.CONTACT_IMPULSE] for i in infos))
         for key in (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL):
             assert macro[key] == max(i[key] for i in infos)
         assert macro[keys.CONTACT_PARTIAL] is False

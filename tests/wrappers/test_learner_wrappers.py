@@ -12,7 +12,6 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 
 sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
-from simulated_worlds import Cart as SimulatedCart
 
 
 def stack():
@@ -100,9 +99,8 @@ def test_a_changed_step_costs_what_the_formula_says_and_no_other(penalty, per_co
         expected = penalty + per_correction * correction if correction > 0 else 0.0
         changed += correction > 0
         assert info[keys.ADAPTION_PENALTY] == pytest.approx(expected, abs=1e-6)
-        assert info[keys.ADAPTION_TASK_REWARD] == task
         assert reward == task - info[keys.ADAPTION_PENALTY]
-        assert type(info[keys.ADAPTION_PENALTY]) is type(info[keys.ADAPTION_TASK_REWARD]) is float
+        assert type(info[keys.ADAPTION_PENALTY]) is float
         np.testing.assert_array_equal(observation, same)
     assert 5 < changed < 35
 
@@ -136,52 +134,6 @@ def test_a_non_finite_action_costs_the_constant_and_a_finite_amount():
 def test_what_it_refuses(build, message):
     with pytest.raises(sw.SafeWrappersError, match=message):
         build()
-
-
-class Two(gym.Wrapper):
-    """Two objectives, declared as mo-gymnasium's envs declare them: the task's reward, and time."""
-
-    def __init__(self, env, declared=True):
-        super().__init__(env)
-        if declared:
-            env.reward_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
-
-    def step(self, action):
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, np.array([reward, -1.0], np.float32), terminated, truncated, info
-
-
-def stopping(make):
-    """A filter that changes actions."""
-    slow = sw.constraints.PredictiveShield(lambda x: 0.25 - abs(x[1]), 4, backup=lambda x: [-np.sign(x[1])])
-    return sw.CBFActionFilter(make, [slow], plant=sw.SimulatorPlant(check_steps=50))
-
-
-def driven(env, steps=6):
-    """Rewards and the last info."""
-    env.reset(seed=0)
-    answers = [env.step(env.action_space.high) for _ in range(steps)]
-    return np.array([answer[1] for answer in answers]), answers[-1][4]
-
-
-def test_a_recorder_sums_up_each_component():
-    env = sw.RecordInterventions(stopping(gym.wrappers.TimeLimit(Two(SimulatedCart()), 6)))
-    rewards, info = driven(env)
-    assert rewards.shape == (6, 2)
-    np.testing.assert_allclose(info["interventions"]["return"], rewards.sum(axis=0))
-    assert info["interventions"]["intervention_rate"] > 0.0
-    scalar = sw.RecordInterventions(gym.wrappers.TimeLimit(SimulatedCart(), 6))
-    assert type(driven(scalar)[1]["interventions"]["return"]) is float
-
-
-def test_wrappers_that_add_up_rewards_add_up_each_component():
-    repeated = sw.ActionRepeat(Two(SimulatedCart()), 3)
-    chunked = sw.ChunkHandover(Two(SimulatedCart()), 3, 3, fallback="zero", rate_limit=100.0)
-    for env, action in ((repeated, np.ones(1)), (chunked, np.ones((3, 1)))):
-        env.reset(seed=0)
-        total = env.step(action)[1]
-        assert total.shape == (2,) and total[1] == -3.0
-        assert -1.0 < total[0] < 0.0
 
 
 LOOKED_AT = ("SafePointGoal1-v0", "SafeCarGoal2-v0", "InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5")
@@ -278,18 +230,15 @@ def test_an_unfiltered_learner_sees_what_the_filtered_one_sees():
     assert steps > 10
 
 
-def test_the_room_of_a_clearance_and_its_nearest_surfaces():
+def test_the_room_of_a_clearance():
     walls = [sw.constraints.Plane([-0.9], [1.0]), sw.constraints.Plane([0.9], [-1.0])]
     limit = sw.constraints.Clearance(walls, bodies=["cart"], braking=8.0)
-    env = sw.FilterObservation(gym.make("InvertedPendulum-v5"), [limit], neighbours=1)
+    env = sw.FilterObservation(gym.make("InvertedPendulum-v5"), [limit])
     observation, _ = env.reset(seed=0)
     for _ in range(8):
-        place, speed = env.unwrapped.data.qpos[0], env.unwrapped.data.qvel[0]
-        clearance, away = 0.9 - abs(place), -np.sign(place)
+        clearance = 0.9 - abs(env.unwrapped.data.qpos[0])
         shown = features_of(env, observation)
         assert shown[0] <= clearance / (1 + clearance) + 1e-6
-        wanted = [away, 0, 0, clearance / (1 + clearance), -away * speed / (1 + abs(speed))]
-        np.testing.assert_allclose(shown[1:6], wanted, atol=1e-6)
         observation = env.step(np.array([3.0], dtype=np.float32))[0]
 
 

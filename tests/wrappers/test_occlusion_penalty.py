@@ -81,9 +81,8 @@ def test_unseen_sigma_is_the_closed_form():
 
 
 def test_what_is_measured_has_the_declared_noise():
-    covariance = np.array([[0.04, 0.03], [0.03, 0.09]])
     env = sw.OcclusionPenalty(
-        Turning(), [straight()], sw.occlusion.Sensor(site="eye", position_std=covariance), tolerance=1.0
+        Turning(), [straight()], sw.occlusion.Sensor(site="eye", position_std=0.3), tolerance=1.0
     )
     env.reset(seed=0)
     noise = []
@@ -91,7 +90,7 @@ def test_what_is_measured_has_the_declared_noise():
         env.step(STILL)
         noise.append(env.last_seen_positions[0] - [1.0, 0.0])
     np.testing.assert_allclose(np.mean(noise, axis=0), 0.0, atol=5 * 0.3 / np.sqrt(2000))
-    np.testing.assert_allclose(np.cov(np.transpose(noise)), covariance, atol=0.015)
+    np.testing.assert_allclose(np.cov(np.transpose(noise)), np.diag([0.09, 0.09]), atol=0.015)
     noise = np.array(noise)
     assert abs((noise[1:] * noise[:-1]).mean(axis=0)).max() < 5 * 0.09 / np.sqrt(2000)  # white
 
@@ -100,26 +99,16 @@ SPIN = ((0.3, 2.0, -1.0, -1, 0), (3.0, 0.5, 0.2, 0, 0))
 
 
 @pytest.mark.parametrize("arm", ["0.4 0 0", "0.1 -0.3 0.2"])
-def test_without_the_lever_arm_the_estimate_is_off_by_it(arm):
+def test_with_the_lever_arm_the_estimate_is_the_truth(arm):
     sharp = {"position_std": 1e-6, "velocity_std": 1e-6}
     sure = straight(start_position_std=10.0, start_velocity_std=10.0, acceleration_noise=1e6)
-    offset = np.array([float(x) for x in arm.split()])
-    for knows in (True, False):
-        env = sw.OcclusionPenalty(
-            Turning(SPIN, arm=arm),
-            [sure],
-            sw.occlusion.Sensor(site="eye", lever_arm=knows, **sharp),
-            tolerance=1.0,
-        )
-        env.reset(seed=0)
-        for _ in range(30):
-            env.step(np.array([0.5]))
-            angle, rate = env.unwrapped.data.qpos[0], env.unwrapped.data.qvel[0]
-            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            r = turn @ offset[:2]
-            wrong = np.concatenate([-r, rate * np.array([r[1], -r[0]])]) * (not knows)
-            truth = np.concatenate([env.unwrapped.data.qpos[1:3], env.unwrapped.data.qvel[1:3]])
-            np.testing.assert_allclose(env.tracking.mean[0] - truth, wrong, atol=2e-5)
+    sharp_eye = sw.occlusion.Sensor(site="eye", **sharp)
+    env = sw.OcclusionPenalty(Turning(SPIN, arm=arm), [sure], sharp_eye, tolerance=1.0)
+    env.reset(seed=0)
+    for _ in range(30):
+        env.step(np.array([0.5]))
+        truth = np.concatenate([env.unwrapped.data.qpos[1:3], env.unwrapped.data.qvel[1:3]])
+        np.testing.assert_allclose(env.tracking.mean[0], truth, atol=2e-5)
 
 
 def test_velocities_alone_leave_positions_unresolved_and_it_says_so():
@@ -134,16 +123,6 @@ def test_velocities_alone_leave_positions_unresolved_and_it_says_so():
     assert info["occlusion/visible"].all() and (info["occlusion/sigma"] >= 0.3).all()
     assert (env.last_seen_positions == fix).all()
     assert np.sqrt(env.tracking.covariance[:, 2, 2]).max() < 0.02
-
-
-def test_a_share_of_measurements_is_lost_for_each_track_by_itself():
-    dropping = sw.occlusion.Sensor(site="eye", dropout=0.3)
-    env = sw.OcclusionPenalty(Turning(), [straight("thing*")], dropping, tolerance=1.0)
-    env.reset(seed=0)
-    seen = np.array([env.step(STILL)[4]["occlusion/visible"] for _ in range(3000)])
-    np.testing.assert_allclose(seen.mean(axis=0), 0.7, atol=5 * np.sqrt(0.21 / 3000))
-    assert abs(np.corrcoef(seen.T)[0, 1]) < 0.1
-    assert abs(np.corrcoef(seen[1:, 0], seen[:-1, 0])[0, 1]) < 0.1
 
 
 def test_a_wall_hides_and_last_seen_stays():
@@ -305,7 +284,7 @@ def trace(env, seed=0, count=40):
 
 
 def test_seeds_repeat_and_differ_and_the_env_s_own_generator_is_untouched():
-    env, bare = crossing(sensor=sw.occlusion.Sensor("eye", dropout=0.2)), gym.make("OccludedCrossing-v0")
+    env, bare = crossing(sensor=sw.occlusion.Sensor("eye")), gym.make("OccludedCrossing-v0")
     first = trace(env, 5)
     assert trace(env, 6) != first and trace(env, 5) == first
     bare.reset(seed=5)
@@ -364,15 +343,14 @@ def made(env=None, tracks=None, sensor=EYE, tolerance=1.0, **options):
             ConfigurationError,
             r"shape \(k, 2\)",
         ),
-        ({"tracks": [straight(acceleration_noise=[[1, 2], [2, 1]])]}, ConfigurationError, "semidefinite"),
+        (
+            {"tracks": [straight(acceleration_noise=[[1, 2], [2, 1]])]},
+            ConfigurationError,
+            "one per coordinate",
+        ),
         ({"tracks": [straight(start_position_std=-1)]}, ConfigurationError, "start_position_std"),
         ({"sensor": "eye"}, UnknownNameError, "no camera 'eye'; it has: front"),
         ({"sensor": sw.occlusion.Sensor(site="front")}, UnknownNameError, "no site 'front'; it has: eye"),
-        (
-            {"sensor": sw.occlusion.Sensor("front", position_std=[[1, 1], [1, 1]])},
-            ConfigurationError,
-            "definite",
-        ),
         (
             {
                 "sensor": sw.occlusion.Sensor("front", velocity_std=0.1),
@@ -407,8 +385,8 @@ def test_what_cannot_be_is_refused_at_construction_with_the_reason(given, error,
 PUSH = np.full(1, 0.004)  # about 4 rad/s²
 
 
-def tracked(lever_arm=True, start_rate=0.0, world=None, **options):
-    imu = sw.occlusion.Imu("eye", lever_arm=lever_arm, **options)
+def tracked(start_rate=0.0, world=None, **options):
+    imu = sw.occlusion.Imu("eye", **options)
     sensor = sw.occlusion.Sensor(site="eye", position_std=1e-3, imu=imu)
     world = world or Turning(((0, 1, 0, -1, 0), (start_rate, 0, 0, 0, 0)))
     return sw.OcclusionPenalty(world, [straight("thing*")], sensor, tolerance=0.5)
@@ -453,20 +431,13 @@ def _text(raw):
     return TEXT.format(world=world, arm=arm)
 
 
-def test_the_body_stays_where_it_is_with_the_arm_and_goes_astray_without():
-    ends = {}
-    for lever_arm in (True, False):
-        env = tracked(lever_arm, start_rate=2.0)
-        env.reset(seed=0)
-        errors = [(env.step(STILL), off(env))[1] for _ in range(100)]
-        ends[lever_arm] = errors[-1]
-        wrong = np.hypot(*(env.tracking.positions - [[1, 0], [-1, 0]]).T)
-        assert (wrong < 0.05).all() if lever_arm else (wrong > 1.0).all()
-        assert env.unwrapped.data.qvel[0] == pytest.approx(2.0)
-    assert ends[True] < 0.01
-    # closed form: the circle of the arm, less the straight line of the velocity that it began with
-    arm = 0.4 * np.array([np.cos(8.0) - 1.0, np.sin(8.0) - 2.0 * 4.0])
-    assert ends[False] == pytest.approx(np.hypot(*arm), rel=0.02)
+def test_the_body_stays_where_it_is():
+    env = tracked(start_rate=2.0)
+    env.reset(seed=0)
+    errors = [(env.step(STILL), off(env))[1] for _ in range(100)]
+    assert (np.hypot(*(env.tracking.positions - [[1, 0], [-1, 0]]).T) < 0.05).all()
+    assert env.unwrapped.data.qvel[0] == pytest.approx(2.0)
+    assert errors[-1] < 0.01
 
 
 def test_what_is_seen_is_put_where_the_reckoned_pose_has_it():

@@ -53,13 +53,13 @@ def cbf(intervened=False, correction=0.0, margin=1.0, infeasible=False, fallback
     }
 
 
-def lease(expired=False, refused=False, braking=False):
-    return {keys.LEASE_EXPIRED: expired, keys.LEASE_REFUSED: refused, keys.LEASE_BRAKING: braking}
+def lease(refused=False, braking=False):
+    return {keys.LEASE_REFUSED: refused, keys.LEASE_BRAKING: braking}
 
 
 SCRIPT = [
     cbf(cost=0.0, cost_substep=0.0, goals_reached=0),
-    cbf(True, 0.5, 0.2, cost=0.0, cost_substep=1.0, goals_reached=1, **lease(expired=True, braking=True)),
+    cbf(True, 0.5, 0.2, cost=0.0, cost_substep=1.0, goals_reached=1, **lease(braking=True)),
     cbf(
         True,
         1.5,
@@ -105,7 +105,6 @@ def test_counts_of_an_episode():
         "fallback": 1,
         "nonfinite": 0,
         "unsafe": 1,
-        "lease_expired": 1,
         "lease_refused": 1,
         "lease_braking": 2,
         "margin_min": -0.1,

@@ -71,7 +71,7 @@ def test_no_executed_bridge_breaks_a_limit_anywhere(seed, velocity, acceleration
 def test_a_blend_is_as_long_as_its_limit_asks_and_no_longer(name, order, peak):
     for steps in (3, 5, 8):
         limit = peak * 1.0 / ((steps + 1) * HOLD) ** order * 1.0001
-        infos, _ = driven(flat(-0.5, 0.5), "smoothstep", limits={name: limit})
+        infos, _ = driven(flat(-0.5, 0.5), limits={name: limit})
         assert infos[1]["handover/blend_time"] == pytest.approx((steps + 1) * HOLD)
 
 
@@ -96,14 +96,14 @@ def test_a_bridge_that_the_box_would_cut_is_not_taken():
         ).any() or refused  # it was cut: the bridge goes on with the rate that it had
 
 
-def test_a_change_of_source_is_faded_within_the_limits():
+def test_a_change_to_and_from_the_fallback_is_faded_within_the_limits():
     line = Line(1, dtype=np.float64)
     limits = {"acceleration": 5.7735026919 / 0.7**2 * 1.0001}
-    env = sw.ChunkHandover(line, 1, 1, fallback="hold", limits=limits)
+    env = sw.ChunkHandover(line, 1, 1, blend="quintic", fallback="hold", limits=limits)
     env.reset(seed=0)
-    env.switch("policy")
     env.step(np.array([-0.5]))
-    env.switch("human")
+    env.set_observation_time(None)
+    env.step(np.array([0.5]))
     info = env.step(np.array([0.5]))[4]
     assert info["handover/blend_time"] == pytest.approx(0.7)
 
@@ -198,7 +198,7 @@ def test_what_is_no_position_servo_tells_no_torque(actuator):
     env = Pendulum(actuator)
     env.action_space = gym.spaces.Box(-2.0, 2.0, (env.model.nu,), np.float64)
     with pytest.raises(UnsupportedEnvError, match="no position servo"):
-        sw.ChunkHandover(env, 8, 4, limits={"torque": 3.0})
+        sw.ChunkHandover(env, 8, 4, blend="quintic", limits={"torque": 3.0})
 
 
 # Bad input --------------------------------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ def test_what_is_no_position_servo_tells_no_torque(actuator):
 )
 def test_bad_limits_are_refused(limits, says):
     with pytest.raises(ConfigurationError, match=says):
-        sw.ChunkHandover(Line(1), 8, 4, fallback="hold", limits=limits)
+        sw.ChunkHandover(Line(1), 8, 4, blend="quintic", fallback="hold", limits=limits)
 
 
 @pytest.mark.parametrize(("entries", "steps"), [(2, 3), (5, 4), (9, 33)])
@@ -352,6 +352,7 @@ def test_a_seam_on_the_flexible_arm_leaves_no_more_than_its_share():
     ("arguments", "says"),
     [
         ({"flexible": RINGS, "blend": "replace"}, "limits and flexible are for smoothstep"),
+        ({"limits": {"velocity": 1.0}}, 'limits are kept by blend="quintic"'),
         ({"flexible": 3.0}, 'flexible is a RigidModelCheck, the dict of one, or "auto"'),
     ],
 )

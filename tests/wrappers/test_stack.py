@@ -45,7 +45,6 @@ MAKE = {
     "ContactMonitor": sw.ContactMonitor,
     "BalanceMonitor": sw.BalanceMonitor,
     "AdaptionPenalty": lambda env: sw.AdaptionPenalty(env, penalty=PENALTY),
-    "SafeActionMap": sw.SafeActionMap,
     "RecordInterventions": sw.RecordInterventions,
     "ChunkHandover": lambda env: sw.ChunkHandover(env, 4, 2, fallback="zero", blend_time=0.02),
     "RepeatedCommands": lambda env: FAULTS["RepeatedCommands"](env, 0.3),
@@ -56,7 +55,7 @@ FILTERS = {
     "Ant-v5": ("WholeBodyFilter",),
 }
 OTHERS = [name for name in MAKE if not any(name in names for names in FILTERS.values())]
-NEED_A_FILTER = {"AdaptionPenalty", "SafeActionMap"}
+NEED_A_FILTER = {"AdaptionPenalty"}
 PAIRS = [
     (task, outer, inner)
     for task, filters in FILTERS.items()
@@ -128,13 +127,7 @@ def check_numbers(env):
     if asked is not None:
         both = zip(asked.actions, witness.executed, strict=True)
         changed = sum(not np.array_equal(given, done) for given, done in both)
-        if "SafeActionMap" in layers:
-            scales = [i[keys.MAP_SCALE] for i in infos if not np.isnan(i[keys.MAP_SCALE])]
-            # A lease's brake is not mapped, and the filter may have to change it.
-            braked = sum(i.get(keys.LEASE_BRAKING, False) for i in infos)
-            assert changed <= braked and len(scales) > 0 and min(scales) < 1.0
-        else:
-            assert changed > 0, "the filter never acted: nothing is tested"
+        assert changed > 0, "the filter never acted: nothing is tested"
     if not {"OcclusionPenalty", "ChunkHandover"} <= layers.keys():  # of a chunk it reports the last step's
         taken = PENALTY * changed if "AdaptionPenalty" in layers else 0.0
         taken += sum(i.get(keys.OCCLUSION_PENALTY, 0.0) for i in infos)

@@ -172,7 +172,7 @@ def _conflicts(arm: ArmConfig) -> list[tuple[bool, str]]:
             f" nothing; leave normalize out, or use {' or '.join(ON_POLICY)}.",
         ),
         (
-            discrete and (learner.stores_executed or learner.maps),
+            discrete and learner.stores_executed,
             f"learner {learner.kind} is for continuous actions, and {arm.algorithm} has discrete ones. Use naive or"
             " adaption_penalty.",
         ),

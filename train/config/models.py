@@ -80,9 +80,8 @@ class LearnerConfig(Section):
     text_is: ClassVar[str] = "kind"
     _PENALISED: ClassVar = ("adaption_penalty", "both")
 
-    kind: Literal["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"] = "naive"
-    """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ. `safe_set_map` is a
-    [SafeActionMap](wrappers/learner.md#safeactionmap) around the filter, in training and evaluation."""
+    kind: Literal["naive", "adaption_penalty", "safe_action", "both"] = "naive"
+    """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ."""
     penalty: Annotated[Number, Field(ge=0)] = 0.0
     """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
@@ -118,16 +117,6 @@ class LearnerConfig(Section):
     def of_filter(self) -> bool:
         """Whether it needs a filter: all but a price on cost does."""
         return replace(self, cost_limit=None, multiplier_rate=NAIVE.multiplier_rate) != NAIVE
-
-    @property
-    def maps(self) -> bool:
-        """Whether the policy's actions are mapped onto the admitted ones."""
-        return self.kind == "safe_set_map"
-
-    @property
-    def in_evaluation(self) -> LearnerConfig:
-        """What is left of it in evaluation: a map, which is part of the policy's interface, and nothing else."""
-        return self if self.maps else NAIVE
 
     @property
     def stores_executed(self) -> bool:
@@ -257,7 +246,7 @@ class ArmConfig(Section):
     env: EnvConfig
     """The env: an id, or the keys of [`env`](#env)."""
     algorithm: Annotated[str, AfterValidator(_check_algorithm)]
-    """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.6,<3'` also `TQC`, `CrossQ`,
+    """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.7,<3'` also `TQC`, `CrossQ`,
     `TRPO`, `QRDQN`. `DQN` and `QRDQN` are for discrete actions; filtered, those have an
     [ActionShield](wrappers/filter.md#actionshield)."""
     total_steps: Count

@@ -90,7 +90,7 @@ def evaluate_run(
         logger = run_logger(arm, seed, folder)
         for at, (condition, used) in enumerate(filters.items()):
             rows: list[dict[str, Any]] = []
-            with closing(make_stack(arm.env, used, arm.learner.in_evaluation)) as env:
+            with closing(make_stack(arm.env, used)) as env:
                 steps = StepRecorder(env)
                 for episode_seed in range(settings.seed, settings.seed + settings.episodes):
                     figures = _episode(env, policy, episode_seed, steps)

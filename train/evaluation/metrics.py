@@ -54,7 +54,6 @@ REGISTRY: Final[dict[str, Metric]] = {
     "lease_braking": Metric(
         "Steps braked by the lease, total", "Fallback steps of an expired lease", "steps"
     ),
-    "lease_expired": Metric("Leases run out, total", "Leases that ran out before the next action", "leases"),
     "goals_reached": Metric("Goals / episode", "Goals reached in an episode", "goals"),
     "spin_outs": Metric("Steps in spin-out, total", "Steps with a loaded wheel's slip above 0.5", "steps"),
     "spin_outs_per_million": Metric("Steps in spin-out / million", "Steps in spin-out", "per million steps"),

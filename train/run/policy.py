@@ -67,7 +67,7 @@ class TrainedPolicy:
             render_mode: As `gymnasium.make` takes it.
         """
         used = {"trained": self.arm.filter, "none": FilterConfig(), "protect": FilterConfig(protect={})}
-        return make_stack(self.arm.env, used[action_filter], self.arm.learner.in_evaluation, render_mode)
+        return make_stack(self.arm.env, used[action_filter], render_mode=render_mode)
 
     def begin(self) -> None:
         """Start an episode: its first action is the policy's."""

@@ -1,4 +1,4 @@
-"""The envs of one run, each a whole stack: from the task to SB3's Monitor, with the learner's map or penalty."""
+"""The envs of one run, each a whole stack: from the task to SB3's Monitor, with the learner's penalty."""
 
 from __future__ import annotations
 
@@ -72,8 +72,7 @@ def make_stack(
     Args:
         env: The task.
         action_filter: The filter around it.
-        learner: In training the arm's; in evaluation its `in_evaluation`, so that no return ever holds a penalty.
-            Without a filter there is nothing to map onto, and no map.
+        learner: In training the arm's; in evaluation none, so that no return ever holds a penalty.
         render_mode: As `gymnasium.make` takes it; None: as the config has it.
 
     Raises:
@@ -91,8 +90,6 @@ def make_stack(
     task = _filtered(task, action_filter)
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
-    if learner.maps and action_filter.kind != "none":
-        task = sw.SafeActionMap(task)
     if observed is not None:
         task = _with_features(task, observed)
     if action_filter.escape is not None:

@@ -23,7 +23,6 @@ from safe_wrappers.control.backup.evasive_maneuvers import (
     EvasiveManeuvers,
     Maneuver,
     least_left,
-    way_clearances,
 )
 from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
@@ -155,34 +154,26 @@ class BoundEscapeClearance(BoundBackupClearance):
         moving = np.sqrt((offsets * offsets).sum(axis=1)) - sizes
         fixed = [distances(o, self._position[None], self.plant)[0] - self.spec.radius for o in self._fixed]
         now = np.concatenate([moving, *fixed])
-        near = [float(f.min(initial=np.inf)) for f in fixed]
-        bounds = (centers - halves).min(axis=0), (centers + halves).max(axis=0)
-        still = self._discs(near), self._planes(near)
-        self._around = Around(centers[1:], halves[1:], sizes, *bounds, *still, self._position)
+        self._around = Around(centers[1:], halves[1:], sizes, self._discs(), self._planes())
         # From outside, the violation must shrink along the way.
         outside = min(float(now.min(initial=np.inf)) - self.spec.margin, 0.0)
         self._wanted = self.spec.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
         return now
 
-    def _discs(self, near: list[float]) -> Array:
-        """For `Around`; of clearances now of the fixed obstacles."""
-        parts = [np.zeros((0, 4))]
-        for obstacle, now in zip(self._fixed, near, strict=True):
-            if not isinstance(obstacle, Plane):
-                centers = obstacle.centers(self.plant)[:, :2]
-                rest = np.tile([obstacle.radius + self.spec.radius, now], (len(centers), 1))
-                parts.append(np.concatenate([centers, rest], axis=1))
-        return np.concatenate(parts)
-
-    def _planes(self, near: list[float]) -> Array:
-        """For `Around`; of clearances now of the fixed obstacles."""
-        rows = [
-            [*_flat(obstacle.point), *_flat(obstacle.normal), self.spec.radius, now]
-            for obstacle, now in zip(self._fixed, near, strict=True)
-            if isinstance(obstacle, Plane)
+    def _discs(self) -> Array:
+        """For `Around`."""
+        discs = [o for o in self._fixed if not isinstance(o, Plane)]
+        parts = [
+            np.insert(o.centers(self.plant)[:, :2], 2, o.radius + self.spec.radius, axis=1) for o in discs
         ]
-        return np.array(rows).reshape(-1, 6)
+        return np.concatenate([np.zeros((0, 3)), *parts])
+
+    def _planes(self) -> Array:
+        """For `Around`."""
+        planes = [o for o in self._fixed if isinstance(o, Plane)]
+        rows = [[*_flat(o.point), *_flat(o.normal), self.spec.radius] for o in planes]
+        return np.array(rows).reshape(-1, 5)
 
     def _expected(self, obstacle: Any, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
@@ -208,8 +199,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
         position, velocity = self._held(controls)
         x, y = self._escapes.paths(position, velocity, self._open)
-        nearest = way_clearances(x, y, self._around, self.spec.margin)
-        left = least_left(nearest, self._wanted)
+        left = least_left(x, y, self._around, self._wanted)
         self._asked.append((velocity, self._open[left.argmax(axis=1)]))
         return left
 

@@ -56,7 +56,7 @@ class ContactFeasibility(Constraint):
 class BoundContactFeasibility(BoundSlacks):
     """ContactFeasibility on a plant."""
 
-    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONTACTS, keys.WHOLE_BODY_CONE_MARGIN)
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONE_MARGIN,)
     spec: ContactFeasibility
 
     def __init__(self, spec: ContactFeasibility, plant: Plant) -> None:
@@ -93,13 +93,9 @@ class BoundContactFeasibility(BoundSlacks):
         return np.minimum(self.insides(control), self.spec.margin) + self.spec.tolerance - self.spec.margin
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info keys `whole_body/cone_margin` and `whole_body/contacts`: forecast for the executed control."""
-        contacts, margin = 0, 0.0
-        if executed is not None:
-            contacts = int((self.plant.contact_forecast(executed).step == 0).sum())
-            margin = float(self.insides(executed).min())
-        margin = margin if np.isfinite(margin) else 0.0
-        return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}
+        """The info key `whole_body/cone_margin`: forecast for the executed control."""
+        margin = 0.0 if executed is None else float(self.insides(executed).min())
+        return {keys.WHOLE_BODY_CONE_MARGIN: margin if np.isfinite(margin) else 0.0}
 
 
 def require_contacts(plant: Plant, asker: str) -> MujocoPlant:

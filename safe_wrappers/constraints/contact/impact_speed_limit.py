@@ -10,7 +10,7 @@ import numpy as np
 from safe_wrappers.checks import Array, name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
-from safe_wrappers.control.contact.impact import pushed_peak_force, speed_limit
+from safe_wrappers.control.contact.impact import peak_force, speed_limit
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
@@ -76,7 +76,7 @@ class Contact(NamedTuple):
     @property
     def peak(self) -> Array:
         """Force by the deepest deflection, under a push that goes on, N."""
-        return pushed_peak_force(*self[1:])
+        return peak_force(*self[1:])
 
     def left(self, limit: float) -> Array:
         """What is left of a limit, N, to first order; in squares, nearly linear in the control."""

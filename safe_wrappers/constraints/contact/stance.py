@@ -6,15 +6,13 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
+from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.constraints.contact.contact_feasibility import checked_friction_share, touching_bodies
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.control.legged import whole_body
-from safe_wrappers.control.legged.support import common_plane, support_rows
 from safe_wrappers.control.legged.whole_body import WholeBodySolution, WholeBodyStatus
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem, predicted_position_rows
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
@@ -44,7 +42,6 @@ class Stance(Constraint):
         friction_share: Of the model's friction coefficient, in (0, 1].
         cone: "pyramid" is conservative and quick, "exact" is the cone itself.
         joint_tolerance: How far driven joints may press their stops, rad or m; None leaves them alone.
-        zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, where there is one.
 
     Source: appendix "Hierarchical whole-body control quadratic program".
     """
@@ -52,7 +49,6 @@ class Stance(Constraint):
     friction_share: float = 0.7
     cone: Literal["pyramid", "exact"] = "pyramid"
     joint_tolerance: float | None = 0.1
-    zmp_inset: float | None = None
 
     def __post_init__(self) -> None:
         self.friction_share = checked_friction_share(self.friction_share)
@@ -60,7 +56,6 @@ class Stance(Constraint):
             raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
         if self.joint_tolerance is not None:
             self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
-        check_fields(self, positive, ("zmp_inset",), "m: forces that push do the rest")
 
     def bind(self, plant: Plant) -> "BoundStance":
         return BoundStance(self, plant)
@@ -70,7 +65,7 @@ class BoundStance(BoundConstraint):
     """Stance on a plant."""
 
     predicts: bool = True
-    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONTACTS, keys.WHOLE_BODY_CONE_MARGIN)
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONE_MARGIN,)
     spec: Stance
     plant: MujocoPlant
 
@@ -120,10 +115,6 @@ class BoundStance(BoundConstraint):
             limits["acceleration_rows"], limits["acceleration_limits"] = predicted_position_rows(
                 *joints, self.plant.control_dt, self.plant.model.nv
             )
-        if self.spec.zmp_inset is not None:
-            rows = self._balance(found.points[ground], normals, pressing)
-            if rows is not None:
-                limits["force_rows"], limits["force_limits"] = rows, np.zeros(len(rows))
         limits |= {"contact_acceleration": acceleration, "breaking": ~pressing}
         limits["first_tangents"] = found.first_tangents[ground]
         contacts = jacobians, drift, normals, self.spec.friction_share * found.friction[ground]
@@ -132,19 +123,6 @@ class BoundStance(BoundConstraint):
         # Two points of one rigid foot cannot come to rest each as it likes.
         attainable = whole_body.attainable_contact_acceleration(problem)
         return replace(problem, contact_acceleration=attainable)
-
-    def _balance(self, points: Array, normals: Array, pressing: NDArray[np.bool_]) -> Array | None:
-        """The inset, as rows on all contact forces; None where there is no polygon."""
-        assert self.spec.zmp_inset is not None
-        if np.count_nonzero(pressing) < 3:
-            return None
-        plane = common_plane(points[pressing], normals[pressing])
-        some = None if plane is None else support_rows(points[pressing], plane, self.spec.zmp_inset)
-        if some is None:
-            return None
-        rows = np.zeros((len(some), len(points), 3))
-        rows[:, pressing] = some.reshape(len(some), -1, 3)
-        return np.asarray(rows.reshape(len(some), -1))
 
     def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
         exact = self.spec.cone == "exact"
@@ -171,7 +149,7 @@ class BoundStance(BoundConstraint):
         return self._answer
 
     def candidates(self, proposed: Array) -> Iterator[Array]:
-        """The program's answer; where there is none, the control that misses least, which is refused."""
+        """The program's answer; where there is none, the proposed control, which is refused."""
         proposed = np.clip(proposed, self.plant.lower, self.plant.upper)
         problem = self.problem(proposed)
         if problem is not None:  # another constraint may have refused before this one was asked
@@ -188,8 +166,7 @@ class BoundStance(BoundConstraint):
         return -float(missed.max()) / self.plant.weight_n if len(forces) else 0.0
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info keys `whole_body/contacts` and `whole_body/cone_margin`: of the forces that would hold them."""
-        contacts, margin = 0, 0.0
-        if executed is not None and self._problem is not None:
-            contacts, margin = len(self._problem.normals), 0.0 + self.slack(executed)
-        return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}
+        """The info key `whole_body/cone_margin`: of the forces that would hold the contacts."""
+        if executed is None or self._problem is None:
+            return {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
+        return {keys.WHOLE_BODY_CONE_MARGIN: 0.0 + self.slack(executed)}

@@ -49,7 +49,7 @@ class SingularityMargin(RolloutConstraint):
         max_decrease: The most that w can fall within `horizon` steps, in shares of the threshold. None: unknown.
 
     Attributes:
-        validated: What the sample said of the threshold; None if it was given, or before the constraint is bound.
+        validated: The threshold that the sample gave; None if it was given, or before the constraint is bound.
     """
 
     threshold: float | None = None
@@ -64,7 +64,7 @@ class SingularityMargin(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    validated: of_arm.ValidatedThreshold | None = field(default=None, init=False, repr=False, compare=False)
+    validated: float | None = field(default=None, init=False, repr=False, compare=False)
     unit: ClassVar[str] = "shares of the threshold"
 
     def __post_init__(self) -> None:
@@ -136,7 +136,7 @@ class BoundSingularityMargin(BoundRollout):
         else:
             assert spec.task_speed is not None and spec.rate_limit is not None
             spec.validated = of_arm.validated_threshold(jacobians, spec.task_speed, spec.rate_limit)
-            self._threshold = spec.validated.threshold
+            self._threshold = spec.validated
         if self._threshold * (1.0 + self.spec.margin) >= most:
             raise ConfigurationError(
                 f"no configuration has a manipulability above {self._threshold:g} with a margin of "

@@ -7,7 +7,7 @@ modelled: stiffness that grows with depth, damping, a pad at the end of its stro
 relate force to speed; they do not certify a contact as safe.
 
 **Braking after contact is too late.** The peak comes a quarter of a period after the touch, typically 20 to 50 ms.
-A brake that acts later does not reduce it (`attenuation_after_delay`), so protection needs clearance before contact.
+A brake that acts later does not reduce it (`braked_deflection`), so protection needs clearance before contact.
 
 Arguments are numbers or arrays that broadcast; speeds of approach that are negative count as at rest. What is not
 finite, or not positive where it must be, raises `ConfigurationError`.
@@ -23,10 +23,9 @@ from safe_wrappers.errors import ConfigurationError
 
 
 class ComplementarityResiduals(NamedTuple):
-    """Violations of `gap >= 0`, `force >= 0`, `gap * force = 0`, shapes (...), 0 where they hold: m, N and N m."""
+    """Violations of `gap >= 0` and of `gap * force = 0`, shapes (...), 0 where they hold: m and N m."""
 
     penetration: Array
-    tension: Array
     product: Array
 
 
@@ -37,22 +36,19 @@ def complementarity_residuals(gap: ArrayLike, force: ArrayLike) -> Complementari
     N, shape (...), positive where it pushes the bodies apart.
     """
     g, f = finite_arrays(gap=gap, force=force)
-    return ComplementarityResiduals(np.maximum(-g, 0.0), np.maximum(-f, 0.0), np.abs(g * f))
+    return ComplementarityResiduals(np.maximum(-g, 0.0), np.abs(g * f))
 
 
-def peak_force(speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike) -> Array:
-    """The largest force of the contact, `v sqrt(k m)`, shape (...), N, of v (m/s), m (kg) and k (N/m)."""
-    return pushed_peak_force(speed, mass, stiffness)
-
-
-def pushed_peak_force(
+def peak_force(
     speed: ArrayLike,
     mass: ArrayLike,
     stiffness: ArrayLike,
     push: ArrayLike = 0.0,
     deflection: ArrayLike = 0.0,
 ) -> Array:
-    """That of a contact on which a push F_p goes on: `F_p + sqrt((k x - F_p)^2 + k m v^2)`, shape (...), N.
+    """The largest force of a contact, shape (...), N.
+
+    `v sqrt(k m)`, and with a push F_p that goes on `F_p + sqrt((k x - F_p)^2 + k m v^2)`.
 
     Args:
         speed: v, m/s.
@@ -104,18 +100,6 @@ def braked_deflection(
     gained = free**2 + 2.0 * b * deep
     braked = gained / np.where(in_time, np.sqrt(b**2 + gained) + b, 1.0)
     return np.asarray(np.where(in_time, braked, free))
-
-
-def attenuation_after_delay(
-    speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, braking: ArrayLike, latency: ArrayLike
-) -> Array:
-    """Relative reduction of the peak force by a brake, shape (...), arguments as of `braked_deflection`.
-
-    Exactly 0 from the `time_to_peak` on, and where there is no peak.
-    """
-    braked = braked_deflection(speed, mass, stiffness, braking, latency)
-    free = braked_deflection(speed, mass, stiffness, 0.0, np.full_like(braked, np.inf))
-    return np.asarray(np.where(free > 0.0, 1.0 - braked / np.where(free > 0.0, free, 1.0), 0.0))
 
 
 def _positive(name: str, value: ArrayLike) -> Array:

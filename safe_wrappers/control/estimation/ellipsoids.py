@@ -11,8 +11,6 @@ from safe_wrappers.errors import ConfigurationError
 
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 """Error of an eigenvalue over the largest one, where the shape is not diagonal."""
-_UNEVEN = 1e-9
-"""Relative asymmetry and relative size of negative eigenvalues that are accepted as rounding."""
 _CONVERGED = 1e-11
 """Of the secular equation; the distance errs with its square, and downwards."""
 _TINY = 1e-150
@@ -36,11 +34,12 @@ def ellipsoid_gap(offset: Array, shape: Array) -> tuple[Array, Array]:
         shape: S, symmetric positive semidefinite, shape (n, d, d), m²: for k sigma of a covariance P it is k² P.
 
     Raises:
-        ConfigurationError: Other shapes, numbers that are not finite, an S that is not positive semidefinite.
+        ConfigurationError: Numbers that are not finite.
     """
-    d = _dimension(offset, shape)
+    if not (np.isfinite(offset).all() and np.isfinite(shape).all()):
+        raise ConfigurationError(f"offsets and shapes must be finite, got {offset} and {shape}")
     squares, bases = np.linalg.eigh(shape)
-    coupled = np.any(shape * (1.0 - np.eye(d)), axis=(1, 2)).tolist()
+    coupled = np.any(shape * (1.0 - np.eye(offset.shape[1])), axis=(1, 2)).tolist()
     along = (offset[:, None, :] @ bases)[:, 0]
     found = [_gap(*point) for point in zip(along.tolist(), squares.tolist(), coupled, strict=True)]
     distances = np.array([distance for distance, _ in found])
@@ -48,24 +47,8 @@ def ellipsoid_gap(offset: Array, shape: Array) -> tuple[Array, Array]:
     return distances, (bases @ normals[:, :, None])[:, :, 0]
 
 
-def _dimension(offset: Array, shape: Array) -> int:
-    """Dimension of the space; checks everything but the eigenvalues."""
-    d = offset.shape[-1] if offset.ndim == 2 else 0
-    if d not in (2, 3) or shape.shape != (*offset.shape, d):
-        given = f"{offset.shape} and {shape.shape}"
-        raise ConfigurationError(f"expected offsets (n, d) and shapes (n, d, d) with d = 2 or 3, got {given}")
-    if not (np.isfinite(offset).all() and np.isfinite(shape).all()):
-        raise ConfigurationError(f"offsets and shapes must be finite, got {offset} and {shape}")
-    uneven = np.abs(shape - shape.swapaxes(1, 2))
-    if uneven.any() and (uneven > _UNEVEN * np.abs(shape).max(axis=(1, 2), keepdims=True)).any():
-        raise ConfigurationError(f"shapes must be symmetric, got {shape.tolist()}")
-    return d
-
-
 def _gap(y: list[float], squares: list[float], coupled: bool) -> tuple[float, list[float]]:
     """Distance and normal in the eigenbasis: y the point, squares those of the half-axes, smallest first."""
-    if squares[0] < -_UNEVEN * max(squares[-1], -squares[0]):
-        raise ConfigurationError(f"shapes must be positive semidefinite, got an eigenvalue of {squares[0]:g}")
     lost = _ROUNDING * squares[-1] if coupled else 0.0
     squares = [square + lost if square > 0.0 else lost for square in squares]
     axes = [math.sqrt(square) for square in squares]

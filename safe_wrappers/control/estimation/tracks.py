@@ -71,8 +71,11 @@ class Tracks:
         self.size = 2 * self.coordinates
         self.mean = np.zeros((len(self.motions), self.size))
         self.covariance = np.zeros((len(self.motions), self.size, self.size))
-        self._single: dict[float, _Over] = {}
-        self._stacked: dict[tuple[float, ...], _Over] = {}
+        self._known: dict[float, _Over] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is computed again: a pickle stores it in another order, and sums would round otherwise."""
+        return vars(self) | {"_known": {}}
 
     @property
     def positions(self) -> Array:
@@ -108,23 +111,19 @@ class Tracks:
             matrix: C of all of them, shape (m, 2d).
             noise: Covariance R of all of them, shape (m, m).
         """
-        updated = update(self.mean[which], self.covariance[which], measured, matrix, noise)
-        self.mean[which], self.covariance[which] = updated.mean, updated.cov
+        before = self.mean[which], self.covariance[which]
+        self.mean[which], self.covariance[which] = update(*before, measured, matrix, noise)
 
     def ahead(self, times_s: Sequence[float]) -> tuple[Array, Array]:
         """Positions (k, n, d), m, and covariances (k, n, d, d), m^2, at k times ahead without measurements."""
-        key, d = tuple(times_s), self.coordinates
-        over = self._stacked.get(key)
-        if over is None:
-            parts = [(f[:, :d], b[:, :d], q[:, :d, :d]) for f, b, q in map(self._over, key)]
-            over = _Over(*(np.stack(part) for part in zip(*parts, strict=True)))
-            _keep(self._stacked, key, over)
-        positions = (over.transition @ self.mean[:, :, None])[..., 0] + over.drift
-        spread = over.transition @ self.covariance @ over.transition.swapaxes(-1, -2)
-        return positions, spread + over.noise
+        d = self.coordinates
+        parts = [(f[:, :d], b[:, :d], q[:, :d, :d]) for f, b, q in map(self._over, times_s)]
+        transition, drift, noise = (np.stack(part) for part in zip(*parts, strict=True))
+        positions = (transition @ self.mean[:, :, None])[..., 0] + drift
+        return positions, transition @ self.covariance @ transition.swapaxes(-1, -2) + noise
 
     def _over(self, time_s: float) -> _Over:
-        over = self._single.get(time_s)
+        over = self._known.get(time_s)
         if over is None:
             each: dict[int, tuple[Array, Array, Array]] = {}
             for motion in self.motions:
@@ -134,15 +133,10 @@ class Tracks:
                     each[id(motion)] = transition, discretise_drift(a, b, time_s), noise
             parts = [each[id(motion)] for motion in self.motions]
             over = _Over(*(np.stack(part) for part in zip(*parts, strict=True)))
-            _keep(self._single, time_s, over)
+            if len(self._known) >= _KEPT:
+                self._known.clear()
+            self._known[time_s] = over
         return over
-
-
-def _keep(kept: dict[Any, _Over], key: Any, over: _Over) -> None:
-    """Cache at most `_KEPT` entries."""
-    if len(kept) >= _KEPT:
-        kept.clear()
-    kept[key] = over
 
 
 def largest_deviation(covariances: Array) -> Array:

@@ -13,8 +13,6 @@ loss.
 Jacobians are of shape (..., m, n); what is not finite raises `ConfigurationError`.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -50,35 +48,10 @@ def worst_joint_rates(jacobian: ArrayLike) -> Array:
     return np.asarray(np.where(lost[..., None], np.inf, np.linalg.norm(inverse, axis=-1)))
 
 
-@dataclass(frozen=True, slots=True)
-class ValidatedThreshold:
-    """A threshold on w, validated on a sample of configurations.
-
-    Attributes:
-        threshold: The smallest number above which no sampled w needs more than the rate limit; the smallest sampled w
-            if none needs more.
-        samples: Number of configurations.
-        above: Number with a w above the threshold.
-        exceeding: Number that need more than the limit, all at or below the threshold.
-    """
-
-    threshold: float
-    samples: int
-    above: int
-    exceeding: int
-
-    def unseen(self, confidence: float = 0.95) -> float:
-        """Upper bound on the share of configurations above the threshold that exceed the limit.
-
-        Holds with that confidence for independent samples of the distribution in use, not for an adversary's choice.
-        """
-        return float(-np.expm1(np.log1p(-confidence) / self.samples))
-
-
-def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: float) -> ValidatedThreshold:
+def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: float) -> float:
     """The smallest threshold on w above which no sampled configuration needs more than the joints' rate limit.
 
-    It holds for controllers that invert J by least norm. `ValidatedThreshold.unseen` bounds the rest statistically.
+    The smallest sampled w if none needs more. It holds for controllers that invert J by least norm.
 
     Args:
         jacobians: Task Jacobians of sampled configurations, shape (samples, m, n).
@@ -94,14 +67,13 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: flo
     exceeding = needed > 1.0
     best = int(np.argmax(w))
     threshold = float(w[exceeding].max()) if exceeding.any() else float(w.min())
-    above = int((w > threshold).sum())
-    if exceeding.any() and not above:
+    if exceeding.any() and not (w > threshold).any():
         raise ConfigurationError(
             f"no threshold on w keeps the rate limit: of {len(j)} configurations the one of the largest w "
             f"({w[best]:.4g}) needs {needed[best]:.3g} times the limit at {task_speed:g} per second; lower the task "
             "speed"
         )
-    return ValidatedThreshold(threshold, len(j), above, int(exceeding.sum()))
+    return threshold
 
 
 def _checked(value: ArrayLike) -> Array:

@@ -81,7 +81,7 @@ class SeamLimits:
 
 
 class SeamCheck:
-    """Whether blends and chunks keep limits.
+    """Whether quintic blends and chunks keep limits.
 
     Args:
         limits: Of the machine.
@@ -107,9 +107,9 @@ class SeamCheck:
         self._torque = none if every["torque"] is None else every["torque"]
         self._slew = none if every["torque_slew"] is None else every["torque_slew"]
 
-    def accepts(self, blend: Any, sent: Array, prior: Array, new: Array, steps: int) -> bool:
-        """Whether a blend of `seams.join` that mixes `steps` commands keeps all limits up to its end."""
-        curve = BlendCurve.of(blend, sent, prior, new, steps, self._control_dt)
+    def accepts(self, sent: Array, new: Array, steps: int) -> bool:
+        """Whether a quintic of `seams.join` that bridges `steps` commands keeps all limits up to its end."""
+        curve = BlendCurve.of(sent, new, steps, self._control_dt)
         if any((curve.peak(d) > bound * _ROUNDING).any() for d, bound in self._bounds.items()):
             return False
         return self._torques is None or self._bears(curve.motion(), self._torques)

@@ -1,4 +1,4 @@
-"""Support of contacts: its plane, the zero moment point in its polygon, an inset as rows; centroidal momentum.
+"""Support of contacts: the zero moment point in its polygon; centroidal momentum.
 
 Source: appendix "Centroidal momentum dynamics" and "Physical contact feasibility constraints", third condition. The
 zero moment point is where, on the plane of support, the contact forces have no tangential moment. Forces that push
@@ -13,76 +13,18 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, finite_array, finite_arrays, non_negative
-from safe_wrappers.control.contact.friction_cone import tangents
+from safe_wrappers.checks import Array, finite_arrays
 from safe_wrappers.control.numerics.compiled import compiled, hypot
 from safe_wrappers.errors import ConfigurationError
 
 COPLANAR_M = 0.01
 """m; the largest distance of coplanar contacts from their plane."""
-COPLANAR_RAD = 0.05
-"""rad; the largest angle between their normals and the mean."""
 _ROUNDING = 1e-12
 """Of an angle's cosine, and of the points' extent: a narrower hull is a line."""
-
-
-class Plane(NamedTuple):
-    """A point of a plane of support (3,), m, its unit normal (3,) towards the robot, two unit tangents (2, 3)."""
-
-    origin: Array
-    normal: Array
-    axes: Array
-
-    def flat(self, points: ArrayLike) -> Array:
-        """Coordinates in the plane of points of the world (..., 3), projected onto it: shape (..., 2), m."""
-        p = finite_array("points", points)
-        return np.asarray((p - self.origin) @ self.axes.T)
-
-
-def common_plane(points: ArrayLike, normals: ArrayLike) -> Plane | None:
-    """The plane of coplanar contacts, or None where they are at several heights or face different ways.
-
-    Args:
-        points: Shape (k, 3), m.
-        normals: Unit normals, shape (k, 3).
-    """
-    p, n = finite_arrays(points=points, normals=normals)
-    if p.ndim != 2 or p.shape[1] != 3:
-        raise ConfigurationError(f"points and normals must have shape (k, 3), got {p.shape}")
-    mean = n.sum(axis=0)
-    length = float(np.linalg.norm(mean))
-    if not len(p) or length < 0.5 * len(p):
-        return None
-    mean = mean / length
-    origin = p.mean(axis=0)
-    level = bool((np.abs((p - origin) @ mean) <= COPLANAR_M).all())
-    facing = bool((n @ mean >= np.cos(COPLANAR_RAD) - _ROUNDING).all())
-    return Plane(origin, mean, tangents(mean)) if level and facing else None
-
-
-def support_rows(points: ArrayLike, ground: Plane, inset: float) -> Array | None:
-    """The inset as half-spaces on the stacked contact forces: `rows @ forces.ravel() <= 0`, shape (v, 3 k).
-
-    Together with forces that push, the rows hold where the zero moment point is inside the inset polygon or nothing
-    presses. An inset that leaves nothing of the polygon allows no pressure at all. None: the contacts are on a line.
-
-    Args:
-        points: In the plane, shape (k, 3), m.
-        ground: The plane.
-        inset: m, at least 0.
-    """
-    from scipy.spatial import ConvexHull, QhullError  # here: SciPy takes a while to import
-
-    flat = ground.flat(points)
-    non_negative("inset", inset, "m")
-    try:
-        outward = ConvexHull(flat).equations
-    except (QhullError, ValueError):
-        return None
-    weights = -(outward[:, :2] @ flat.T + outward[:, 2:]) - inset
-    return np.asarray((-weights[:, :, None] * ground.normal).reshape(len(weights), -1))
+_FACING = math.cos(0.05) - _ROUNDING
+"""The cosine of the largest angle between their normals and the mean."""
 
 
 def support_distances(instant: ArrayLike, points: ArrayLike, normals: ArrayLike, forces: ArrayLike) -> Array:
@@ -101,75 +43,36 @@ def support_distances(instant: ArrayLike, points: ArrayLike, normals: ArrayLike,
     if p.ndim != 2 or p.shape[1] != 3 or when.shape != p.shape[:1]:
         raise ConfigurationError(f"expected instants (n,) and points (n, 3), got {when.shape} and {p.shape}")
     order = np.argsort(when, kind="stable")
-    ends = np.append(np.flatnonzero(np.diff(when[order])) + 1, len(when))
-    return _distances(p[order], n[order], f[order], ends, COPLANAR_M, math.cos(COPLANAR_RAD) - _ROUNDING)
+    each = np.split(order, np.flatnonzero(np.diff(when[order])) + 1)
+    found = np.array([_distance(p[these], n[these], f[these]) for these in each])
+    return np.asarray(found[found != math.inf])
 
 
 @compiled
-def _distances(
-    points: Array, normals: Array, forces: Array, ends: NDArray[np.int64], apart: float, facing: float
-) -> Array:
-    """Of contacts in the order of their instants, which end before these."""
-    found, count, first = np.empty(len(ends)), 0, 0
-    axes, flat, x = np.empty((3, 3)), np.empty((len(points), 2)), np.empty(2)
-    for end in ends:
-        these = slice(first, end)
-        first = end
-        if _on_plane(points[these], normals[these], forces[these], apart, facing, axes, flat, x):
-            distance = _from_edges(flat[: end - these.start], x)
-            if distance != math.inf:
-                found[count] = distance
-                count += 1
-    return found[:count]
-
-
-@compiled
-def _on_plane(
-    points: Array,
-    normals: Array,
-    forces: Array,
-    apart: float,
-    facing: float,
-    axes: Array,
-    flat: Array,
-    x: Array,
-) -> bool:
-    """Write contacts of one plane and their zero moment point in its coordinates; False if there is none.
-
-    `axes` are for the plane's normal and two tangents.
-    """
-    k, mean = len(points), axes[0]
-    if k < 3:
-        return False
-    origin, moment, pressure = np.zeros(3), np.zeros(3), 0.0
-    mean[:] = 0.0
-    for i in range(k):
-        mean += normals[i]
-        origin += points[i]
+def _distance(points: Array, normals: Array, forces: Array) -> float:
+    """Of the contacts of one instant; infinite where there is no polygon, or nothing presses."""
+    k, mean = len(points), _total(normals)
     length = math.sqrt(_dot(mean, mean))
-    if length < 0.5 * k:
-        return False
+    if k < 3 or length < 0.5 * k:
+        return math.inf
     mean /= length
-    origin /= k
+    origin, force, moment = _total(points) / k, _total(forces), np.zeros(3)
     for i in range(k):
-        arm, force = points[i] - origin, forces[i]
-        if abs(_dot(arm, mean)) > apart or _dot(normals[i], mean) < facing:
-            return False
-        pressure += _dot(force, mean)
-        moment += _cross(arm, force)
+        arm = points[i] - origin
+        if abs(_dot(arm, mean)) > COPLANAR_M or _dot(normals[i], mean) < _FACING:
+            return math.inf
+        moment += _cross(arm, forces[i])
+    pressure = _dot(force, mean)
     if not pressure > 0.0:
-        return False
-    axes[1] = 0.0
-    axes[1, np.argmin(np.abs(mean))] = 1.0  # the axis of the world that is farthest from the normal
-    axes[1] -= _dot(axes[1], mean) * mean
-    axes[1] /= math.sqrt(_dot(axes[1], axes[1]))
-    axes[2] = _cross(mean, axes[1])
-    zmp = _cross(mean, moment) / pressure
-    for axis in range(2):
-        x[axis] = _dot(zmp, axes[1 + axis])
-        for i in range(k):
-            flat[i, axis] = _dot(points[i] - origin, axes[1 + axis])
-    return True
+        return math.inf
+    first = np.zeros(3)
+    first[np.argmin(np.abs(mean))] = 1.0  # the axis of the world that is farthest from the normal
+    first -= _dot(first, mean) * mean
+    first /= math.sqrt(_dot(first, first))
+    zmp, second, flat = _cross(mean, moment) / pressure, _cross(mean, first), np.empty((k, 2))
+    for i in range(k):
+        flat[i, 0], flat[i, 1] = _dot(points[i] - origin, first), _dot(points[i] - origin, second)
+    return _from_edges(flat, np.array([_dot(zmp, first), _dot(zmp, second)]))
 
 
 @compiled
@@ -198,6 +101,14 @@ def _from_edges(points: Array, x: Array) -> float:
     if longest == 0.0 or width <= _ROUNDING * longest:
         return math.inf
     return inside if inside >= 0.0 else -outside
+
+
+@compiled
+def _total(rows: Array) -> Array:
+    total = np.zeros(3)
+    for row in rows:
+        total += row
+    return total
 
 
 @compiled

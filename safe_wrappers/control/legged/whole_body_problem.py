@@ -36,8 +36,6 @@ class WholeBodyProblem:
         first_tangents: Direction of each pyramid's first edge, shape (k, 3); None for a default.
         acceleration_rows: G in `G qacc <= g`, shape (m, nv) (`predicted_position_rows` makes some).
         acceleration_limits: g, shape (m,).
-        force_rows: R in `R f <= r`, f the stacked contact forces, shape (m', 3 k) (`support_rows` makes some).
-        force_limits: r, shape (m',).
     """
 
     inertia: Array
@@ -56,8 +54,6 @@ class WholeBodyProblem:
     first_tangents: Array | None = None
     acceleration_rows: Array | None = None
     acceleration_limits: Array | None = None
-    force_rows: Array | None = None
-    force_limits: Array | None = None
     stance: NDArray[np.intp] = field(init=False)
     """Indices of the contacts that are to stay."""
     opening: NDArray[np.intp] = field(init=False)

@@ -3,14 +3,13 @@
 One source serves both. Without fused operations, and with `math`'s own functions, both give the same bits; only
 `math.hypot` differs, so use `hypot` of this module. The environment variable ``SAFE_WRAPPERS_COMPILED=0`` switches
 machine code off. It is cached beside the sources, or in the user's cache where that folder is read-only. Compiling
-takes seconds: where it has taken two in a process, one line on stderr says so.
+takes seconds: one line on stderr says so.
 """
 
 import contextlib
 import math
 import os
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,8 +28,6 @@ def _compiler() -> Callable[..., Any] | None:
     return numba.njit
 
 
-_SILENT_S = 2.0
-"""How long a process compiles without a word."""
 _COMPILING = (
     "safe-wrappers: compiling for this machine, once (10 to 40 s); later starts load what is compiled"
 )
@@ -41,24 +38,15 @@ def _announce_waits() -> None:
     from numba.core import event
 
     class Notice(event.Listener):
-        def __init__(self) -> None:
-            self._begun: list[float] = []  # of the functions that are being compiled, the outermost first
-            self._spent_s, self._written = 0.0, False
+        written = False
 
         def on_start(self, event: Any) -> None:
-            if _is_ours(event):
-                self._begun.append(time.monotonic())
+            if _is_ours(event) and not self.written:
+                self.written = True
+                print(_COMPILING, file=sys.stderr, flush=True)
 
         def on_end(self, event: Any) -> None:
-            if not _is_ours(event):
-                return
-            spent_s = self._spent_s + time.monotonic() - self._begun[0]
-            self._begun.pop()
-            if not self._begun:
-                self._spent_s = spent_s
-            if spent_s >= _SILENT_S and not self._written:
-                self._written = True
-                print(_COMPILING, file=sys.stderr, flush=True)
+            """Nothing is said."""
 
     event.register("numba:compile", Notice())
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, finite_array, float_array, positive
+from safe_wrappers.checks import Array, finite_arrays, float_array, positive
 from safe_wrappers.errors import ConfigurationError
 
 
@@ -42,7 +42,7 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
         flow: v, m/s, of the same shape, positive together with F into the component that u goes into.
         impedance: b > 0, N s/m.
     """
-    f, v = _of_one_shape(effort=effort, flow=flow)
+    f, v = finite_arrays(effort=effort, flow=flow)
     b = positive("impedance", impedance, "N s/m")
     root = math.sqrt(2.0 * b)
     return Waves(np.asarray((f + b * v) / root), np.asarray((f - b * v) / root))
@@ -56,7 +56,7 @@ def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) 
         incoming: w, sqrt(W), of the same shape.
         impedance: b > 0, N s/m.
     """
-    v, w = _of_one_shape(flow=flow, incoming=incoming)
+    v, w = finite_arrays(flow=flow, incoming=incoming)
     b = positive("impedance", impedance, "N s/m")
     root = math.sqrt(2.0 * b)
     return EffortAndWave(np.asarray(b * v + root * w), np.asarray(root * v + w))
@@ -115,12 +115,3 @@ def port_energy(effort: Array, flow: Array, time_s: float) -> float:
     if not math.isfinite(energy):
         raise ConfigurationError(f"effort, flow and so their product must be finite; got {effort}, {flow}")
     return energy
-
-
-def _of_one_shape(**values: ArrayLike) -> tuple[Array, Array]:
-    """Two finite arrays, without broadcasting."""
-    first, second = (finite_array(name, value) for name, value in values.items())
-    if first.shape != second.shape:
-        a, b = values
-        raise ConfigurationError(f"expected {a} and {b} of one shape, got {first.shape} and {second.shape}")
-    return first, second

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.control.teleop.passivity import port_energy, port_vector
-from safe_wrappers.errors import ConfigurationError
 
 
 class WaveLine:
@@ -37,7 +36,6 @@ class WaveLine:
     def __init__(self, time_s: float, components: int = 1) -> None:
         self._time = positive("time_s", time_s, "s")
         self._components = whole_number("components", components, 1)
-        self._last_sent = -1
         self._flying: dict[int, float] = {}
         self._queue: list[tuple[int, float, tuple[float, ...]]] = []
         self.put_in_j = self.put_out_j = self.lost_j = 0.0
@@ -53,45 +51,26 @@ class WaveLine:
         return math.fsum(energy for _, energy, _ in self._queue)
 
     def send(self, wave: ArrayLike, sequence: int) -> None:
-        """Note a wave that leaves, sqrt(W), shape (m,) or a number.
-
-        Raises:
-            ConfigurationError: For a wave of another shape or not finite, and a sequence number that does not rise.
-        """
-        if sequence <= self._last_sent:
-            raise ConfigurationError(f"sequence must rise, be at least 0; {sequence} after {self._last_sent}")
-        energy = self._energy(self._wave(wave))
-        self._last_sent = int(sequence)
-        self._flying[self._last_sent] = energy
+        """Note a finite wave that leaves, sqrt(W), shape (m,) or a number; each has a sequence number of its own."""
+        energy = self._energy(port_vector("wave", wave))
+        self._flying[sequence] = energy
         self.put_in_j += energy
 
     def lose(self, sequence: int) -> None:
-        """Declare a packet lost; its later arrival is ignored. Until then it counts as in flight.
-
-        Raises:
-            ConfigurationError: If it is not in flight.
-        """
-        if sequence not in self._flying:
-            raise ConfigurationError(f"packet {sequence} is not in flight, so it cannot get lost")
+        """Declare a packet lost; its later arrival is ignored. Until then it counts as in flight."""
         self.lost_j += self._flying.pop(sequence)
 
     def deliver(self, packets: Iterable[tuple[int, ArrayLike]]) -> Array:
         """The wave put out during this tick, sqrt(W), shape (m,). Call it once per tick, arrivals or not.
 
         Args:
-            packets: Arrivals since the last tick, (sequence, wave) in any order. Duplicates are ignored.
-
-        Raises:
-            ConfigurationError: For a packet that was never sent, or a wave of another shape or not finite.
+            packets: Arrivals since the last tick, (sequence, wave) in any order. What is not in flight is ignored.
         """
-        arrived = [(sequence, self._wave(given)) for sequence, given in packets]
-        unknown = [sequence for sequence, _ in arrived if sequence > self._last_sent]
-        if unknown:
-            raise ConfigurationError(f"packets {unknown} arrived and were never sent")
+        arrived = [(sequence, port_vector("wave", given)) for sequence, given in packets]
         for sequence, wave in arrived:
             if sequence in self._flying:
                 # The energy as sent counts, not that of the received wave.
-                entry = int(sequence), self._flying.pop(sequence), tuple(wave.tolist())
+                entry = sequence, self._flying.pop(sequence), tuple(wave.tolist())
                 heapq.heappush(self._queue, entry)
         if not self._queue:
             return np.zeros(self._components)
@@ -114,10 +93,3 @@ class WaveLine:
 
     def _energy(self, wave: Array) -> float:
         return 0.5 * port_energy(wave, wave, self._time)
-
-    def _wave(self, given: ArrayLike) -> Array:
-        wave = port_vector("wave", given)
-        if wave.size != self._components:
-            raise ConfigurationError(f"expected a wave of {self._components} components, got {wave.size}")
-        self._energy(wave)
-        return wave

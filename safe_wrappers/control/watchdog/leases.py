@@ -24,6 +24,8 @@ _TINY = 1e-300
 """Absolute reserve for subnormal numbers, whose relative precision is lost."""
 _LONGEST = 1e300
 """s; largest finite lease, so that nothing overflows."""
+_AT_ONCE = 1e300
+"""m/s^2; a braking that takes no way."""
 
 
 def longest_lease(
@@ -137,17 +139,7 @@ def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: A
         closing_speed: Bound on how fast h may fall under any command until the brakes hold, U/s, shape (...).
         delays_s: The other four delays, s, at least 0, shape (...).
     """
-    given = (np.asarray(x, dtype=np.float64) for x in (room, closing_speed, delays_s))
-    h, closing, delays = np.broadcast_arrays(*given)
-    _not_negative(delays_s=delays)
-    known = np.isfinite(h) & np.isfinite(closing) & np.isfinite(delays)
-    falls = known & (closing > 0.0)
-    with np.errstate(over="ignore"):
-        tau = np.minimum(np.where(falls, h, 0.0) / np.where(falls, closing, 1.0), _LONGEST)
-        known_delays = np.where(known, delays, 0.0)
-        lease = tau - known_delays - _ROUNDING * (np.abs(tau) + known_delays) - _TINY
-    lease = np.where(falls, lease, np.where(known & (h > 0.0), np.inf, -np.inf))
-    return np.asarray(np.where(np.isnan(lease), -np.inf, lease))
+    return longest_lease(room, closing_speed, _AT_ONCE, delays_s)
 
 
 def _not_negative(**values: ArrayLike) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
-from safe_wrappers.plants.control_loop import ControlLoop, checked_loop
+from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
@@ -48,7 +48,8 @@ class MujocoPlant(Plant):
         delay_s: Evidence age plus detection plus actuation delay in s, over which this plant's model predicts.
         data: A function of the unwrapped env that returns its data; None: they are its `.data`.
         control_dt: How long the env holds an action, s; needed where it has no `dt` or `frame_skip`.
-        loop: The `plants.ControlLoop` that your controller closes; `margin_left_deg` is what is left of its margin.
+        loop: The `plants.ControlLoop` that your controller closes; a warning says where too little of its margin is
+            left.
 
     Attributes:
         action_map: By which the env makes controls of actions, where the action space is not the control range; found
@@ -58,7 +59,6 @@ class MujocoPlant(Plant):
         UnsupportedEnvError: No MuJoCo model, a disabled actuator, one not affine, or actions that no map fits.
     """
 
-    bounds_are_action_space: ClassVar[bool] = True
     can_brake: ClassVar[bool] = True
     model: mujoco.MjModel  #: the plant's own
     data: mujoco.MjData  #: likewise; at the present state only after `forward` or `pose`
@@ -77,10 +77,13 @@ class MujocoPlant(Plant):
         loop: ControlLoop | None = None,
     ) -> None:
         self._given, self._functions = binding.given_and_functions(model, data)
+        if not isinstance(loop, ControlLoop | None):
+            example = "sw.plants.ControlLoop(crossover=4.0, phase_margin_deg=60.0)"
+            raise ConfigurationError(f"loop is a ControlLoop, such as {example}, or None; got {loop!r}")
         self._given_dt = control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._pending: deque[Array] = deque()
-        self._factors, self.loop = (1.0, 1.0), checked_loop(loop)
+        self._factors, self._loop = (1.0, 1.0), loop
         self._raw: Any = None
         self._sent: Array | None = None
         self._outdated = False
@@ -95,7 +98,8 @@ class MujocoPlant(Plant):
         bound_before, self._raw, self._env = self._raw is not None, raw, env
         self._env_model = self.model = None
         self._take_model()
-        self._check_loop(bound_before)
+        if self._loop is not None and not bound_before:
+            self._loop.warn_if_short(self.control_dt, self.delay_s)
 
     def _take_model(self) -> None:
         """Read the model anew: at binding, and when the env's has changed."""

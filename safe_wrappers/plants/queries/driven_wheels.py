@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle.slip import Wheel
@@ -15,7 +14,6 @@ from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _ROUND = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("SPHERE", "CYLINDER", "CAPSULE")]
-_FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
 _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
 _FLAT = 1e-6  # level part of an axle's direction below which it has none
 
@@ -74,13 +72,11 @@ class DrivenWheels:
         for i, body in enumerate(truth.jnt_bodyid[self._joints]):
             self._wheel_of_geom[:-1][truth.geom_bodyid == body] = i
         self._force = np.zeros(6)
-        self._fixed_drive: tuple[Array, Array] | None = None
         self.constants(plant)
 
     def constants(self, plant: MujocoPlant) -> Wheel:
         """Radius, inertia about the axle and damping in the plant's present model; also sets `feedback`."""
         m, data = plant.model, mujoco.MjData(plant.model)
-        self._fixed_drive = None
         mujoco.mj_forward(m, data)
         # The torque of a servo that a forcerange may clamp counts as constant, not as feedback.
         servos = (m.actuator_biastype == _AFFINE_BIAS) & ~m.actuator_forcelimited.astype(bool)
@@ -145,14 +141,8 @@ class DrivenWheels:
         """Torque of the drives without `feedback`, shape (n,), N m, in an env's last physics substep."""
         return np.asarray(data.qfrc_actuator[self.dofs] + self._opposing @ data.actuator_velocity)
 
-    def driven_by(self, controls: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which wheels, shape (n,), any of the given controls, shape (nu,), drives."""
-        return np.asarray((self._drives & controls).any(axis=1))
-
     def drive(self, plant: MujocoPlant) -> tuple[Array, Array]:
         """`torque = bias + effect @ u - feedback * rate` inside the actuators' clamps: (n,) in N m and (n, nu)."""
-        if self._fixed_drive is not None:
-            return self._fixed_drive
         m, driven = plant.model, self._drives
         gear = m.actuator_gear[:, 0]
         joint = np.where(driven.any(axis=0), m.actuator_trnid[:, 0], 0)
@@ -160,11 +150,7 @@ class DrivenWheels:
         velocity = gear * plant.qvel[m.jnt_dofadr[joint]]
         gain, bias = plant.actuators.gain_and_bias(length, velocity)
         at_rest = (driven * (gear * bias)).sum(axis=1) + self._opposing @ velocity
-        drive = np.asarray(at_rest), np.asarray(driven * (gear * gain))
-        motors = (m.actuator_gaintype == _FIXED_GAIN) & (m.actuator_biastype == _NO_BIAS)
-        if motors[driven.any(axis=0)].all():
-            self._fixed_drive = drive
-        return drive
+        return np.asarray(at_rest), np.asarray(driven * (gear * gain))
 
 
 def _round_geom(plant: MujocoPlant, joint: int) -> int:

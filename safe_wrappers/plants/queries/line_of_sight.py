@@ -1,8 +1,6 @@
 """LineOfSight: which points a camera or a site of a MuJoCo model sees, by rays."""
 
 import math
-from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,7 +18,7 @@ _SKIN_M = 1e-9  # a surface this close in front of a point does not hide it: the
 class LineOfSight:
     """Rays from a sensor to points, all in one call of MuJoCo.
 
-    Every visible geom (alpha above 0) of the given groups stops a ray, except those of the sensor's own body, unless
+    Every visible geom (alpha above 0) stops a ray, except those of the sensor's own body, unless
     that is the world. A ray that first meets a body, or a descendant of it, has reached the points on that body.
 
     Args:
@@ -30,7 +28,6 @@ class LineOfSight:
         view_deg: Full opening angle of the visible cone, degrees, around a camera's direction of view or a site's z
             axis. None: a camera's own `fovy`, all around for a site.
         range_m: Range of sight, m.
-        groups: Geom groups (0 to 5) that stop rays; None: all.
 
     Raises:
         UnknownNameError: No camera or site of that name; the message lists all names.
@@ -44,7 +41,6 @@ class LineOfSight:
         site: str | None,
         view_deg: float | None,
         range_m: float,
-        groups: Sequence[int] | None,
     ) -> None:
         self.model = model
         self.data = mujoco.MjData(model)  # kinematics and velocities of the state that was read last
@@ -56,10 +52,6 @@ class LineOfSight:
         self._cosine = math.cos(math.radians(0.5 * min(view_deg, 360.0)))
         self._all_around = view_deg >= 360.0
         self._range = range_m
-        self._groups: Any = None
-        if groups is not None:
-            self._groups = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
-            self._groups[list(groups)] = 1
         self._inside = np.eye(model.nbody, dtype=bool)  # whether body i is body j or a descendant of it
         for body in range(1, model.nbody):
             self._inside[body] |= self._inside[model.body_parentid[body]]
@@ -106,7 +98,7 @@ class LineOfSight:
         hit, at = np.full(which.size, -1, dtype=np.int32), np.zeros(which.size)
         normals = (None,) if _TAKES_NORMALS else ()
         own_body = self.body or -1  # a sensor on the world does not see through walls
-        rays = self.model, self.data, eye, directions.reshape(-1), self._groups, 1, own_body
+        rays = self.model, self.data, eye, directions.reshape(-1), None, 1, own_body
         mujoco.mj_multiRay(*rays, hit, at, *normals, which.size, float(lengths[which].max()) + 1.0)
         hitting = hit >= 0
         blocker = self.model.geom_bodyid[np.where(hitting, hit, 0)]

@@ -17,10 +17,7 @@ from safe_wrappers.plants.mujoco.model import Constants, every_constant
 _DRAWING = ("pygame", "glfw", "OpenGL", "moviepy")
 _SHARED = (gym.Space, gym.envs.registration.EnvSpec, ModuleType)
 _LOCKS = {type(made()): made for made in (threading.Lock, threading.RLock)}
-_WAYS_OUT = (
-    "Say how its state is saved and restored, snapshot=(save, restore) with save(env) and restore(env, state) of the "
-    "unwrapped env, or simulate in child processes, SimulatorPlant(snapshot='fork'), where the system has them"
-)
+_WAYS_OUT = "Simulate in child processes, SimulatorPlant(snapshot='fork'), where the system has them"
 _RECORDING = ("RecordVideo", "HumanRendering", "RenderCollection")
 Memo = dict[int, Any]
 

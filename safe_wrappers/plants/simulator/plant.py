@@ -2,32 +2,27 @@
 
 import contextlib
 import copy
-import math
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 
-from safe_wrappers.checks import Array, positive, whole_number
+from safe_wrappers.checks import Array, whole_number
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import name_of, reward_numbers
+from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.binding import physics_steps
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
 from safe_wrappers.plants.simulator.simulation import (
     Env,
     Simulation,
-    Snapshot,
     check_replay,
     differing,
-    other_noise,
     simulation_of,
 )
-
-_INSTEAD = '(h may read env.data, with sees="env")'
 
 
 def known_substeps(raw: Any) -> int:
@@ -38,86 +33,47 @@ def known_substeps(raw: Any) -> int:
         return 1
 
 
-class Substeps:
-    """Measures a rollout at MuJoCo's substeps.
+@contextlib.contextmanager
+def each_substep(raw: Any, look: Callable[[], None]) -> Iterator[None]:
+    """Let an env simulate substep by substep, which MuJoCo makes the same of, bit for bit, and look after each."""
+    simulate = raw._step_mujoco_simulation
 
-    Attributes:
-        why_not: Why they cannot be measured, once that is known.
-    """
+    def one_by_one(ctrl: Any, n_frames: int) -> None:
+        for _ in range(n_frames):
+            simulate(ctrl, 1)
+            look()
 
-    def __init__(self, measure: Measure | None, sees: str) -> None:
-        self._measure, self._sees, self._values, self.why_not = measure, sees, list[float](), ""
-
-    @contextlib.contextmanager
-    def of(self, raw: Any) -> Iterator[None]:
-        """Let an env simulate substep by substep, which MuJoCo makes the same of, bit for bit."""
-        if not self._sees:
-            yield
-            return
-        simulate = raw._step_mujoco_simulation
-
-        def one_by_one(ctrl: Any, n_frames: int) -> None:
-            for _ in range(n_frames):
-                simulate(ctrl, 1)
-                self._look(raw)
-
-        raw._step_mujoco_simulation = one_by_one
-        try:
-            yield
-        finally:
-            del raw._step_mujoco_simulation
-
-    def _look(self, raw: Any) -> None:
-        assert self._measure is not None
-        if self._sees != "env" and not hasattr(raw, "_get_obs"):
-            self.why_not = f"this env has no _get_obs() {_INSTEAD}"
-        if self.why_not:
-            return
-        try:
-            observation = None if self._sees == "env" else raw._get_obs()
-            self._values.append(self._measure(View(raw, observation, {})))
-        except KeyError as missing:
-            self.why_not = f"h reads {missing} of info, which only a whole step has"
-
-    def least(self, value: float, view: View) -> float:
-        """The least of the step that has just ended, with the value at its end."""
-        values, self._values = self._values, []
-        if values and self._sees != "env" and differing("", view.env._get_obs(), view.observation):
-            self.why_not = (
-                f"a wrapper inside the filter changes the observation, or it is not the same twice {_INSTEAD}"
-            )
-        return float(np.min([*values, value]))
+    raw._step_mujoco_simulation = one_by_one
+    try:
+        yield
+    finally:
+        del raw._step_mujoco_simulation
 
 
 _ROUNDING = 1e-6  # of float32
+_CHECK_S = 2.0  # for the check at binding
 
 
 class SimulatorPlant(RolloutPlant):
     """Rolls out actions in the env itself, from its present state, with all wrappers inside the filter.
 
-    No dynamics are written down. By default the env is copied, MuJoCo's state included; an env with `get_state` and
-    `set_state`, or `clone_state` and `restore_state`, is restored by these. At binding random steps are made in the
-    simulation and in the env: both must agree bit for bit, or the env is refused.
+    No dynamics are written down. By default the env is copied, MuJoCo's state included. At binding random steps are
+    made in the simulation and in the env: both must agree bit for bit, or the env is refused.
 
     **It knows what will be drawn**: the random generator of the env belongs to its state, so that a rollout has the
-    noise that the env will have. Only a simulator has this privilege; `same_noise=False` takes it away, and then
-    rollouts are samples, and prove nothing about the env. It reseeds, in the simulation, the generators of NumPy and
-    of `random` that the env, its wrappers or anything in them holds.
+    noise that the env will have. Only a simulator has this privilege.
 
     **After every step** what the env has returned is compared with the rollout of the executed action. From the first
     difference on (a generator that copies share, a clock, another process) nothing is proved, and `cbf/mismatch` says
     at which steps it was.
 
     Args:
-        snapshot: `(save, restore)`: functions `save(env)` and `restore(env, state)` of the unwrapped env, which is
-            then itself simulated; or "fork", which simulates in a child process, for envs that cannot be copied, such
-            as Box2D's (a model as backup then computes in the child, where torch must have one thread). None: see
-            above.
+        snapshot: "fork" simulates in a child process, for envs that cannot be copied, such as Box2D's (a model as
+            backup then computes in the child, where torch must have one thread). None: see above.
         control_dt: Control interval, s; None takes the env's `dt`. An env without `dt` has none, and wrappers that
             count in seconds ask for it.
-        same_noise: Whether rollouts draw the random numbers that the env will draw.
-        check_steps: Random steps of the check at binding; 0 checks nothing.
-        check_s: How long this check may take, s, before it ends with fewer steps, and a warning.
+        check_steps: Random steps of the check at binding; 0 checks nothing. At most 2 s: a warning says where
+            that was too few.
 
     Attributes:
         checked_steps: How many steps the check has compared.
@@ -136,19 +92,17 @@ class SimulatorPlant(RolloutPlant):
 
     def __init__(
         self,
-        snapshot: Snapshot = None,
+        snapshot: Literal["fork"] | None = None,
         control_dt: float | None = None,
-        same_noise: bool = True,
         check_steps: int = 1000,
-        check_s: float = 2.0,
     ) -> None:
-        self._snapshot, self.same_noise = snapshot, bool(same_noise)
+        self._snapshot = snapshot
         super().__init__(control_dt)
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
-        self.check_s, self.checked_steps = positive("check_s", check_s, "s"), 0
-        self.exact = self.same_noise and self.check_steps > 0
+        self.checked_steps = 0
+        self.exact = self.check_steps > 0
         self._simulation: Simulation | None = None
-        self._compares, self._compared_substeps = self.exact, False
+        self._compares = self.exact
         self._sent, self._answered = b"", False
         self._foreseen: dict[bytes, tuple[Any, float | None, Measure | None]] = {}
 
@@ -161,13 +115,11 @@ class SimulatorPlant(RolloutPlant):
         stepping = getattr(type(env.unwrapped), "_step_mujoco_simulation", None)
         self.judges_substeps = stepping is MujocoEnv._step_mujoco_simulation
         if self.check_steps:
-            self.checked_steps = check_replay(self._simulation, self.check_steps, self.check_s)
+            self.checked_steps = check_replay(self._simulation, self.check_steps, _CHECK_S)
             if self.checked_steps < self.check_steps:
-                needed_s = math.ceil(1.2 * self.check_s * self.check_steps / self.checked_steps)
                 warnings.warn(
                     f"the simulation of {name_of(env)} was compared with the env on {self.checked_steps:,} random "
-                    f"steps, which took {self.check_s:g} s, instead of {self.check_steps:,}; for all of them pass "
-                    f"plant=SimulatorPlant(check_s={needed_s})",
+                    f"steps, which took {_CHECK_S:g} s, instead of {self.check_steps:,}",
                     stacklevel=2,
                 )
 
@@ -224,49 +176,39 @@ class SimulatorPlant(RolloutPlant):
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
-        between: str = "",
+        between: bool = False,
     ) -> Rollout:
 
-        def simulated(env: gym.Env[Any, Any]) -> tuple[Rollout, float | None, str]:
-            with contextlib.ExitStack() as stack:
-                if not self.same_noise:
-                    stack.enter_context(other_noise(env, self.observation_id))
-                seen = Substeps(measure, between if self.judges_substeps else "")
-                stack.enter_context(seen.of(env.unwrapped))
-                return rolled_out(env, seen)
+        def simulated(env: gym.Env[Any, Any]) -> tuple[Rollout, float | None]:
+            raw, found, first, passed = env.unwrapped, Rollout(), None, list[float]()
 
-        def rolled_out(env: gym.Env[Any, Any], seen: Substeps) -> tuple[Rollout, float | None, str]:
-            found, action, first = Rollout(), self.action(control), None
-            for step in range(horizon):
-                observation, reward, terminated, truncated, info = env.step(action)
-                view = View(env.unwrapped, observation, info)
-                found.observations.append(observation if step else copy.deepcopy(observation))
-                found.rewards.append(reward_numbers(reward))
-                if measure is not None:
-                    value = measure(view)
-                    first = first if step else value
-                    found.values.append(seen.least(value, view))
-                    if not found.values[-1] >= least:
+            def look() -> None:
+                assert measure is not None
+                passed.append(measure(View(raw, None, {})))
+
+            action = self.action(control)
+            with each_substep(raw, look) if between else contextlib.nullcontext():
+                for step in range(horizon):
+                    observation, reward, terminated, truncated, info = env.step(action)
+                    view = View(raw, observation, info)
+                    found.observations.append(observation if step else copy.deepcopy(observation))
+                    found.rewards.append(float(reward))
+                    if measure is not None:
+                        value = measure(view)
+                        first = first if step else value
+                        found.values.append(float(np.min([*passed, value])))
+                        passed.clear()
+                        if not found.values[-1] >= least:
+                            break
+                    found.ended = bool(terminated or truncated)
+                    found.reached = until is not None and until(view)
+                    if found.ended or found.reached:
                         break
-                found.ended = bool(terminated or truncated)
-                found.reached = until is not None and until(view)
-                if found.ended or found.reached:
-                    break
-                if policy is not None and step + 1 < horizon:
-                    action = policy(view)
-            return found, first, seen.why_not
+                    if policy is not None and step + 1 < horizon:
+                        action = policy(view)
+            return found, first
 
-        found, value, why_not = self.simulation.run(simulated)
-        if between and self.judges_substeps and not (why_not or self._compared_substeps):
-            plain = self.rollout(control, len(found.observations), policy, measure)
-            pairs = zip(plain.observations, found.observations, strict=False)
-            if any(differing("observation", *pair) for pair in pairs):
-                why_not = "to look at this env between them changes what it does"
-            self._compared_substeps = True
-        if why_not:
-            self.judges_substeps = False
-            self.warn_of_substeps(why_not)
-            return self.rollout(control, horizon, policy, measure, least, until)
+        found, value = self.simulation.run(simulated)
         if self._compares:
             self._foreseen[control.tobytes()] = found.observations[0], value, measure
         return found

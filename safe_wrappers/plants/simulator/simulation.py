@@ -1,35 +1,23 @@
 """Simulation: runs a task on an env as it would go on from its present state, and leaves the env as it is."""
 
-import contextlib
 import copy
-import functools
-import gc
-import inspect
-import logging
 import os
 import pickle
-import random
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from types import FunctionType, ModuleType
-from typing import Any, ClassVar, Literal, TypeVar
+from collections.abc import Callable
+from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
 import numpy as np
 
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.env_checks import name_of, reward_numbers, wrappers_of
-from safe_wrappers.plants.simulator.copies import EnvCopier, is_drawn, refuse_finalizers, refuse_recorders
+from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.plants.simulator.copies import EnvCopier, refuse_finalizers, refuse_recorders
 
 T = TypeVar("T")
 Env = gym.Env[Any, Any]
 Task = Callable[[Env], T]
-Save = Callable[[Any], Any]
-"""Takes the unwrapped env; returns its state, which does not change with the env."""
-Restore = Callable[[Any, Any], None]
-"""Takes the unwrapped env and a saved state, and puts it back."""
-Snapshot = tuple[Save, Restore] | Literal["fork"] | None
 
 
 class Simulation(ABC):
@@ -40,8 +28,7 @@ class Simulation(ABC):
     """
 
     remedy: ClassVar[str] = (
-        "Say how to restore all of its state, SimulatorPlant(snapshot=(save, restore)), or simulate in child "
-        "processes, SimulatorPlant(snapshot='fork'), where the system has them"
+        "Simulate in child processes, SimulatorPlant(snapshot='fork'), where the system has them"
     )
     """What to do where the simulation differs from the env."""
 
@@ -79,42 +66,18 @@ class CopiedSimulation(Simulation):
         return CopiedSimulation(EnvCopier(self.env).copy())
 
 
-class RestoredSimulation(Simulation):
-    """On the env itself, whose state is put back by functions; that of its wrappers and its generator by copies."""
-
-    def __init__(self, env: Env, save: Save, restore: Restore) -> None:
-        super().__init__(env)
-        self._save, self._restore = save, restore
-
-    def run(self, task: Task[T]) -> T:
-        raw: Any = self.env.unwrapped
-        wrappers = [(vars(layer), _state_of(layer)) for layer in wrappers_of(self.env)]
-        state = self._save(raw)
-        generator, drawing = copy.deepcopy(raw._np_random), raw.render_mode
-        raw.render_mode = None
-        try:
-            return task(self.env)
-        finally:
-            self._restore(raw, state)
-            raw._np_random, raw.render_mode = generator, drawing
-            for attributes, before in wrappers:
-                attributes.update(before)
-
-
 class ForkedSimulation(Simulation):
     """In a child process, which has the env as it is; its cost grows with the memory of this process."""
 
     remedy = (
         "A child process has all of its memory: what differs lies outside of it (a clock, a file, a server), and the "
-        "env's step must not depend on that; or say how to restore it, SimulatorPlant(snapshot=(save, restore))"
+        "env's step must not depend on that"
     )
 
     def __init__(self, env: Env) -> None:
         super().__init__(env)
         if not hasattr(os, "fork"):
-            raise UnsupportedEnvError(
-                "snapshot='fork' needs a system with os.fork, which this one is not; give (save, restore)"
-            )
+            raise UnsupportedEnvError("snapshot='fork' needs a system with os.fork, which this one is not")
 
     def run(self, task: Task[T]) -> T:
         reading, writing = os.pipe()
@@ -149,120 +112,17 @@ def _answer(task: Task[Any], env: Env, writing: int) -> None:
         os._exit(0)
 
 
-def _state_of(layer: Any) -> dict[str, Any]:
-    """Copies of a wrapper's attributes, but for the env inside and what has no state."""
-    shared = (gym.Env, gym.Space, gym.envs.registration.EnvSpec)
-    try:
-        return {
-            name: value if isinstance(value, shared) or is_drawn(value) else copy.deepcopy(value)
-            for name, value in vars(layer).items()
-        }
-    except Exception as error:
-        raise UnsupportedEnvError(
-            f"{type(layer).__name__} inside the filter cannot be restored ({error}); put it outside"
-        ) from None
-
-
-def simulation_of(env: Env, snapshot: Snapshot) -> Simulation:
-    """The way to simulate an env: the user's, its own functions, else copies.
+def simulation_of(env: Env, snapshot: str | None) -> Simulation:
+    """The way to simulate an env: by copies, or in child processes.
 
     Raises:
         UnsupportedEnvError: It cannot be copied, or there are no child processes.
         ConfigurationError: Another `snapshot`, or a wrapper inside that records.
     """
     refuse_recorders(env)
-    if snapshot == "fork":
-        return ForkedSimulation(env)
-    if snapshot is not None:
-        pair = isinstance(snapshot, tuple | list) and len(snapshot) == 2 and all(map(callable, snapshot))
-        if not pair:
-            raise ConfigurationError(
-                "snapshot is two functions, (save, restore) with save(env) and restore(env, state), or 'fork', or"
-                f" None for the env's own; got {snapshot!r}"
-            )
-        return RestoredSimulation(env, *snapshot)
-    own = _own_functions(env.unwrapped)
-    return CopiedSimulation(env) if own is None else RestoredSimulation(env, *own)
-
-
-def _own_functions(raw: Any) -> tuple[Save, Restore] | None:
-    """`get_state` and `set_state`, or `clone_state` and `restore_state`, of an unwrapped env."""
-    for save, restore in (("get_state", "set_state"), ("clone_state", "restore_state")):
-        functions = getattr(raw, save, None), getattr(raw, restore, None)
-        if not (callable(functions[0]) and callable(functions[1])):
-            continue
-        # Of an Atari env: its random numbers belong to the state.
-        takes = inspect.signature(functions[0]).parameters
-        options = {"include_rng": True} if "include_rng" in takes else {}
-        return functools.partial(_saved, save, options), functools.partial(_put_back, restore)
-    return None
-
-
-def _saved(method: str, options: dict[str, Any], env: Any) -> Any:
-    return copy.deepcopy(getattr(env, method)(**options))
-
-
-def _put_back(method: str, env: Any, state: Any) -> None:
-    getattr(env, method)(copy.deepcopy(state))
-
-
-_GLOBAL: Any = (np.random.get_state.__self__, random.getstate.__self__)  # type: ignore[attr-defined]
-_ELSEWHERE = (type, ModuleType, logging.Logger, random.SystemRandom)
-"""What leads out of an env, and what has no state."""
-
-
-def _generators_of(env: Env) -> list[Any]:
-    """The generators of NumPy and of `random` that an env, its wrappers or anything in them could draw from."""
-    found: list[Any] = []
-    seen: set[int] = set()
-    left: list[Any] = [*_GLOBAL, env, env.unwrapped.np_random]
-    while left:
-        one = left.pop()
-        if id(one) in seen or isinstance(one, _ELSEWHERE) or is_drawn(one):
-            continue
-        seen.add(id(one))
-        if isinstance(one, np.random.Generator | np.random.RandomState | random.Random):
-            found.append(one)
-        elif isinstance(one, FunctionType):
-            left += [cell.cell_contents for cell in one.__closure__ or ()]
-        else:
-            left += gc.get_referents(one)
-    return found
-
-
-@contextlib.contextmanager
-def other_noise(env: Env, seed: int) -> Iterator[None]:
-    """Lets steps draw other random numbers than the env will; afterwards its generators are as they were."""
-    generators = _generators_of(env)
-    before = [_state(one) for one in generators]
-    try:
-        for number, one in enumerate(generators):
-            fresh = np.random.SeedSequence([0x5AFE, seed, number])
-            if isinstance(one, np.random.Generator):
-                one.bit_generator.state = type(one.bit_generator)(fresh).state
-            else:
-                one.seed(int(fresh.generate_state(1)[0]))
-        yield
-    finally:
-        for one, state in zip(generators, before, strict=True):
-            _set_state(one, state)
-
-
-def _state(generator: Any) -> Any:
-    if isinstance(generator, np.random.Generator):
-        return generator.bit_generator.state
-    if isinstance(generator, random.Random):
-        return generator.getstate()
-    return generator.get_state(legacy=False)
-
-
-def _set_state(generator: Any, state: Any) -> None:
-    if isinstance(generator, np.random.Generator):
-        generator.bit_generator.state = state
-    elif isinstance(generator, random.Random):
-        generator.setstate(state)
-    else:
-        generator.set_state(state)
+    if snapshot not in (None, "fork"):
+        raise ConfigurationError(f"snapshot is 'fork' or None, for copies; got {snapshot!r}")
+    return CopiedSimulation(env) if snapshot is None else ForkedSimulation(env)
 
 
 _LONGEST = 10  # steps that are simulated ahead before the env makes them
@@ -308,8 +168,8 @@ def check_replay(simulation: Simulation, steps: int, limit_s: float, seed: int =
     return made
 
 
-Answer = tuple[Any, Any, bool, bool]
-"""Observation, reward (a float, or an array where it is a vector), terminated and truncated."""
+Answer = tuple[Any, float, bool, bool]
+"""Observation, reward, terminated and truncated."""
 
 
 def stretch(env: Env, actions: list[Any]) -> list[Answer]:
@@ -317,9 +177,7 @@ def stretch(env: Env, actions: list[Any]) -> list[Answer]:
     answers: list[Answer] = []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        answers.append(
-            (copy.deepcopy(observation), reward_numbers(reward), bool(terminated), bool(truncated))
-        )
+        answers.append((copy.deepcopy(observation), float(reward), bool(terminated), bool(truncated)))
         if terminated or truncated:
             break
     return answers

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from safe_wrappers.plants.identified import allowed_misses, scores_needed, upper_bound
+from safe_wrappers.plants.identified import allowed_misses, upper_bound
 
 RATES = st.tuples(st.integers(1, 99), st.just(100)) | st.tuples(st.integers(1, 6), st.just(7))
 
@@ -21,7 +21,7 @@ def test_the_bound_is_the_smallest_score_that_enough_scores_do_not_exceed(rate, 
     wanted = (n + 1) * (1 - exact)
     fits = [s for s in sorted(scores) if int((scores <= s).sum()) >= wanted]
     assert upper_bound(scores, float(exact)) == (fits[0] if fits else math.inf)
-    assert math.isfinite(upper_bound(scores, float(exact))) == (n >= scores_needed(float(exact)))
+    assert math.isfinite(upper_bound(scores, float(exact))) == ((n + 1) * exact >= 1)
     assert allowed_misses(n, float(exact)) == math.floor((n + 1) * exact)
 
 

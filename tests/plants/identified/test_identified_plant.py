@@ -76,12 +76,12 @@ def test_windows_of_fresh_episodes_miss_as_often_as_promised():
     draw = np.random.default_rng(0)
     misses, trials = 0, 100
     for trial in range(trials):
-        logged = logs_of(32, seed=trial, steps=25)
+        logged = logs_of(39, seed=trial, steps=25)
         # One fresh episode per plant: misses of different plants are independent.
-        plant = sw.IdentifiedPlant(logged[:31], miss_rate=0.2, held_out=0.62, seed=trial)
+        plant = sw.IdentifiedPlant(logged[:38], miss_rate=0.2, seed=trial)
         assert len(plant.held_out_episodes) == 19
         margins = plant.margins(wall, 12)
-        misses += not fresh_window(plant, margins, logged[31], draw.random())
+        misses += not fresh_window(plant, margins, logged[38], draw.random())
     low, high = binom.interval(0.999, trials, 4 / 20)
     assert low <= misses <= high
 
@@ -173,24 +173,6 @@ def test_a_shield_on_it_keeps_a_cart_from_the_wall(varied):
         changed += info["cbf/intervened"]
     assert out == 0 and changed > 100
     assert max(abs(x[0]) for x, _, _ in drive(CartInWind(), 5)) > 10.0
-
-
-def test_the_monitor_finds_a_wind_eight_times_as_strong_and_not_the_same_one(varied):
-    lost = {}
-    for wind in (1.0, 8.0):
-        env = shielded(CartInWind(wind), sw.IdentifiedPlant(varied))
-        lost[wind] = 0
-        for _, info, first in drive(env, 10):
-            if first:
-                assert math.isnan(info["plant/coverage"]) and not info["plant/coverage_lost"]
-                steps = missed = 0
-                continue
-            steps += 1
-            # The share is that of whole steps: so many of so many.
-            missed = round((1.0 - info["plant/coverage"]) * steps)
-            assert info["plant/coverage"] == pytest.approx(1.0 - missed / steps)
-            lost[wind] += steps == 200 and info["plant/coverage_lost"]
-    assert lost[1.0] <= 1 and lost[8.0] >= 8
 
 
 def test_what_is_judged_is_the_next_measure_against_its_prediction(logs):

@@ -72,32 +72,6 @@ class SharedSight(SharedCart):
         return observation + np.array([self.steps[0], 0.0]), reward, terminated, truncated, info
 
 
-class StateCart(WaitingCart):
-    """Saves and restores itself."""
-
-    calls = 0
-
-    def get_state(self):
-        type(self).calls += 1
-        return [self.x, self.v]
-
-    def set_state(self, state):
-        self.x, self.v = state
-
-
-class CloneCart(WaitingCart):
-    """As Atari's envs do."""
-
-    seen = None
-
-    def clone_state(self, include_rng=False):
-        type(self).seen = include_rng
-        return [self.x, self.v]
-
-    def restore_state(self, state):
-        self.x, self.v = state
-
-
 GRID = ["S..#", ".#..", "...#", "#..G"]
 MOVES = ((0, -1), (1, 0), (0, 1), (-1, 0))
 
