@@ -9,10 +9,10 @@ import pytest
 from chunk_worlds import Line
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import smoothstep_share
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
 import safe_wrappers as sw
-from safe_wrappers.control.handover.vibration import smoothstep_share
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import RigidModelCheck
 from safe_wrappers.wrappers.chunk_queue import Upsampling
