@@ -11,16 +11,12 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.control.handover.curves import hermite_spline
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import BLENDS, LOOK_BACK, Seam, drawn_out, join
+from safe_wrappers.control.handover.seams import LOOK_BACK, Seam, drawn_out, join
 from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE, shortest_latched_blend, smoothstep
 from safe_wrappers.control.handover.vibration import shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck
 from safe_wrappers.wrappers.layer import whole_steps
-
-REPLACE: Final = "replace"
-"""The baseline without a bound on the seam: the new chunk at once."""
-
 
 _VIBRATION_SHARE: Final = 0.01
 """Of the energy that a step of torque leaves in springs, what a blend over the whole action range may leave."""
@@ -55,7 +51,7 @@ class ChunkQueue:
     Args:
         space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
         control_dt: Control interval, s.
-        blend: A blend of `control/handover/seams.py`, or "replace".
+        blend: A blend of `control/handover/seams.py`.
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
         check: Of the machine's limits; None accepts all blends.
@@ -132,7 +128,7 @@ class ChunkQueue:
         starved = control is None
         if control is None:
             control = np.clip(fallback(), self._low, self._high)
-        if starved != self._starved and len(self._sent) and not seam and self._blend in BLENDS:
+        if starved != self._starved and len(self._sent) and not seam:
             # A longer chunk that takes over blends by itself; everything else starts from the last command.
             blend_steps = self._fade_steps(control)
             self._fade = (self._sent[-1], blend_steps, 0)
@@ -157,17 +153,18 @@ class ChunkQueue:
     def _take_over(self, chunk: Chunk) -> tuple[bool, int] | None:
         """Let a chunk take over: whether it is a seam, and its blend's steps; None if no blend keeps the limits."""
         fresh = chunk.commands[self.now - chunk.observed :]
-        joined: Seam | None = None
-        if self._blend in BLENDS and len(chunk.commands) > 1:
-            joined = self._joined(fresh)
-            if joined is None:
-                return None
+        joined = (
+            self._joined(fresh)
+            if len(chunk.commands) > 1
+            else Seam(fresh, 0, np.zeros(len(fresh), dtype=bool))
+        )
+        if joined is None:
+            return None
         self._coming = [c for c in self._coming if c.observed > chunk.observed]
         self._observed = chunk.observed
-        if joined is None:
-            self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
-            return self._blend == REPLACE and len(self._sent) > 0, 0
         self._plan, self._limited, self._asked = joined.plan, joined.limited, fresh
+        if len(chunk.commands) == 1:
+            return False, 0
         self._fade = None
         return len(self._sent) > 0, joined.steps
 
@@ -226,7 +223,7 @@ class ChunkQueue:
     def _sendable(self, control: Array) -> tuple[NDArray[Any], bool]:
         """The command in the env's dtype, within the box and the limit, and whether it had to be held back."""
         control = np.clip(control, self._low, self._high)
-        if self._blend not in BLENDS or not len(self._sent):
+        if not len(self._sent):
             return control.astype(self._dtype), False
         last = self._sent[-1]
         kept = np.clip(control, last - self._step, last + self._step)
@@ -281,16 +278,6 @@ def blend_bounds(
 ) -> tuple[int, Array]:
     """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
     fewest, rate_limits = 0, np.full(space.shape, np.inf)
-    given = {"blend_time": blend_time, "rate_limit": rate_limit, "limits": limits}
-    named = [name for name, one in given.items() if one is not None]
-    if blend == REPLACE:
-        if named:
-            bounded = ", ".join(BLENDS)
-            baseline = f"blend={blend!r} is a baseline that bounds nothing"
-            raise ConfigurationError(
-                f"{baseline}: blend_time, rate_limit, limits and flexible are for {bounded}"
-            )
-        return fewest, rate_limits
     if limits is not None and blend != "quintic":
         raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
     if blend_time is not None:
@@ -306,7 +293,7 @@ def blend_bounds(
         if (rate_limits * control_dt <= resolution).any():
             least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
             raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
-    if not named:
+    if blend_time is None and rate_limit is None and limits is None:
         fewest = sizes.chunk - sizes.horizon - sizes.delay[1]  # the least left-over
         if fewest == 0:
             has = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"
