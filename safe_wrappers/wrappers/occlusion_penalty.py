@@ -9,13 +9,14 @@ import mujoco
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, positive, true_or_false
+from safe_wrappers.checks import Array, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.control.estimation.observability import unobservable_directions
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
+from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.occlusion import (
@@ -24,7 +25,6 @@ from safe_wrappers.wrappers.occlusion import (
     Sensor,
     Track,
     sensor_from,
-    track_from,
     tracked_things,
 )
 
@@ -101,7 +101,7 @@ class OcclusionPenalty(LayerWrapper):
             raise UnsupportedEnvError(f"OcclusionPenalty needs MuJoCo's .model and .data; {raw} has none")
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
-        self.tracks = [track_from(t) for t in tracks]
+        self.tracks = [settings_from(Track, track, "a track") for track in tracks]
         self.sensor = sensor_from(sensor)
         if self.sensor.velocity_std is not None and any(t.published is not None for t in self.tracks):
             raise ConfigurationError("velocity_std: velocities are measured of bodies alone")
@@ -112,7 +112,7 @@ class OcclusionPenalty(LayerWrapper):
             raise ConfigurationError(f"axes is 'xy' or 'xyz', got {axes!r}")
         self.observe = true_or_false("observe", observe)
         plain = {name: getattr(self, name) for name in ("tolerance", "weight", "sigmas")}
-        parts = {"tracks": [t.data() for t in self.tracks], "sensor": self.sensor.data()}
+        parts = {"tracks": plain_data(self.tracks), "sensor": plain_data(self.sensor)}
         self._record(arguments, **parts, **plain, observe=self.observe)
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
         self._control_dt = control_interval(raw)

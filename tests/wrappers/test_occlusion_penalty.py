@@ -329,7 +329,7 @@ def made(env=None, tracks=None, sensor=EYE, tolerance=1.0, **options):
         ({"tracks": []}, ConfigurationError, "at least one Track"),
         ({"tracks": "thing"}, ConfigurationError, "at least one Track"),
         ({"tracks": straight()}, ConfigurationError, "at least one Track"),
-        ({"tracks": ["thing"]}, ConfigurationError, "acceleration_noise"),
+        ({"tracks": ["thing"]}, ConfigurationError, "a track is a Track"),
         ({"tracks": [straight("think")]}, UnknownNameError, "'think'; it has: robot, thing, thing2"),
         ({"tracks": [straight("")]}, UnknownNameError, "no body ''"),
         ({"tracks": [straight("thing"), straight("thing*")]}, ConfigurationError, "twice: thing$"),
