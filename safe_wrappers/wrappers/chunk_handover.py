@@ -27,7 +27,6 @@ from safe_wrappers.wrappers.chunk_queue import (
     Command,
     Upsampling,
     blend_bounds,
-    bounds_for_springs,
 )
 from safe_wrappers.wrappers.commands import FallbackController
 from safe_wrappers.wrappers.layer import (
@@ -145,9 +144,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self.action_space = gym.spaces.Box(low, high, dtype=space.dtype)
         self._fallback = FallbackController(env, fallback, plant)
         springs = self._springs(flexible)
-        if springs is not None:
-            blend_time, rate_limit = bounds_for_springs(springs, space, blend_time, rate_limit)
-        bounds = blend_time, rate_limit, limits
+        bounds = blend_time, rate_limit, limits, springs
         fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, *bounds)
         self._check = None if limits is None else self._bound_check(limits)
         queue = space, self.control_dt, blend, fewest, rate_limits, self._check

@@ -275,47 +275,41 @@ def blend_bounds(
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
     limits: SeamLimits | None = None,
+    springs: RigidModelCheck | None = None,
 ) -> tuple[int, Array]:
-    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
-    fewest, rate_limits = 0, np.full(space.shape, np.inf)
+    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none.
+
+    Springs ask for the time from which on a smoothstep leaves at most 1 % of a step's energy in them, and for the
+    steepest rate of such a blend over the whole action range.
+    """
     if limits is not None and blend != "quintic":
         raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
-    if blend_time is not None:
-        fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
-        available = sizes.chunk - sizes.delay[1]
-        if fewest >= available and sizes.chunk > 1:
-            left = f"{available} control steps of {control_dt} s"
-            longer = f"blend_time = {blend_time} s is longer than a chunk's rest, {left}"
-            raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
+    rates, shortest = (
+        np.full(space.shape, np.inf),
+        0.0 if blend_time is None else positive("blend_time", blend_time, "s"),
+    )
     if rate_limit is not None:
-        rate_limits = _rate_limits(rate_limit, rate_limits.size)
-        resolution = _rounding(space)
-        if (rate_limits * control_dt <= resolution).any():
-            least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
-            raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
-    if blend_time is None and rate_limit is None and limits is None:
-        fewest = sizes.chunk - sizes.horizon - sizes.delay[1]  # the least left-over
+        rates = _rate_limits(rate_limit, rates.size)
+    if springs is not None:
+        calm = shortest_smoothstep(_VIBRATION_SHARE, springs.resonances[0])
+        rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / calm, rates)
+        shortest = max(calm, shortest)
+    resolution = _rounding(space)
+    if (rates * control_dt <= resolution).any():
+        least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
+        raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
+    fewest = max(whole_steps(shortest, control_dt) - 1, 1) if shortest else 0
+    available = sizes.chunk - sizes.delay[1]
+    if fewest >= available and sizes.chunk > 1:
+        left = f"{available} control steps of {control_dt} s"
+        longer = f"blend_time = {shortest} s is longer than a chunk's rest, {left}"
+        raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
+    if not shortest and rate_limit is None and limits is None:
+        fewest = available - sizes.horizon  # the least left-over
         if fewest == 0:
             has = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"
             raise ConfigurationError(f"{has}: no left-over to blend with: pass rate_limit or blend_time")
-    return fewest, rate_limits
-
-
-def bounds_for_springs(
-    check: RigidModelCheck,
-    space: gym.spaces.Box,
-    blend_time: float | None,
-    rate_limit: float | Sequence[float] | None,
-) -> tuple[float, Sequence[float] | float | None]:
-    """Blend time, s, and rate limit, each the stricter of the user's and of what springs ask.
-
-    These ask for the time from which on a smoothstep leaves at most 1 % of a step's energy in them, and for the
-    steepest rate of such a blend over the whole action range, if every component has one.
-    """
-    shortest = shortest_smoothstep(_VIBRATION_SHARE, check.resonances[0])
-    own = np.full(space.shape, np.inf) if rate_limit is None else _rate_limits(rate_limit, space.shape[0])
-    rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / shortest, own)
-    return max(shortest, blend_time or 0.0), rates.tolist() if np.isfinite(rates).all() else rate_limit
+    return fewest, rates
 
 
 def _delay(value: Any) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.faults import OnOffProcess, probability
 from safe_wrappers.wrappers.layer import Env, WrapperRng
@@ -46,8 +46,7 @@ class Link:
     def __post_init__(self) -> None:
         check_fields(self, non_negative, ["delay_s", "jitter_s"], "s")
         object.__setattr__(self, "loss", probability("loss", self.loss))
-        if not isinstance(self.in_order, bool):
-            raise ConfigurationError(f"in_order is True or False, got {self.in_order!r}")
+        true_or_false("in_order", self.in_order)
         if (self.outage_between_s is None) != (self.outage_length_s is None):
             given = f"{self.outage_between_s!r} and {self.outage_length_s!r}"
             raise ConfigurationError(f"an outage needs outage_between_s and outage_length_s, s; got {given}")
