@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 
@@ -26,7 +26,6 @@ class Finding:
             where it could not be measured.
         threshold: From which on it is a symptom.
         unit: Of both.
-        by_driver: The figure of each driver.
         evidence: Further numbers.
         code: Lines that put the wrapper that was tried around `env`; "" where none was.
         advice: What to do besides, or why no wrapper was tried.
@@ -39,7 +38,6 @@ class Finding:
     figure: float = math.nan
     threshold: float = math.nan
     unit: str = ""
-    by_driver: Mapping[str, float] = field(default_factory=dict)
     evidence: Sequence[Evidence] = ()
     code: str = ""
     advice: str = ""
@@ -55,12 +53,6 @@ class Finding:
     def present(self) -> bool:
         """Whether the symptom is there."""
         return self.severity >= 1.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers and words; None for what was not measured."""
-        evidence = [each._asdict() for each in self.evidence]
-        found: dict[str, Any] = _finite(asdict(self) | {"evidence": evidence, "severity": self.severity})
-        return found | {"present": self.present}
 
 
 def _finite(value: Any) -> Any:
@@ -81,14 +73,12 @@ class Diagnosis:
         steps: Control steps of each driver.
         drivers: Names.
         findings: One per symptom.
-        idle_constraints: Those of the env's filter that have refused no action of any driver, by name.
     """
 
     env: str
     steps: int
     drivers: Sequence[str]
     findings: Sequence[Finding]
-    idle_constraints: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         ranked = sorted(
@@ -106,24 +96,16 @@ class Diagnosis:
         return {finding.symptom: finding for finding in self.findings}[symptom]
 
     def as_json(self) -> str:
-        """All of it."""
-        whole = {
-            "env": self.env,
-            "steps": self.steps,
-            "drivers": list(self.drivers),
-            "idle_constraints": list(self.idle_constraints),
-            "findings": [finding.as_dict() for finding in self.findings],
-        }
-        return json.dumps(whole, indent=1, allow_nan=False) + "\n"
+        """All of it; null for numbers that are not finite."""
+        whole = asdict(self)
+        for finding, plain in zip(self.findings, whole["findings"], strict=True):
+            evidence = [each._asdict() for each in finding.evidence]
+            plain.update(evidence=evidence, severity=finding.severity, present=finding.present)
+        return json.dumps(_finite(whole), indent=1, allow_nan=False) + "\n"
 
     def __str__(self) -> str:
         """A table for a terminal, and the lines to paste."""
         lines = [f"{self.env}: {self.steps:,} steps each of {', '.join(self.drivers)}"]
-        if self.idle_constraints:
-            lines.append(
-                f"  Never acted, with any driver: {', '.join(self.idle_constraints)}. A limit may be out of reach, or"
-                " in another unit; angles are in rad."
-            )
         for finding in self.findings:
             verdict = "unknown" if finding.missing else "FOUND" if finding.present else "not found"
             lines.append(f"  {verdict:9} {finding.symptom:17} {_words(finding)}")

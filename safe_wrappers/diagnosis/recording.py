@@ -11,7 +11,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.checks import Array, finite_action
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import check_timing, wrappers_of
 from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
@@ -166,9 +166,9 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
     """Drive the env for so many control steps, episode after episode.
 
     Raises:
-        ConfigurationError: The driver gave an action that is not finite; the env never gets it.
+        ActionError: The driver gave an action of another shape, or one that is not finite; the env never gets it.
     """
-    found = physics(env)
+    found, size = physics(env), math.prod(env.action_space.shape or ())
     env, monitor = _monitored(env)
     rows: list[tuple[Any, ...]] = []
     states: list[tuple[Any, ...]] = []
@@ -177,17 +177,13 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
         control_dt = check_timing(env, None)
     with _spied(env) as (env, spy), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
-        for k in range(steps):
+        for _ in range(steps):
             first = over
             if first:
                 observation, _ = env.reset(seed=seed + episode)
                 getattr(driver, "reset", lambda: None)()
                 episode += 1
-            action = np.asarray(driver(observation))
-            if not np.isfinite(action).all():
-                raise ConfigurationError(
-                    f"the policy's action in control step {k} is not finite: {action}; the env was not given it"
-                )
+            action = finite_action(driver(observation), size)
             before = (0.0, 0) if found is None else (found[1].time, _warnings(found[1]))
             observation, _, terminated, truncated, info = env.step(action)
             struck = None if monitor is None else monitor.peak_bodies

@@ -5,9 +5,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import gymnasium as gym
-import numpy as np
 
-from safe_wrappers import info as keys
 from safe_wrappers.checks import whole_number
 from safe_wrappers.diagnosis import commands, contacts, limits, wheel_slip
 from safe_wrappers.diagnosis.finding import Diagnosis, Finding
@@ -21,9 +19,8 @@ from safe_wrappers.diagnosis.recording import (
     record,
 )
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import SafeWrappersError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
-from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
 SYMPTOMS: Final[dict[str, Symptom]] = {
     "limits": limits.SYMPTOM,
@@ -61,7 +58,8 @@ def diagnose(
     Raises:
         UnsupportedEnvError: No Gymnasium env, or one with other actions.
         UnknownNameError: A symptom of another name.
-        ConfigurationError: A policy that is none, or whose actions do not fit the env.
+        ConfigurationError: A policy that is none.
+        ActionError: The policy's action has another shape than the env's, or is not finite; the env never gets it.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -79,37 +77,9 @@ def diagnose(
     drivers = {"random": random_driver(env, seed), "attacking": attacking_driver(env, seed)}
     if policy is not None:
         drivers[POLICY] = policy_driver(policy)
-        _try(env, drivers[POLICY])
     recordings = {name: record(env, driver, steps, seed) for name, driver in drivers.items()}
     findings = [_found(env, name, recordings, drivers, seed) for name in chosen]
-    return Diagnosis(name_of(env), steps, list(drivers), findings, _idle_constraints(env, recordings))
-
-
-def _try(env: Env, driver: Driver) -> None:
-    """Ask a policy once, so that one of another env is told before the first run."""
-    observation, _ = env.reset(seed=0)
-    space: Any = env.action_space
-    try:
-        action = np.asarray(driver(observation))
-    except Exception as error:
-        raise ConfigurationError(
-            f"the policy raised {type(error).__name__} for an observation of {name_of(env)}: {error}. "
-            "Is it this env's?"
-        ) from error
-    if action.shape != space.shape:
-        raise ConfigurationError(
-            f"the policy gives actions of shape {action.shape}, {name_of(env)} takes {space.shape}. Is it this env's?"
-        )
-
-
-def _idle_constraints(env: Env, recordings: dict[str, Recording]) -> list[str]:
-    """The constraints of the env's filter, if it has one, that have refused nothing."""
-    inside = filter_inside(env)
-    if inside is None:
-        return []
-    infos = [info for recording in recordings.values() for info in recording.infos]
-    acted = np.any([info[keys.CBF_REFUSED] for info in infos if keys.CBF_REFUSED in info], axis=0)
-    return [name for name, has in zip(inside.constraint_names, acted, strict=True) if not has]
+    return Diagnosis(name_of(env), steps, list(drivers), findings)
 
 
 def _found(
@@ -131,10 +101,8 @@ def _found(
     if not found:
         return Finding(name, symptom.title, missing=missing)
     judged = POLICY if POLICY in found else max(found, key=lambda driver: found[driver].figure)
-    figures = {driver: one.figure for driver, one in found.items()}
-    finding = Finding(
-        name, symptom.title, figures[judged], symptom.threshold, symptom.unit, figures, found[judged].evidence
-    )
+    figure, evidence = found[judged]
+    finding = Finding(name, symptom.title, figure, symptom.threshold, symptom.unit, evidence)
     if not finding.present:
         return finding
     makers = {"random": random_driver, "attacking": attacking_driver}

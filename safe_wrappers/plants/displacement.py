@@ -53,13 +53,12 @@ class DisplacementRecorder(Recorder):
         data.mocap_quat[self._mocap] = data.xquat[self._gripper] + _TURN
         data.ctrl[:] = data.qpos[self._servoed] + self._servo_acts * step[3]
 
-    settles: ClassVar[bool] = True
-
-    def settle(self, data: mujoco.MjData) -> None:
+    def settle(self, data: mujoco.MjData) -> bool:
         """Put a blocked gripper's fingers back to zero, and update the poses."""
         if self._closed.size:
             data.qpos[self._closed] = 0.0
             mujoco.mj_kinematics(self._model, data)
+        return bool(self._closed.size)
 
     def brake(self, data: mujoco.MjData) -> None:
         self.act(data, np.zeros(4))

@@ -202,8 +202,8 @@ class IdentifiedPlant(RolloutPlant):
 
     **What this is not**: a guarantee in closed loop. The filter changes which actions are executed and which states
     are visited, and it prefers actions that the model takes for good, whether or not they are. So coverage is
-    monitored: at every step the next measure is predicted, with a margin for one step of the same miss rate, and
-    `plant/coverage` is the share of the episode's steps whose prediction held.
+    monitored: at every step the next measure is predicted, less the margin of a first step, and `plant/coverage` is
+    the share of the episode's steps whose prediction held.
 
     Args:
         episodes: Pairs (observations, shape (T + 1, n); actions, shape (T, m)), as `log_steps` returns them; drawn
@@ -314,7 +314,7 @@ class IdentifiedPlant(RolloutPlant):
             self._judged = self._missed = 0
         elif self._watched is not None and np.isfinite(self.state).all():
             predicted = self.model(self.state, control)
-            self._least = measured(self._watched, predicted) - self._one_step
+            self._least = measured(self._watched, predicted) - self._first
 
     def rollout(
         self,
@@ -357,12 +357,6 @@ class IdentifiedPlant(RolloutPlant):
         Raises:
             ConfigurationError: Too many rollouts of held-out episodes give no number.
         """
-        found = self._margins(measure, horizon)
-        self._watched, self._least = measure, None
-        self._one_step = float(self._margins(measure, 1)[0])
-        return found
-
-    def _margins(self, measure: Measure, horizon: int) -> Array:
         fitted = self._shortfalls(self.fit_episodes, self._scale_places, horizon, measure)
         # Any scales do, if they are fixed before the scores are looked at.
         scales = np.sqrt(np.square(np.where(np.isfinite(fitted), fitted, 0.0)).mean(axis=0))
@@ -374,7 +368,9 @@ class IdentifiedPlant(RolloutPlant):
                 f"more than {self.miss_rate:g} of the rollouts over {horizon} steps give no finite h: the model "
                 "diverges, or h is not a number there. Take a shorter horizon or more episodes"
             )
-        return np.asarray(max(factor, 0.0) * scales)
+        margins: Array = max(factor, 0.0) * scales
+        self._watched, self._first, self._least = measure, float(margins[0]), None
+        return margins
 
     def _shortfalls(self, episodes: list[Episode], places: Array, horizon: int, measure: Measure) -> Array:
         windows = zip(episodes, places, strict=True)

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Final
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -54,9 +53,8 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         buffer_size: Env steps to keep, over all envs; a changed step counts once.
         observation_space: Not a Dict; for those there is `ExecutedActionDictReplayBuffer`.
         action_space: A bounded Box.
-        device, n_envs, handle_timeout_termination, more: As in SB3.
-        optimize_memory_usage: As in SB3, mode "safe_action" only.
-        mode: "safe_action" or "both".
+        mode: "safe_action" or "both"; for "both" without `optimize_memory_usage`.
+        args, more: As in SB3.
 
     Attributes:
         actions, rewards: In mode "both" the policy's actions and penalised rewards.
@@ -78,10 +76,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         buffer_size: int,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
-        device: th.device | str = "auto",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
-        handle_timeout_termination: bool = True,
+        *args: Any,
         mode: str = "safe_action",
         **more: Any,
     ) -> None:
@@ -96,11 +91,9 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
                 "use ExecutedActionDictReplayBuffer for Dict observations (with HER: ExecutedActionHerReplayBuffer)"
                 f" and ExecutedActionReplayBuffer for all others; {type(self).__name__} got {observation_space}"
             )
-        if mode == "both" and optimize_memory_usage:
+        if mode == "both" and more.get("optimize_memory_usage"):
             raise ConfigurationError("mode 'both' does not work with optimize_memory_usage; leave it out")
-        more |= {"device": device, "n_envs": n_envs, "optimize_memory_usage": optimize_memory_usage}
-        more["handle_timeout_termination"] = handle_timeout_termination
-        super().__init__(buffer_size, observation_space, action_space, **more)
+        super().__init__(buffer_size, observation_space, action_space, *args, **more)
         self.mode = mode
         self._low, self._high = action_space.low, action_space.high
         if mode == "both":

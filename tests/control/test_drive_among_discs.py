@@ -1,5 +1,7 @@
 """A heading drive among discs: from inside of one the backup leads out, and many robots are judged as each alone."""
 
+import hashlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -33,18 +35,35 @@ def test_from_inside_a_disc_the_filter_and_the_backup_alone_lead_out():
         assert changed > 5 or policy is None
 
 
-def test_many_are_judged_as_each_alone():
-    env = sw.protect(gym.make("SafePointGoal1-v0"))
+def random_scenes(count):
+    """Every function on random scenes, as one digest, and how many controls are admitted."""
+    env = sw.CBFActionFilter(
+        gym.make("SafePointGoal1-v0"),
+        [sw.constraints.HeadingDriveClearance([sw.constraints.Disc([0.0, 0.0], 0.2)], uncertainty=0.1)],
+    )
+    env.reset(seed=0)
     drive = env.filter.bound[0].drive
-    n, rng, models = 400, np.random.default_rng(3), np.array([drive, *drive.corners()], dtype=np.float64)
-    motions = rng.uniform(-1.0, 1.0, (n, 6)) * [0.1, 0.1, 3.0, 1.0, 1.0, 2.0]
-    discs = np.dstack([rng.uniform(-0.9, 0.9, (n, 6, 2)), np.full((n, 6), 0.1)])
-    controls, least, admitted = rng.uniform(-1.0, 1.0, (n, 2)), np.empty(n), np.empty(n, dtype=bool)
-    scenes = np.stack([models] * n), motions, discs.reshape(-1, 3), 6 * np.arange(n + 1), RESERVE_M
+    rng, models = np.random.default_rng(3), np.array([drive, *drive.corners()], dtype=np.float64)
+    motions = rng.uniform(-1.0, 1.0, (count, 6)) * [0.1, 0.1, 3.0, 1.0, 1.0, 2.0]
+    discs = np.dstack([rng.uniform(-0.9, 0.9, (count, 6, 2)), np.full((count, 6), 0.1)])
+    controls = rng.uniform(-1.0, 1.0, (count, 2))
+    least, admitted, digest = np.empty(count), np.empty(count, dtype=bool), hashlib.sha256()
+    scenes = np.stack([models] * count), motions, discs.reshape(-1, 3), 6 * np.arange(count + 1), RESERVE_M
     among.admit_each(*scenes, controls, least, admitted)
-    for i in range(n):
+    for i in range(count):
         scene = models, motions[i], discs[i], RESERVE_M
         assert admitted[i] == among.is_admitted(scene, *controls[i])
         joints = motions[i, :3], motions[i, 3:], np.zeros(4)
         assert least[i] == among.least_clearance(*joints, (models, np.empty(6), discs[i], RESERVE_M))[0]
-    assert 0.1 * n < admitted.sum() < 0.9 * n
+        found = (
+            *among.secants(scene),
+            among.way_around(scene, *controls[i], 0.0),
+            among.manoeuvre_drive(scene),
+        )
+        for part in (least[i], admitted[i], *found):
+            digest.update(np.asarray(part, dtype=np.float64).tobytes())
+    return digest.hexdigest(), int(admitted.sum())
+
+
+def test_many_are_judged_as_each_alone():
+    assert 40 < random_scenes(400)[1] < 360

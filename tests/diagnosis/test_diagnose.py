@@ -19,7 +19,7 @@ from safe_wrappers.diagnosis.recording import (
     random_driver,
     record,
 )
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 pytest.importorskip("gymnasium_robotics")
 from tests.diagnosis.planted import CART, HEALTHY, PLANTED, STOPPED, Bench, waving
@@ -50,7 +50,7 @@ def test_the_lines_that_are_shown_do_what_was_tried(name):
     scope = {"env": make()[0], "sw": sw}
     exec(finding.code, scope)
     again = make()[1]
-    for _ in range(steps + 1):
+    for _ in range(steps):
         again(None)  # as often as it was asked before the second run
     measured = SYMPTOMS[symptom].measure(scope["env"], record(scope["env"], again, steps, 0))
     assert measured.figure == pytest.approx(finding.after)
@@ -83,15 +83,6 @@ class Drifting(gym.Env):
         speed = np.clip(self.at[1] + 0.1 * float(action[0]), -0.2, 0.2)
         self.at = np.array([self.at[0] + 0.1 * speed, speed])
         return self.at.copy(), 0.0, False, False, {"cost": float(abs(self.at[0]) > 1.0)}
-
-
-def test_constraints_that_never_acted_with_any_driver_are_named():
-    limits = [sw.constraints.JointSpeedLimit(4.0), sw.constraints.JointPositionLimit(-6.0, 6.0, ["joint0"])]
-    env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
-    still = diagnose(env, lambda seen: np.zeros(2), steps=60, symptoms=["limits"])
-    assert still.idle_constraints == ["JointPositionLimit"], "others than the policy made the first act"
-    assert "Never acted, with any driver: JointPositionLimit." in str(still)
-    assert diagnose(gym.make("Reacher-v5"), steps=20, symptoms=["limits"]).idle_constraints == []
 
 
 def test_an_env_of_ones_own_is_simulated_while_it_is_diagnosed_and_nothing_leaks():
@@ -130,7 +121,7 @@ def test_without_a_policy_its_symptoms_are_not_measured():
 def test_the_policy_counts_where_there_is_one():
     env = Bench(STOPPED)
     finding = diagnose(env, lambda observation: np.zeros(1), steps=400, symptoms=["limits"]).finding("limits")
-    assert finding.figure == finding.by_driver["policy"] == 0.0 < finding.by_driver["attacking"]
+    assert finding.figure == 0.0 < diagnose(env, steps=400, symptoms=["limits"]).finding("limits").figure
 
 
 def test_lines_that_are_refused_are_told_with_the_reason(monkeypatch):
@@ -154,14 +145,8 @@ def test_bad_input_is_refused_by_name():
         diagnose(gym.make("CartPole-v1"))
     with pytest.raises(ConfigurationError, match="policy is a function of the observation"):
         diagnose(env, policy=3)
-    with pytest.raises(
-        ConfigurationError, match=r"actions of shape \(3,\), Swimmer-v5 takes \(2,\)\. Is it this"
-    ):
+    with pytest.raises(ActionError, match="an action of 2 finite numbers, got array"):
         diagnose(env, policy=lambda observation: np.zeros(3))
-    with pytest.raises(
-        ConfigurationError, match=r"raised IndexError for an observation of Swimmer-v5.*Is it this"
-    ):
-        diagnose(env, policy=lambda observation: observation[99])
     with pytest.raises(ConfigurationError, match="steps"):
         diagnose(env, steps=1)
 
@@ -191,9 +176,7 @@ def test_an_action_that_is_not_finite_never_reaches_the_env():
     seen = env.unwrapped.step
     env.unwrapped.step = lambda action: calls.append(np.isfinite(action).all()) or seen(action)
     answers = iter([np.zeros(2, np.float32)] * 6)
-    with pytest.raises(
-        ConfigurationError, match=r"control step \d+ is not finite: \[nan nan\]; the env was not given"
-    ):
+    with pytest.raises(ActionError, match=r"2 finite numbers, got array\(\[nan, nan\].*; the env was not"):
         diagnose(env, lambda observation: next(answers, np.full(2, np.nan, np.float32)), steps=20)
     assert calls and all(calls)
 
@@ -224,9 +207,7 @@ def test_findings_are_ranked_and_json_has_no_nan():
     made = [
         Finding("a", "A", 0.5, 1.0, "share"),
         Finding("b", "B", missing="no model"),
-        Finding(
-            "c", "C", 3.0, 1.0, "N", {"random": 3.0}, [Evidence("x", math.inf, "m")], "env = env", after=1.0
-        ),
+        Finding("c", "C", 3.0, 1.0, "N", [Evidence("x", math.inf, "m")], "env = env", after=1.0),
         Finding("d", "D", 8.0, 4.0, "N", advice="Think."),
     ]
     diagnosis = Diagnosis("Env-v0", 10, ["random"], made)

@@ -246,7 +246,7 @@ class ArmConfig(Section):
     env: EnvConfig
     """The env: an id, or the keys of [`env`](#env)."""
     algorithm: Annotated[str, AfterValidator(_check_algorithm)]
-    """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.6,<3'` also `TQC`, `CrossQ`,
+    """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.7,<3'` also `TQC`, `CrossQ`,
     `TRPO`, `QRDQN`. `DQN` and `QRDQN` are for discrete actions; filtered, those have an
     [ActionShield](wrappers/filter.md#actionshield)."""
     total_steps: Count

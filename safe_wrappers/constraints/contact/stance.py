@@ -149,7 +149,7 @@ class BoundStance(BoundConstraint):
         return self._answer
 
     def candidates(self, proposed: Array) -> Iterator[Array]:
-        """The program's answer; where there is none, the control that misses least, which is refused."""
+        """The program's answer; where there is none, the proposed control, which is refused."""
         proposed = np.clip(proposed, self.plant.lower, self.plant.upper)
         problem = self.problem(proposed)
         if problem is not None:  # another constraint may have refused before this one was asked

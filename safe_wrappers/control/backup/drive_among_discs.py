@@ -164,20 +164,13 @@ def look(scene: Scene) -> Look:
     speed = hypot(now.vx, now.vy) + abs(body.com_offset * now.yaw_rate)
     loss = change * (control_dt + coast) + speed * (control_dt + turn * coast)
     n, kept, best = len(discs), path.radius + _swivel(body), math.inf
-    order, bounds = np.zeros((n, 3)), np.zeros(n)
+    bounds = np.empty(n)
     for i in range(n):
-        bound = hypot(discs[i, 0] - now.x, discs[i, 1] - now.y) - discs[i, 2] - kept
-        if bound != bound:
-            return Look(models, body, now, path, order[:0], math.nan, math.nan, False, reserve, loss)
-        place = i
-        while place > 0 and bounds[place - 1] > bound:
-            bounds[place] = bounds[place - 1]
-            for j in range(3):
-                order[place, j] = order[place - 1, j]
-            place -= 1
-        bounds[place] = bound
-        for j in range(3):
-            order[place, j] = discs[i, j]
+        bounds[i] = hypot(discs[i, 0] - now.x, discs[i, 1] - now.y) - discs[i, 2] - kept
+        if bounds[i] != bounds[i]:
+            return Look(models, body, now, path, discs[:0].copy(), math.nan, math.nan, False, reserve, loss)
+    nearest = np.argsort(bounds, kind="mergesort")
+    order, bounds = discs[nearest], bounds[nearest]
     for i in range(n):
         if not bounds[i] < best:
             break

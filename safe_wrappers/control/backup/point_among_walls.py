@@ -133,9 +133,16 @@ def distance(among: PointAmongWalls, motion: PointMotion, enough: float = math.i
     best, wall = nearest(around, among.walls, enough)
     if wall < 0 or not among.clip_known or not math.isfinite(end_x + end_y):
         return best
-    best, steps, wall = enough, path(among, motion), -1
+    # The path contains its ends. Where one of them is as close as the rectangle, the path is, too.
+    close = one_of(among.walls, wall)
+    start = apart((motion.x, motion.x, motion.y, motion.y), close)
+    ends = min(start, apart((end_x, end_x, end_y, end_y), close))
+    if ends <= best:
+        return best
+    best, steps = min(ends, enough), path(among, motion)
+    limit, wall = max(best, 0.0), -1
     while True:
-        wall = closer(around, among.walls, max(best, 0.0), wall + 1)
+        wall = closer(around, among.walls, limit, wall + 1)
         if wall < 0:
             return best
         for i in range(len(steps)):

@@ -200,7 +200,7 @@ def near(at: At, control: Pair) -> Array:
     turned, count = np.empty((0, 2)), 0
     if _is_inside(at):
         turned = _turned(at, asked)
-    found, away = np.empty((len(turned) + 2, 2)), np.empty(len(turned) + 2)
+    found = np.empty((len(turned) + 2, 2))
     for i in range(len(turned)):
         one = turned[i, 0], turned[i, 1]
         if admits(at, one, 0.0):
@@ -215,15 +215,10 @@ def near(at: At, control: Pair) -> Array:
                 one = _towards(at, one, _replaced(one, axis, asked[axis]))
             found[count, 0], found[count, 1] = one
             count += 1
-    for i in range(count):  # sorted by insertion: of equally near ones the first stays first
-        one = found[i, 0], found[i, 1]
-        far, place = hypot(one[0] - asked[0], one[1] - asked[1]), i
-        while place > 0 and away[place - 1] > far:
-            away[place] = away[place - 1]
-            found[place, 0], found[place, 1] = found[place - 1, 0], found[place - 1, 1]
-            place -= 1
-        away[place], found[place, 0], found[place, 1] = far, one[0], one[1]
-    return found[:count]
+    away = np.empty(count)
+    for i in range(count):
+        away[i] = hypot(found[i, 0] - asked[0], found[i, 1] - asked[1])
+    return found[np.argsort(away, kind="mergesort")]  # of equally near ones the first stays first
 
 
 @compiled

@@ -23,10 +23,9 @@ from safe_wrappers.errors import ConfigurationError
 
 
 class ComplementarityResiduals(NamedTuple):
-    """Violations of `gap >= 0`, `force >= 0`, `gap * force = 0`, shapes (...), 0 where they hold: m, N and N m."""
+    """Violations of `gap >= 0` and of `gap * force = 0`, shapes (...), 0 where they hold: m and N m."""
 
     penetration: Array
-    tension: Array
     product: Array
 
 
@@ -37,7 +36,7 @@ def complementarity_residuals(gap: ArrayLike, force: ArrayLike) -> Complementari
     N, shape (...), positive where it pushes the bodies apart.
     """
     g, f = finite_arrays(gap=gap, force=force)
-    return ComplementarityResiduals(np.maximum(-g, 0.0), np.maximum(-f, 0.0), np.abs(g * f))
+    return ComplementarityResiduals(np.maximum(-g, 0.0), np.abs(g * f))
 
 
 def in_series(*parts: ArrayLike) -> Array:

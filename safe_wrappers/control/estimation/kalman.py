@@ -6,18 +6,9 @@ Joseph's form: symmetric and positive semidefinite for any gain, rounding includ
 Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), section 5.2.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from safe_wrappers.checks import Array
-
-
-class Updated(NamedTuple):
-    """Mean (..., n) and covariance (..., n, n) after a measurement."""
-
-    mean: Array
-    cov: Array
 
 
 def predict(
@@ -40,8 +31,8 @@ def predict(
     return moved, 0.5 * (grown + np.swapaxes(grown, -1, -2))
 
 
-def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> Updated:
-    """Update with one measurement `y = C x + v` per track.
+def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> tuple[Array, Array]:
+    """Mean and covariance after one measurement `y = C x + v` per track.
 
     Args:
         mean: Estimate, shape (..., n).
@@ -61,7 +52,5 @@ def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> Upda
     np.einsum("...ii->...i", left)[...] += 1.0
     kept = left @ cov @ np.swapaxes(left, -1, -2)
     kept += gain @ R @ np.swapaxes(gain, -1, -2)
-    return Updated(
-        mean + (gain @ innovation[..., None])[..., 0],
-        0.5 * (kept + np.swapaxes(kept, -1, -2)),
-    )
+    mean = mean + (gain @ innovation[..., None])[..., 0]
+    return mean, 0.5 * (kept + np.swapaxes(kept, -1, -2))

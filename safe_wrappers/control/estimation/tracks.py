@@ -111,8 +111,8 @@ class Tracks:
             matrix: C of all of them, shape (m, 2d).
             noise: Covariance R of all of them, shape (m, m).
         """
-        updated = update(self.mean[which], self.covariance[which], measured, matrix, noise)
-        self.mean[which], self.covariance[which] = updated.mean, updated.cov
+        before = self.mean[which], self.covariance[which]
+        self.mean[which], self.covariance[which] = update(*before, measured, matrix, noise)
 
     def ahead(self, times_s: Sequence[float]) -> tuple[Array, Array]:
         """Positions (k, n, d), m, and covariances (k, n, d, d), m^2, at k times ahead without measurements."""

@@ -31,10 +31,6 @@ from safe_wrappers.control.legged.whole_body_program import (
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""
-_INNER_IN_LEAST_VIOLATION = 1e-8
-"""Cost of a squared newton of inner force in a least violation; a smaller one would be ill-conditioned."""
-_OBJECTIVE_IN_LEAST_VIOLATION = 1e-3
-"""Largest cost of half a control's range in a least violation; with 1e-6 answers were up to 0.5 N outside cones."""
 
 
 class WholeBodyStatus(StrEnum):
@@ -45,9 +41,9 @@ class WholeBodyStatus(StrEnum):
     SOLVED = "solved"
     """The best control that satisfies everything, residuals checked."""
     INFEASIBLE = "infeasible"
-    """No control does. `control` violates contact accelerations and rows least (in squares); box and cones hold."""
+    """No control does."""
     FAILED = "failed"
-    """No solver gave an answer that passed the check; `control` is inside the box, `forces` may be zeros."""
+    """No solver gave an answer that passed the check."""
 
 
 class Residuals(NamedTuple):
@@ -66,9 +62,9 @@ class WholeBodySolution(NamedTuple):
     """A checked answer.
 
     Attributes:
-        control: Shape (nu,), finite and inside the box.
+        control: Shape (nu,), finite and inside the box; without an answer the nominal one, clipped to it.
         acceleration: qacc under it and the forces, shape (nv,).
-        forces: At the contacts, shape (k, 3), N, each inside its cone (and pyramid).
+        forces: At the contacts, shape (k, 3), N, each inside its cone (and pyramid); zeros without an answer.
         status: Compares equal to its string.
         residuals: See `Residuals`.
     """
@@ -100,7 +96,7 @@ def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Arra
     Contradictory accelerations are met as closely as possible.
     """
     motion = motion_of(problem)
-    rigid, _ = eliminate(motion)
+    rigid = eliminate(motion)
     y = np.concatenate([control, np.zeros(rigid.size - len(control))])
     return _forces_and_acceleration(problem, motion, rigid, y)
 
@@ -108,7 +104,7 @@ def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Arra
 def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
     """The contact accelerations closest to the wanted ones that do not contradict each other, shape (k, 3), m/s^2.
 
-    By kinematics alone. Contradictory accelerations make a problem without softness infeasible.
+    By kinematics alone. Contradictory accelerations make a problem infeasible.
     """
     motion = motion_of(problem)
     solution = np.linalg.lstsq(motion.held, motion.wanted, rcond=1e-5)[0]
@@ -120,10 +116,10 @@ def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
 
 def _solve(problem: WholeBodyProblem, sides: Array | None) -> WholeBodySolution:
     motion = motion_of(problem)
-    rigid, loose = eliminate(motion)
+    rigid = eliminate(motion)
     consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _tolerance(problem.wanted)
     reduced = reduced_program(problem, motion, rigid, sides) if consistent else None
-    verdict = "infeasible"
+    status = WholeBodyStatus.INFEASIBLE
     if reduced is not None:
         nu = len(problem.nominal)
         unchanged = _nominal(problem, motion, reduced, np.zeros(rigid.size - nu))
@@ -135,8 +131,13 @@ def _solve(problem: WholeBodyProblem, sides: Array | None) -> WholeBodySolution:
             found = unchanged or _checked(problem, motion, reduced, candidate.y, WholeBodyStatus.SOLVED)
             if found is not None:
                 return found
-        verdict = "failed" if candidate.y is not None else candidate.verdict
-    return _least_violation(problem, motion, loose, sides, verdict)
+        if candidate.verdict != "infeasible":
+            status = WholeBodyStatus.FAILED
+    # Nothing passed: the nominal control clipped to its box, contacts without force.
+    control = np.clip(problem.nominal, problem.lower, problem.upper)
+    acceleration, forces = motion.free + motion.by_control @ control, np.zeros(problem.normals.shape)
+    missed = _residuals(problem, acceleration, forces)
+    return WholeBodySolution(control, acceleration, forces, status, missed)
 
 
 def _ask(program: Program) -> Candidate:
@@ -172,7 +173,7 @@ def _checked(
     answer = _answer(problem, motion, reduced, inside, status)
     missed = answer.residuals
     force = _tolerance(answer.forces)
-    program, soft = reduced.program, reduced.softenable
+    program, soft = reduced.program, reduced.accelerations
     over = program.rows @ inside - program.limits
     size = np.abs(program.rows[:soft]) @ np.abs(inside)
     fine = (
@@ -217,39 +218,3 @@ def _residuals(problem: WholeBodyProblem, acceleration: Array, forces: Array) ->
         contact = max(contact, float(short.max()))
     cone = float(cone_excess(forces, problem.normals, problem.friction).max(initial=0.0))
     return Residuals(contact, cone)
-
-
-def _least_violation(
-    problem: WholeBodyProblem,
-    motion: Motion,
-    loose: Elimination,
-    sides: Array | None,
-    verdict: str,
-) -> WholeBodySolution:
-    """Minimise the squared violations of contact accelerations and rows; box and cones stay hard."""
-    plain = reduced_program(problem, motion, loose, sides)
-    nu = len(problem.nominal)
-    misses = np.arange(nu, nu + loose.misses)
-    half = 0.5 * (problem.upper - problem.lower)
-    costs = half**2
-    share = _OBJECTIVE_IN_LEAST_VIOLATION / max(1.0, float(costs[np.isfinite(costs)].max(initial=0.0)))
-    hessian = share * plain.program.hessian
-    hessian[misses, misses] += 1.0
-    inner = np.arange(nu + loose.misses, loose.size)
-    hessian[inner, inner] += _INNER_IN_LEAST_VIOLATION
-    softer = plain.program._replace(hessian=hessian, linear=share * plain.program.linear)
-    program = softer.softened(plain.softenable)
-    status = WholeBodyStatus.INFEASIBLE if verdict == "infeasible" else WholeBodyStatus.FAILED
-    for ask in (_ask, by_clarabel):  # clarabel as well where the first violates its cones
-        candidate = ask(program)
-        if candidate.y is not None:
-            y = candidate.y[: loose.size].copy()
-            y[:nu] = np.clip(y[:nu], problem.lower, problem.upper)
-            answer = _answer(problem, motion, plain, y, status)
-            if answer.residuals.cone <= _tolerance(answer.forces):
-                return answer
-    # Nothing passed: the nominal control clipped to its box, contacts without force.
-    control = np.clip(problem.nominal, problem.lower, problem.upper)
-    acceleration, forces = motion.free + motion.by_control @ control, np.zeros(problem.normals.shape)
-    missed = _residuals(problem, acceleration, forces)
-    return WholeBodySolution(control, acceleration, forces, WholeBodyStatus.FAILED, missed)

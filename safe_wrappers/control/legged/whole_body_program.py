@@ -1,8 +1,8 @@
-"""The whole-body problem as a program in the control, the missed contact accelerations and the inner forces.
+"""The whole-body problem as a program in the control and the inner forces.
 
 With qacc = M^-1 (B u + J' f - h), the contacts' accelerations are affine in u and f. Prescribing them determines f up
 to inner forces, which cause no motion (two feet pressing against each other through a rigid ground). So the contact
-forces are eliminated; the misses are the errors of the contact accelerations.
+forces are eliminated.
 
     minimise 1/2 y' H y + q' y    so that    G y <= h,  lower <= y <= upper,  c_i + C_i y in the cone,
 
@@ -45,27 +45,6 @@ class Program(NamedTuple):
     upper: Array  # (n,), inf is no bound
     cones: Array | None = None  # C_i, (m, d, n)
     cone_offsets: Array | None = None  # c_i, (m, d)
-
-    def softened(self, count: int) -> "Program":
-        """The first rows made soft: half the squares of their violations are added to the objective."""
-        n, k = self.linear.size, self.limits.size
-        hessian = np.zeros((n + count, n + count))
-        hessian[:n, :n] = self.hessian
-        hessian[n:, n:] = np.eye(count)
-        give = np.zeros((k, count))
-        give[:count] = -np.eye(count)
-        none = np.full(count, np.inf)
-        cones = self.cones
-        if cones is not None:
-            cones = np.concatenate([cones, np.zeros((*cones.shape[:2], count))], axis=2)
-        return self._replace(
-            hessian=hessian,
-            linear=np.concatenate([self.linear, np.zeros(count)]),
-            rows=np.concatenate([self.rows, give], axis=1),
-            lower=np.concatenate([self.lower, -none]),
-            upper=np.concatenate([self.upper, none]),
-            cones=cones,
-        )
 
     def scaled(self) -> tuple["Program", Array]:
         """The program scaled to unit curvature along each unknown, and the factor of its answer."""
@@ -149,12 +128,11 @@ class Motion(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """`f = offset + matrix @ y` with the unknowns y = (control, misses, inner forces)."""
+    """`f = offset + matrix @ y` with the unknowns y = (control, inner forces)."""
 
     offset: Array  # (3 s,), N
     matrix: Array  # (3 s, n)
     controls: int  # number of controls among the unknowns
-    misses: int  # number of misses, m/s^2; 0 if the wanted accelerations are met exactly
     contradiction: Array  # (r,), m/s^2: the part of the wanted accelerations that no motion gives
 
     @property
@@ -193,40 +171,32 @@ def _axes(normals: Array, friction: Array) -> Array:
     return axes
 
 
-def eliminate(motion: Motion) -> tuple[Elimination, Elimination]:
-    """The forces of contacts that move as wanted (no misses), and of contacts that may deviate (with misses)."""
+def eliminate(motion: Motion) -> Elimination:
+    """The forces of contacts that move as wanted."""
     nu = motion.by_control.shape[1]
     missing = motion.wanted - motion.held @ motion.free
     if not missing.size:
-        nothing = Elimination(missing, np.zeros((0, nu)), nu, 0, missing)
-        return nothing, nothing
+        return Elimination(missing, np.zeros((0, nu)), nu, missing)
     compliance = motion.held @ (motion.by_force @ motion.axes)
     values, vectors = np.linalg.eigh(0.5 * (compliance + compliance.T))
     counts = values > _RANK * max(float(values[-1]), np.finfo(np.float64).tiny)
     moving, inner = vectors[:, counts], vectors[:, ~counts]
-    by_miss = moving / values[counts]
-    inverse = by_miss @ moving.T
+    inverse = moving / values[counts] @ moving.T
     by_control = -inverse @ (motion.held @ motion.by_control)
     # Inner forces cause no acceleration, so no control meets a wanted acceleration along them.
     contradiction = inner @ (inner.T @ missing)
-    offset = motion.axes @ (inverse @ missing)
-    rigid = motion.axes @ np.concatenate([by_control, inner], axis=1)
-    loose = motion.axes @ np.concatenate([by_control, by_miss, inner], axis=1)
-    return (
-        Elimination(offset, rigid, nu, 0, contradiction),
-        Elimination(offset, loose, nu, by_miss.shape[1], contradiction),
-    )
+    matrix = motion.axes @ np.concatenate([by_control, inner], axis=1)
+    return Elimination(motion.axes @ (inverse @ missing), matrix, nu, contradiction)
 
 
 class ReducedProgram(NamedTuple):
     """A program, and the contact forces as a function of its unknowns.
 
-    A least violation may break the first `softenable` rows: those of accelerations and opening contacts. The others
-    are sides of pyramids.
+    Its first rows, `accelerations` of them, are of accelerations and opening contacts, the others sides of pyramids.
     """
 
     program: Program
-    softenable: int
+    accelerations: int
     elimination: Elimination
 
 
@@ -241,7 +211,7 @@ def reduced_program(
     Args:
         problem: The instant.
         motion: Of the problem.
-        elimination: Of the motion, with or without misses.
+        elimination: Of the motion.
         sides: Sides of the friction pyramids of the contacts with friction, shape (k, edges, 3); None keeps cones.
     """
     nu, n = elimination.controls, elimination.size
@@ -253,7 +223,7 @@ def reduced_program(
     hessian[each, each] += 1.0
     linear[:nu] -= problem.nominal
     rows, limits = _rows(problem, start, slope)
-    softenable = len(limits)
+    accelerations = len(limits)
     normals, friction = problem.normals[problem.stance], problem.friction[problem.stance]
     by_contact, force = elimination.matrix.reshape(-1, 3, n), elimination.offset.reshape(-1, 3, 1)
     grips, slides = friction > 0.0, friction == 0.0
@@ -270,7 +240,7 @@ def reduced_program(
     free = np.full(n - nu, np.inf)
     lower, upper = np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free])
     program = Program(hessian, linear, rows, limits, lower, upper, cones, cone_offsets)
-    return ReducedProgram(program, softenable, elimination)
+    return ReducedProgram(program, accelerations, elimination)
 
 
 def _rows(problem: WholeBodyProblem, start: Array, slope: Array) -> tuple[Array, Array]:

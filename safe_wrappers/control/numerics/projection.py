@@ -280,8 +280,12 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
     asking, unit = _prepare(p)
     if asking == _ADMITTED:
         return Projection(u, Status.INACTIVE, 0.0)
-    if asking < 0:
-        return _without_program(p, asking)
+    if asking == _BAD_NOMINAL:
+        raise ConfigurationError(f"u_nom must be finite, got {p.u}; replace it before projecting")
+    if asking == _BAD_BOX:
+        raise ConfigurationError(f"lower must not exceed upper, got {p.lo} and {p.hi}")
+    if asking == _UNUSUAL:  # numbers that are not finite, or too large, cannot be checked
+        return Projection(p.control, Status.FAILED, math.inf)
     clipped = p.control.copy()
     closest, within, violation = _judge(p, unit, *_by_daqp(p))
     if closest:
@@ -302,19 +306,6 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
 
 def _status(within: bool) -> Status:
     return Status.PROJECTED if within else Status.INFEASIBLE
-
-
-def _without_program(p: _Problem, code: int) -> Projection:
-    """Rows with numbers that are not finite or too large cannot be checked: respect the others, say failed."""
-    if code == _BAD_NOMINAL:
-        raise ConfigurationError(f"u_nom must be finite, got {p.u}; replace it before projecting")
-    if code == _BAD_BOX:
-        raise ConfigurationError(f"lower must not exceed upper, got {p.lo} and {p.hi}")
-    fine = (np.abs(p.a) < _LARGEST).all(axis=1) & (p.b > -_OVERFLOWING)
-    control = np.clip(p.u, p.lo, p.hi)
-    if bool((np.abs(p.u) < _LARGEST).all() and (np.abs(control) < _LARGEST).all()):
-        control = project_unchecked(p.u, p.a[fine], p.b[fine], p.lo, p.hi).control
-    return Projection(control, Status.FAILED, math.inf)
 
 
 _Answer = tuple[Array, Array]

@@ -59,7 +59,8 @@ class ActionMap:
 
     def reach(self) -> tuple[Array, Array]:
         """The least and the largest control that actions have, shapes (nu,)."""
-        ends = _times(self.scale, self.low), _times(self.scale, self.high)
+        # Zero where the scale is, though the end may be infinite.
+        ends = [self.scale * np.where(self.scale == 0.0, 0.0, end) for end in (self.low, self.high)]
         return self.offset + np.minimum(*ends), self.offset + np.maximum(*ends)
 
     def exceeds(self, lower: Array, upper: Array) -> bool:
@@ -91,11 +92,6 @@ def refuse_mapped(action_map: ActionMap | None, asker: str) -> None:
         )
 
 
-def _times(scale: Array, end: Array) -> Array:
-    """Their product, zero where the scale is, though the end may be infinite."""
-    return np.where(scale == 0.0, 0.0, scale) * np.where(scale == 0.0, 0.0, end)
-
-
 class MappedRecorder(Recorder):
     """Forecasts of actions that the env maps to controls; the arguments are those of `Recorder`, and the map."""
 
@@ -110,10 +106,6 @@ class MappedRecorder(Recorder):
     def act(self, data: mujoco.MjData, control: Array) -> None:
         """Give the machine an action, shape (nu,), as its env does at the start of a control interval."""
         data.ctrl[:] = self._map.control(control)
-
-    def key(self, control: Array) -> bytes:
-        """What identifies an action: the bytes of the control that its env sets."""
-        return self._map.control(control).tobytes()
 
     def braking(self, data: mujoco.MjData) -> Array:
         """The action that brakes, shape (nu,)."""

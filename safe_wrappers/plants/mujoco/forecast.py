@@ -1,7 +1,6 @@
 """A forecast: what a MuJoCo model does under a held control, and under braking after it."""
 
-from collections import deque
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -11,7 +10,6 @@ from safe_wrappers.plants.mujoco.model import Remade, control_range
 
 _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
-_HELD: Final = 4  # forecasts whose data are held: the admitted one is among the latest
 RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 """The warnings after which MuJoCo resets the state."""
 _EULER: Final = int(mujoco.mjtIntegrator.mjINT_EULER)
@@ -62,17 +60,14 @@ class Forecast:
 
 
 class Recorder(Remade):
-    """Steps the plant's own model and keeps what a forecast holds; `substeps` are those of a control interval.
-
-    Attributes:
-        held: Data at the ends of the latest forecasts' first control intervals, the oldest first, with the bytes of
-            the controls that were held; None: there is none from the present state.
-    """
+    """Steps the plant's own model and keeps what a forecast holds; `substeps` are those of a control interval."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int) -> None:
         self._model, self._data, self.substeps, self.nq = model, data, substeps, int(model.nq)
         self.is_runge_kutta = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-        self.held = deque[tuple[bytes | None, mujoco.MjData]]()
+        # Data at the end of the latest forecast's first control interval, and the bytes of what was held.
+        self._held: mujoco.MjData | None = None
+        self._held_after = b""
         self._still = mujoco.MjData(model)
         # A unit force accelerates its joints by acc0 (in the reference pose), a transmission by gear times that.
         control_dt = substeps * model.opt.timestep
@@ -94,34 +89,29 @@ class Recorder(Remade):
         """Hold a control, shape (nu,), for one control interval; in the others each actuator brakes its own joints.
 
         The data starts at the present state and is left at the end, after `horizon` >= 1 control intervals. With
-        `first`, its forecast over one interval, it goes on from there if the data is still held. With `euler` the
+        `first`, its forecast over one interval, it goes on from there if that was the latest one. With `euler` the
         intervals that brake are simulated by Euler steps, where the model's own are Runge-Kutta's, which cost four.
         """
         m, data, n = self._model, self._data, self.substeps
         path, published = self._empty(horizon)
-        held = None if first is None else self.held_after(self.key(control))
-        if first is None or held is None:
+        if first is None or self._held is None or self._held_after != control.tobytes():
             self._begin(control)
             whole = self.simulate(0, 1, path, published)
             # Data are large: only plants that forecast have these.
-            oldest = self.held.popleft()[1] if len(self.held) == _HELD else mujoco.MjData(m)
-            mujoco.mj_copyData(oldest, m, data)
-            self.held.append((self.key(control), oldest))
+            self._held = mujoco.MjData(m) if self._held is None else self._held
+            mujoco.mj_copyData(self._held, m, data)
+            self._held_after = control.tobytes()
         else:
             whole = 1
-            mujoco.mj_copyData(data, m, held)
+            mujoco.mj_copyData(data, m, self._held)
             path[:n], published[:1] = first.path, first.published
         if whole and horizon > 1:
             whole = (self._by_euler_steps if euler else self.simulate)(1, horizon, path, published)
         return self._forecast(control, path, published, whole)
 
-    def held_after(self, key: bytes) -> mujoco.MjData | None:
-        """The data at the end of a control interval from the present state, if it is still held."""
-        return next((data for known, data in self.held if known == key), None)
-
     def forget(self) -> None:
         """Called when the present state has changed: what is held belongs to another one."""
-        self.held = deque((None, data) for _, data in self.held)
+        self._held_after = b""
 
     def sketch(self, control: Array, horizon: int) -> Forecast:
         """A forecast as `record` makes it, but by Euler steps from the start; nothing is held."""
@@ -179,8 +169,7 @@ class Recorder(Remade):
             for state in states:
                 mujoco.mj_step(m, data)
                 mujoco.mj_getState(m, data, state, _MOTION)
-            if self.settles:
-                self.settle(data)
+            if self.settle(data):
                 mujoco.mj_getState(m, data, states[-1], _MOTION)
             if euler:
                 mujoco.mj_kinematics(m, data)
@@ -193,10 +182,6 @@ class Recorder(Remade):
         """Give the machine a control, as its env does at the start of a control interval."""
         data.ctrl[:] = control
 
-    def key(self, control: Array) -> bytes:
-        """What identifies a control among those whose data are held: the bytes that the env sets."""
-        return control.tobytes()
-
     def braking(self, data: mujoco.MjData) -> Array:
         """Every actuator against its own motion, shape (nu,); read once per control interval, as controllers do."""
         return self._against_motion(data)
@@ -205,11 +190,9 @@ class Recorder(Remade):
         """Give the machine the control that brakes."""
         data.ctrl[:] = self._against_motion(data)
 
-    settles: ClassVar[bool] = False
-    """Whether the env does something to its data at the end of a control interval."""
-
-    def settle(self, data: mujoco.MjData) -> None:
-        """Do what the env does to its data at the end of a control interval."""
+    def settle(self, data: mujoco.MjData) -> bool:
+        """Do what the env does to its data at the end of a control interval, and say whether it does anything."""
+        return False
 
     def _against_motion(self, data: mujoco.MjData) -> Array:
         rest, per_length, damping = self._servos

@@ -17,6 +17,7 @@ FREE, BALL, SLIDE, HINGE = (
 )
 SCALAR_JOINTS = SLIDE, HINGE
 """The kinds of joints with one position."""
+_ALONG_S = 1e-5
 AT_A_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 """The transmissions of actuators that act on one joint."""
 
@@ -126,24 +127,13 @@ def inertia(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 
 
 def position_rate(model: mujoco.MjModel, qpos: Array, qvel: Array) -> Array:
-    """Time derivative of the positions, shape (nq,)."""
+    """Time derivative of the positions, shape (nq,): of orientations by central differences of MuJoCo's steps."""
     if model.nq == model.nv:
         return qvel.copy()
-    rate = np.zeros(model.nq)
-    for j in range(model.njnt):
-        q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
-        kind = model.jnt_type[j]
-        if kind == FREE:
-            rate[q : q + 3] = qvel[v : v + 3]
-            q, v = q + 3, v + 3
-        if kind in (FREE, BALL):
-            # Angular velocities of these joints are in the body's frame; mju_derivQuat wants the world's.
-            turn = np.zeros(4)
-            mujoco.mju_mulQuatAxis(turn, qpos[q : q + 4].copy(), qvel[v : v + 3].copy())
-            rate[q : q + 4] = 0.5 * turn
-        else:
-            rate[q] = qvel[v]
-    return rate
+    ahead, behind = qpos.copy(), qpos.copy()
+    mujoco.mj_integratePos(model, ahead, qvel, _ALONG_S)
+    mujoco.mj_integratePos(model, behind, qvel, -_ALONG_S)
+    return np.asarray((ahead - behind) / (2.0 * _ALONG_S))
 
 
 _READ: Final = ("body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "eq_", "tendon_", "pair_", "qpos")
