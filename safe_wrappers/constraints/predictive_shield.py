@@ -153,7 +153,11 @@ class BoundPredictiveShield(BoundConstraint):
     plant: RolloutPlant
 
     def __init__(self, spec: PredictiveShield, plant: Plant) -> None:
-        plant.require_simulation("PredictiveShield")
+        if not plant.simulates:
+            raise UnsupportedEnvError(
+                f"PredictiveShield simulates backups, which a {type(plant).__name__} cannot: take "
+                "plant=SimulatorPlant(), and put other constraints' requirements into h"
+            )
         super().__init__(spec, plant)
         self.info_keys = self.plant.info_keys
         if not self.plant.simulates_env and (spec.sees == "env" or isinstance(spec.h, str)):

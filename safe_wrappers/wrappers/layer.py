@@ -98,7 +98,7 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
             raise ConfigurationError(f"the observation has {name!r} already: {sorted(entries)}")
         self.observation_space = spaces.Dict({**entries, name: more})
 
-    def _widened(self, observation: Any, name: str, numbers: NDArray[Any]) -> Any:
+    def _with_numbers(self, observation: Any, name: str, numbers: NDArray[Any]) -> Any:
         """The observation with the numbers that `_widen_observation` has announced."""
         space = self.observation_space
         if isinstance(space, spaces.Box):

@@ -218,4 +218,4 @@ class FilterObservation(LayerWrapper):
             parts = [c.features(self.neighbours) for c in observed.bound]
         else:  # the state is not a number, and nothing was judged
             parts = [np.full(c.feature_count(self.neighbours), np.nan) for c in observed.bound]
-        return self._widened(observation, KEY, np.concatenate([*parts, shares]))
+        return self._with_numbers(observation, KEY, np.concatenate([*parts, shares]))

@@ -273,4 +273,4 @@ class OcclusionPenalty(LayerWrapper):
         tracking = self.tracking
         deviations = np.sqrt(np.diagonal(tracking.position_covariances, axis1=1, axis2=2))
         flat = np.concatenate([tracking.positions - body, tracking.velocities, deviations], axis=1).ravel()
-        return self._widened(observation, "tracks", flat)
+        return self._with_numbers(observation, "tracks", flat)
