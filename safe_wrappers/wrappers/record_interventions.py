@@ -51,10 +51,11 @@ class _Tally:
         """The figure after so many steps; None if nobody reported it, or for a 0 that is not of every step."""
         numbers, how = self._numbers, self.figure.how
         if how == "min":
-            numbers = [number for number in numbers if math.isfinite(number)]
-        if how in ("min", "last", "any"):
-            picked = {"min": min, "last": lambda all_: int(all_[-1]), "any": lambda all_: bool(max(all_))}
-            return picked[how](numbers) if numbers else None
+            return min(filter(math.isfinite, numbers), default=None)
+        if how == "last":
+            return int(numbers[-1]) if numbers else None
+        if how == "any":
+            return bool(max(numbers)) if numbers else None
         if how == "p95":
             return float(np.percentile(numbers, 95)) if len(numbers) == steps else None
         total = sum(numbers) if how in ("sum", "mean") else int(sum(numbers))
