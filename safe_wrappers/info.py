@@ -165,8 +165,6 @@ executed was clipped to the space. A filter inside counts that in `cbf/correctio
 # ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
 HANDOVER_PEAK_JERK: Final = _key("handover/peak_jerk", "float64", unit="action/s", log="peak_jerk")
 """The largest rate of change between neighbouring executed commands, of any component."""
-HANDOVER_BLEND_TIME: Final = _key("handover/blend_time", "float64", unit="s", log="blend_time")
-"""Duration of the longest blend that began in this step; 0 where none did."""
 HANDOVER_STARVED: Final = _key("handover/starved", "int64", log="starved")
 """Control steps of this step at which the queue was empty and the fallback gave the command."""
 HANDOVER_LIMITED: Final = _key("handover/limited", "int64", log="limited")
@@ -174,8 +172,6 @@ HANDOVER_LIMITED: Final = _key("handover/limited", "int64", log="limited")
 HANDOVER_REFUSED: Final = _key("handover/refused", "bool")
 """A chunk was refused: not finite, not newer than the one in force, too late, out of reach, or without a blend that
 keeps `limits`."""
-HANDOVER_LATENCY: Final = _key("handover/latency", "int64")
-"""Control steps from the observation to the takeover of the last chunk that took over in this step; -1 without."""
 
 # LeaseExpiry, every control step ---------------------------------------------------------------------------------
 LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")

@@ -77,9 +77,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             the energy that a step of torque leaves in the springs, and smoothsteps that the next seam comes before
             the end of fade out beside the next one.
 
-    Info, at every step (see `safe_wrappers.info`): ``handover/peak_jerk``, ``handover/blend_time``,
-    ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``,
-    ``action/clipped``. The inner layers' info is merged over the control steps.
+    Info, at every step (see `safe_wrappers.info`): ``handover/peak_jerk``, ``handover/starved``,
+    ``handover/limited``, ``handover/refused``, ``action/clipped``. The inner layers' info is merged
+    over the control steps.
 
     Raises:
         ConfigurationError: Sizes that do not fit together, a time or limit that is not positive, nothing to blend
@@ -165,7 +165,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback.reset()
         self._queue.reset()
         self._start()
-        info.update(self._measured([], False, -1, 0.0))
+        info.update(self._measured([], False, 0.0))
         self.started = True
         return observation, info
 
@@ -176,14 +176,11 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         clipped = self._clipped(chunk)
         refused = not self._submit(chunk)
         total: Any = 0.0
-        infos, commands, latency = [], [], -1
+        infos, commands = [], []
         terminated = truncated = False
         for _ in range(self.execution_horizon):
-            now = self._queue.now
             command = self._queue.next(self._admits, self._fallback.command)
             refused |= command.refused
-            if command.took_over:
-                latency = now - command.observed
             if self._inside is not None:
                 observed_s = None if command.observed < 0 else command.observed * self.control_dt
                 self._inside.set_observation_time(observed_s)
@@ -198,7 +195,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
                 break
         self._observed_s = self.now_s
         info = keys.merged(infos)
-        info.update(self._measured(commands, refused, latency, clipped))
+        info.update(self._measured(commands, refused, clipped))
         return observation, total, terminated, truncated, info
 
     @property
@@ -268,23 +265,18 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             self._warn_once("clipped", f"{message}; its entries are clipped to it")
         return clipped
 
-    def _measured(
-        self, commands: list[Command], refused: bool, latency: int, clipped: float
-    ) -> dict[str, Any]:
+    def _measured(self, commands: list[Command], refused: bool, clipped: float) -> dict[str, Any]:
         executed = np.array(self._executed).reshape(-1, self._controls)
         peak = float(np.abs(np.diff(executed, axis=0)).max(initial=0.0)) / self.control_dt
         self._executed = self._executed[-1:]
-        blends = [c.blend_steps for c in commands if c.blend_steps]
         limited = sum(c.limited for c in commands)
         if limited:
             message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
             self._warn_once("limited", message)
         return {
             keys.HANDOVER_PEAK_JERK: peak,
-            keys.HANDOVER_BLEND_TIME: (max(blends) + 1) * self.control_dt if blends else 0.0,
             keys.HANDOVER_STARVED: sum(c.starved for c in commands),
             keys.HANDOVER_LIMITED: limited,
             keys.HANDOVER_REFUSED: refused,
-            keys.HANDOVER_LATENCY: latency,
             keys.ACTION_CLIPPED: clipped,
         }

@@ -33,9 +33,7 @@ class Command(NamedTuple):
     observed: int  # control step whose observation the command was made from; -1 before there was any
     starved: bool  # the queue is empty: the fallback gave it
     limited: bool  # held back beyond the blend to keep the rate limit
-    took_over: bool  # a chunk took over with it
     refused: bool  # a chunk that has arrived was refused
-    blend_steps: int  # control steps of the blend that begins with this command; 0 if none does
 
 
 class Chunk(NamedTuple):
@@ -121,28 +119,24 @@ class ChunkQueue:
             fallback: Called when nothing is planned; returns a finite control of shape (m,).
         """
         chunk, refused = self._admitted(admits)
-        newest = self._observed
         self._coming = [c for c in self._coming if c.due > self.now]
-        seam, blend_steps = False, 0
+        seam = False
         if chunk is not None:
             joined = self._take_over(chunk)
             refused |= joined is None
-            seam, blend_steps = joined or (False, 0)
+            seam = bool(joined)
         control, limited = self._planned()
         starved = control is None
         if control is None:
             control = np.clip(fallback(), self._low, self._high)
         if starved != self._starved and len(self._sent) and not seam and self._blend in BLENDS:
             # A longer chunk that takes over blends by itself; everything else starts from the last command.
-            blend_steps = self._fade_steps(control)
-            self._fade = (self._sent[-1], blend_steps, 0)
+            self._fade = (self._sent[-1], self._fade_steps(control), 0)
         self._starved = starved
         sent, held = self._sendable(self._faded(control))
         self._sent = np.concatenate([self._sent[-LOOK_BACK + 1 :], sent[None].astype(np.float64)])
         self.now += 1
-        took_over = self._observed > newest
-        held |= limited
-        return Command(sent, self._observed, starved, held, took_over, refused, blend_steps)
+        return Command(sent, self._observed, starved, held or limited, refused)
 
     def _admitted(self, admits: Callable[[Array], bool]) -> tuple[Chunk | None, bool]:
         """The chunk of the newest observation that may take over now, if any; and whether one was refused."""
@@ -154,8 +148,8 @@ class ChunkQueue:
             refused = True  # it came too late, or must not
         return None, refused
 
-    def _take_over(self, chunk: Chunk) -> tuple[bool, int] | None:
-        """Let a chunk take over: whether it is a seam, and its blend's steps; None if no blend keeps the limits."""
+    def _take_over(self, chunk: Chunk) -> bool | None:
+        """Let a chunk take over: whether it is a seam; None if no blend keeps the limits."""
         fresh = chunk.commands[self.now - chunk.observed :]
         joined: Seam | None = None
         if self._blend in BLENDS and len(chunk.commands) > 1:
@@ -166,10 +160,10 @@ class ChunkQueue:
         self._observed = chunk.observed
         if joined is None:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
-            return self._blend == REPLACE and len(self._sent) > 0, 0
+            return self._blend == REPLACE and len(self._sent) > 0
         self._plan, self._limited, self._asked = joined.plan, joined.limited, fresh
         self._fade = None
-        return len(self._sent) > 0, joined.steps
+        return len(self._sent) > 0
 
     def _joined(self, fresh: Array) -> Seam | None:
         """The blend into a chunk's rest, shape (n, m); None if none keeps the machine's limits."""

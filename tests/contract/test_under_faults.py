@@ -40,7 +40,7 @@ FLAGS = (
     "teleop/lost", "action/clipped",
     "contact/partial", "balance/partial", "occlusion/expired",
 )  # fmt: skip
-LESS_KNOWN = {"lease/remaining_s": -1, "teleop/round_trip_s": 1, "handover/latency": -1, "cbf/correction": 1}
+LESS_KNOWN = {"lease/remaining_s": -1, "teleop/round_trip_s": 1, "cbf/correction": 1}
 """Figures that say that something is not as usual, and in which direction."""
 assert {*FLAGS, *LESS_KNOWN} <= set(keys.KEYS)
 GATES = {}

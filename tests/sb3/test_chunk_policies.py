@@ -72,7 +72,7 @@ def test_a_policy_of_whole_chunks_learns_and_predicts(name):
     observation = env.reset(seed=1)[0]
     action, _ = model.predict(observation, deterministic=True)
     assert action.shape == (10, 2) and env.action_space.contains(action)
-    assert env.step(action)[4]["handover/latency"] in (-1, 0, 1, 2)
+    assert not env.step(action)[4]["handover/refused"]
     episodes = [i["episode"] for i in infos.seen if "episode" in i]
     assert {e["l"] for e in episodes} == {13}, "50 control steps are 13 chunks of 4"
 

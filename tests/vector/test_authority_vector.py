@@ -42,7 +42,7 @@ def test_the_episodes_by_hand_have_in_them_what_is_to_be_compared(task):
         assert any(s.info["handover/starved"] for s in steps) and any(
             s.info["handover/refused"] for s in steps
         )
-        assert len({s.info["handover/latency"] for s in steps}) >= 4
+        assert len({s.info["handover/starved"] for s in steps}) >= 2
     else:
         assert {s.info["lease/refused"] for s in steps} == {True, False}
     flags = ["lease/braking"]

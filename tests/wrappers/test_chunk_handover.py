@@ -7,7 +7,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from chunk_worlds import Line, Wander, counting_plant
+from chunk_worlds import ChunkHandover, Line, Wander, counting_plant
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from slow_handover import BLENDS, Slow, measured
@@ -62,7 +62,7 @@ class Scenario:
         bound = self.bound
         line = Line(self.controls, -bound, bound, self.dtype, HOLD, ends_at=self.ends_at)
         wander = self.fallback == "wander"
-        return sw.ChunkHandover(
+        return ChunkHandover(
             line,
             self.size,
             self.horizon,
@@ -249,7 +249,7 @@ def test_without_need_for_a_blend_the_chunks_bits_are_executed(blend, dtype):
     rng = np.random.default_rng(0)
     stream = rng.uniform(-1, 1, (40, 2)).astype(dtype)
     chunks = [stream[i : i + 8] for i in range(0, 32, 4)]  # they agree where they overlap
-    env = sw.ChunkHandover(Line(2, dtype=dtype), 8, 4, 2, blend=blend, rate_limit=20.0, fallback="zero")
+    env = ChunkHandover(Line(2, dtype=dtype), 8, 4, 2, blend=blend, rate_limit=20.0, fallback="zero")
     commands, infos = run(env, chunks)
     assert commands[2:].tobytes() == stream[2:32].tobytes()
     assert [i["handover/limited"] for i in infos] == [0] * 8
@@ -260,7 +260,7 @@ def test_without_need_for_a_blend_the_chunks_bits_are_executed(blend, dtype):
 def test_ordinary_policies_pass_bit_for_bit_as_chunks_of_one():
     rng = np.random.default_rng(1)
     actions = rng.uniform(-1, 1, (50, 3)).astype(np.float32)
-    env = sw.ChunkHandover(Line(3), 1, 1, rate_limit=20.0, fallback="zero")
+    env = ChunkHandover(Line(3), 1, 1, rate_limit=20.0, fallback="zero")
     commands, infos = run(env, actions[:, None])
     assert commands.tobytes() == actions.tobytes()
     assert all(i["handover/blend_time"] == 0.0 and i["handover/latency"] == 0 for i in infos)
@@ -268,7 +268,7 @@ def test_ordinary_policies_pass_bit_for_bit_as_chunks_of_one():
 
 def test_chunks_outside_the_box_are_clipped_to_it_before_they_are_limited():
     """A policy that asks for 1000 in a box of 1 must not be a long way from -1."""
-    env = sw.ChunkHandover(Line(), 4, 4, rate_limit=10.0, fallback="zero")
+    env = ChunkHandover(Line(), 4, 4, rate_limit=10.0, fallback="zero")
     up, down = np.full((4, 1), 1000.0, np.float32), np.full((4, 1), -1000.0, np.float32)
     commands, _ = run(env, [up, down])
     assert commands[:4, 0].tolist() == [1.0] * 4
@@ -286,7 +286,7 @@ def numbered(k, size):
 @pytest.mark.parametrize(("size", "horizon"), [(8, 4), (6, 3), (4, 2)])
 def test_what_is_executed_when_for_every_delay_up_to_the_horizon(size, horizon):
     for delay in range(min(horizon, size - horizon) + 1):
-        env = sw.ChunkHandover(Line(), size, horizon, delay, blend="replace", fallback="zero")
+        env = ChunkHandover(Line(), size, horizon, delay, blend="replace", fallback="zero")
         commands, infos = run(env, [numbered(k, size) for k in range(1, 6)])
         for t, command in enumerate(commands[:, 0]):
             k, j = divmod(t - delay, horizon)  # chunk k took over at k horizon + delay
@@ -306,12 +306,12 @@ def test_random_delays_are_drawn_within_bounds_all_of_them_and_again_with_the_se
             found.append([env.step(numbered(k, 12))[4]["handover/latency"] for k in range(40)])
         return found
 
-    env = sw.ChunkHandover(Line(), 12, 6, [1, 4], fallback="zero", rate_limit=50.0)
+    env = ChunkHandover(Line(), 12, 6, [1, 4], fallback="zero", rate_limit=50.0)
     first, second = latencies(env, 3, episodes=2)
     assert set(first) == {1, 2, 3, 4} == set(second) and first != second
     assert latencies(env, 3, episodes=2) == [first, second]
     assert latencies(env, 4) != [first]
-    again = sw.ChunkHandover(Line(), 12, 6, [1, 4], fallback="zero", rate_limit=50.0)
+    again = ChunkHandover(Line(), 12, 6, [1, 4], fallback="zero", rate_limit=50.0)
     assert latencies(again, 3) == [first]
 
 
@@ -320,7 +320,7 @@ def test_random_delays_are_drawn_within_bounds_all_of_them_and_again_with_the_se
     [(0.0, "old"), (0.4, "a repeat"), (0.39, "a repeat"), (0.7, "the future"), (-1.0, "old")],
 )
 def test_chunks_that_are_not_newer_or_from_the_future_are_refused(stamp, why):
-    env = sw.ChunkHandover(Line(), 8, 2, blend="replace", fallback="zero")
+    env = ChunkHandover(Line(), 8, 2, blend="replace", fallback="zero")
     env.reset(seed=0)
     for k in (1, 2, 3):
         env.step(numbered(k, 8))  # the third is from 0.4 s
@@ -332,7 +332,7 @@ def test_chunks_that_are_not_newer_or_from_the_future_are_refused(stamp, why):
 
 
 def test_a_reset_forgets_chunks_stamps_and_commands():
-    env = sw.ChunkHandover(Line(), 8, 4, 4, rate_limit=0.5, fallback="zero")
+    env = ChunkHandover(Line(), 8, 4, 4, rate_limit=0.5, fallback="zero")
     fresh, _ = run(env, [numbered(k, 8) for k in range(4)])
     env.reset(seed=0)
     env.step(np.ones((8, 1), np.float32))
@@ -348,7 +348,7 @@ def test_a_reset_forgets_chunks_stamps_and_commands():
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("where", [0, 5, 11])
 def test_a_chunk_with_one_bad_entry_is_refused_whole_then_left_over_then_fallback(bad, where):
-    env = sw.ChunkHandover(Line(), 12, 4, blend="replace", fallback="hold")
+    env = ChunkHandover(Line(), 12, 4, blend="replace", fallback="hold")
     env.reset(seed=0)
     env.step(numbered(1, 12))
     broken = numbered(2, 12)
@@ -363,7 +363,7 @@ def test_a_chunk_with_one_bad_entry_is_refused_whole_then_left_over_then_fallbac
 @pytest.mark.parametrize("blend", BLENDS)
 def test_into_the_fallback_and_back_is_bumpless(blend):
     limit = 1.0
-    env = sw.ChunkHandover(Line(), 8, 4, blend=blend, rate_limit=limit, fallback="zero")
+    env = ChunkHandover(Line(), 8, 4, blend=blend, rate_limit=limit, fallback="zero")
     env.reset(seed=0)
     high, infos = np.full((8, 1), 0.9, np.float32), []
     for step in range(14):
@@ -381,7 +381,7 @@ def test_into_the_fallback_and_back_is_bumpless(blend):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
 def test_a_broken_fallback_sends_nothing_that_is_not_finite(value):
-    env = sw.ChunkHandover(
+    env = ChunkHandover(
         Line(low=-np.inf, high=np.inf),
         4,
         2,
@@ -402,7 +402,7 @@ def test_an_episode_may_end_inside_a_chunk(ends_at):
     def infos(line):
         return {"cost": float(line.steps)}
 
-    env = sw.ChunkHandover(Line(ends_at=ends_at, infos=infos), 8, 4, 1, rate_limit=5.0, fallback="zero")
+    env = ChunkHandover(Line(ends_at=ends_at, infos=infos), 8, 4, 1, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     done, rewards, cost = False, 0.0, 0.0
     while not done:
@@ -423,7 +423,7 @@ def test_what_was_executed_is_measured_not_what_was_sent():
             info["executed_action"] = done
             return observation, reward, terminated, truncated, info
 
-    env = sw.ChunkHandover(Flips(Line()), 4, 2, rate_limit=5.0, fallback="zero")
+    env = ChunkHandover(Flips(Line()), 4, 2, rate_limit=5.0, fallback="zero")
     commands, infos = run(env, [np.full((4, 1), 0.5, np.float32)] * 3)
     assert np.abs(commands).tolist() == [[0.5]] * 6
     assert [i["handover/peak_jerk"] for i in infos] == [10.0] * 3
@@ -433,7 +433,7 @@ def test_what_was_executed_is_measured_not_what_was_sent():
 
 
 def test_replacement_is_the_new_chunk_at_once_and_its_seam_is_measured():
-    env = sw.ChunkHandover(Line(), 4, 2, blend="replace", fallback="zero")
+    env = ChunkHandover(Line(), 4, 2, blend="replace", fallback="zero")
     commands, infos = run(env, [np.full((4, 1), x, np.float32) for x in (1.0, -1.0)])
     assert commands[:, 0].tolist() == [1.0, 1.0, -1.0, -1.0]
     assert infos[1]["handover/peak_jerk"] == pytest.approx(20.0)
@@ -444,7 +444,7 @@ def test_replacement_is_the_new_chunk_at_once_and_its_seam_is_measured():
 
 def handover(env, **changed):
     arguments = {"chunk_size": 8, "execution_horizon": 4, "fallback": "zero", "rate_limit": 5.0, **changed}
-    return sw.ChunkHandover(env, **arguments)
+    return ChunkHandover(env, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -530,7 +530,7 @@ class Listener(gym.Wrapper, CommandReceiver):
 
 def test_whoever_is_inside_is_told_what_every_command_is_made_from():
     """Nothing before the first chunk; the chunk in force for its commands, its left-over, and while it starves."""
-    env = sw.ChunkHandover(Listener(Line()), 6, 3, 1, rate_limit=5.0, fallback="zero")
+    env = ChunkHandover(Listener(Line()), 6, 3, 1, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     env.step(numbered(1, 6))
     env.step(numbered(2, 6))
@@ -559,7 +559,7 @@ def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on(between):
         motion_limits={"max_speed": 1.0, "max_acceleration": 10.0},
         fallback="zero",
     )
-    env = sw.ChunkHandover(between(lease), 6, 3, rate_limit=5.0, fallback="zero")
+    env = ChunkHandover(between(lease), 6, 3, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     assert not env.step(np.full((6, 1), 0.1, np.float32))[4]["handover/refused"]
     far = env.step(np.full((6, 1), 0.9, np.float32))[4]  # 0.6 s at 1 per second

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from chunk_worlds import ChunkHandover
 from slow_handover import BLENDS
 
 import safe_wrappers as sw
@@ -65,7 +66,7 @@ def test_hundreds_of_seams_and_not_one_beyond_the_limit(env_id, blend):
     """Late by chance, lost by chance, with the brake as the fallback."""
     limit = ENVS[env_id]
     recorder = Recorder(gym.make(env_id))
-    env = sw.ChunkHandover(recorder, 24, 8, [0, 5], blend=blend, rate_limit=limit)
+    env = ChunkHandover(recorder, 24, 8, [0, 5], blend=blend, rate_limit=limit)
     rng = np.random.default_rng(0)
     infos, found, seams = episodes(env, smooth_chunks(env, rng), 120, late=rng)
     assert seams > 80 and len(found) >= 4
@@ -81,7 +82,7 @@ def test_a_filter_inside_may_break_the_limit_and_then_it_shows():
     """What is sent keeps it; what is executed is the filter's, and that is what is reported."""
     recorder = Recorder(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(6.0)]))
     limit = 4.0
-    env = sw.ChunkHandover(recorder, 24, 8, 2, rate_limit=limit)
+    env = ChunkHandover(recorder, 24, 8, 2, rate_limit=limit)
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     above, last = 0, None

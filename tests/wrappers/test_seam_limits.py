@@ -6,13 +6,13 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from chunk_worlds import Line
+from chunk_worlds import ChunkHandover, Line
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import smoothstep_share
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
 import safe_wrappers as sw
-from safe_wrappers.control.handover.vibration import smoothstep_share
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import RigidModelCheck
 from safe_wrappers.wrappers.chunk_queue import Upsampling
@@ -26,7 +26,7 @@ HOLD = 0.1
 def driven(chunks, blend="quintic", horizon=4, delay=0, **more):
     """The infos of some chunks on a line, and what it was sent."""
     line = Line(chunks[0].shape[1], dtype=np.float64)
-    env = sw.ChunkHandover(line, len(chunks[0]), horizon, delay, blend=blend, fallback="hold", **more)
+    env = ChunkHandover(line, len(chunks[0]), horizon, delay, blend=blend, fallback="hold", **more)
     env.reset(seed=0)
     return [env.step(chunk)[4] for chunk in chunks], np.array(line.given)
 
@@ -99,7 +99,7 @@ def test_a_bridge_that_the_box_would_cut_is_not_taken():
 def test_a_change_to_and_from_the_fallback_is_faded_within_the_limits():
     line = Line(1, dtype=np.float64)
     limits = {"acceleration": 5.7735026919 / 0.7**2 * 1.0001}
-    env = sw.ChunkHandover(line, 1, 1, blend="quintic", fallback="hold", limits=limits)
+    env = ChunkHandover(line, 1, 1, blend="quintic", fallback="hold", limits=limits)
     env.reset(seed=0)
     env.step(np.array([-0.5]))
     env.set_observation_time(None)
@@ -145,7 +145,7 @@ def torque_by_hand(q, v, a):
 
 
 def held_pendulum(limits, levels, entries=20, **pendulum):
-    env = sw.ChunkHandover(Pendulum(**pendulum), entries, 8, blend="quintic", fallback="zero", limits=limits)
+    env = ChunkHandover(Pendulum(**pendulum), entries, 8, blend="quintic", fallback="zero", limits=limits)
     env.reset(seed=0)
     return [env.step(np.full((entries, 1), level))[4] for level in levels]
 
@@ -180,7 +180,7 @@ def test_a_slow_chunks_knots_are_refused_by_the_torque_steps_there():
     largest = np.abs(bend(at + 1e-9) - bend(at - 1e-9)).max() * inertia / 0.02
     for factor, refused in ((1.001, False), (0.999, True)):
         limits = {"torque_slew": factor * largest}
-        env = sw.ChunkHandover(
+        env = ChunkHandover(
             Pendulum(), 6, 8, steps_per_entry=4, blend="quintic", fallback="zero", limits=limits
         )
         env.reset(seed=0)
@@ -198,7 +198,7 @@ def test_what_is_no_position_servo_tells_no_torque(actuator):
     env = Pendulum(actuator)
     env.action_space = gym.spaces.Box(-2.0, 2.0, (env.model.nu,), np.float64)
     with pytest.raises(UnsupportedEnvError, match="no position servo"):
-        sw.ChunkHandover(env, 8, 4, blend="quintic", limits={"torque": 3.0})
+        ChunkHandover(env, 8, 4, blend="quintic", limits={"torque": 3.0})
 
 
 # Bad input --------------------------------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ def test_what_is_no_position_servo_tells_no_torque(actuator):
 )
 def test_bad_limits_are_refused(limits, says):
     with pytest.raises(ConfigurationError, match=says):
-        sw.ChunkHandover(Line(1), 8, 4, blend="quintic", fallback="hold", limits=limits)
+        ChunkHandover(Line(1), 8, 4, blend="quintic", fallback="hold", limits=limits)
 
 
 @pytest.mark.parametrize(("entries", "steps"), [(2, 3), (5, 4), (9, 33)])
@@ -242,7 +242,7 @@ class Sent(gym.Wrapper):
 
 def test_a_slow_chunk_drives_a_fast_loop_late_and_within_the_limit():
     inner = Sent(gym.make("FlexJointReach-v0"))
-    env = sw.ChunkHandover(inner, 5, 10, inference_delay=3, steps_per_entry=5, rate_limit=[30.0, 10.0])
+    env = ChunkHandover(inner, 5, 10, inference_delay=3, steps_per_entry=5, rate_limit=[30.0, 10.0])
     assert env.action_space.shape == (5, 2)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -267,7 +267,7 @@ def test_a_slow_chunk_drives_a_fast_loop_late_and_within_the_limit():
 )
 def test_bad_sizes(sizes, words):
     with pytest.raises(ConfigurationError, match=words):
-        sw.ChunkHandover(
+        ChunkHandover(
             gym.make("Reacher-v5"), **{"chunk_size": 5, "execution_horizon": 3, "rate_limit": 5.0, **sizes}
         )
 
@@ -284,7 +284,7 @@ def smooth(s):
 
 def sent(chunks, horizon, **more):
     line = Line(chunks[0].shape[1], dtype=np.float64)
-    env = sw.ChunkHandover(line, len(chunks[0]), horizon, fallback="hold", **more)
+    env = ChunkHandover(line, len(chunks[0]), horizon, fallback="hold", **more)
     env.reset(seed=0)
     infos = [env.step(chunk)[4] for chunk in chunks]
     return np.array(line.given), infos
@@ -335,7 +335,7 @@ def test_a_seam_on_the_flexible_arm_leaves_no_more_than_its_share():
     """One change of torque at the elbow from rest: what rings on after it, against what rings on after a step."""
 
     def left(**how):
-        env = sw.ChunkHandover(gym.make("FlexJointReach-v0"), 40, 20, fallback="zero", **how)
+        env = ChunkHandover(gym.make("FlexJointReach-v0"), 40, 20, fallback="zero", **how)
         env.reset(seed=0)
         # The arm hardly turns, so that its resonances stay.
         for level in (0.0, 0.05):
@@ -358,4 +358,4 @@ def test_a_seam_on_the_flexible_arm_leaves_no_more_than_its_share():
 )
 def test_bad_input_is_refused(arguments, says):
     with pytest.raises(ConfigurationError, match=says):
-        sw.ChunkHandover(Line(1), 16, 8, fallback="hold", **arguments)
+        ChunkHandover(Line(1), 16, 8, fallback="hold", **arguments)
