@@ -10,6 +10,7 @@ from safe_wrappers.checks import Array, float_array
 from safe_wrappers.control.numerics.projection import box_least_squares
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import BoundConstraint
+from safe_wrappers.plants.mujoco.model import inertia
 from safe_wrappers.plants.plant import Plant
 
 FallbackFunction = Callable[[Plant], ArrayLike]
@@ -84,7 +85,7 @@ def brake(plant: Any) -> Array:
     if not plant.has_acceleration:
         return np.asarray(plant.braking())
     drift, effect = plant.acceleration
-    weight = np.sqrt(plant.inertia_diagonal())
+    weight = np.sqrt(np.diag(inertia(plant.model, plant.forward())))
     a = effect * weight[:, None]
     scale = float(np.sqrt((a * a).sum(axis=0).max(initial=1e-12)))
     low, high = plant.acting_range

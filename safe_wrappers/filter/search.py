@@ -339,10 +339,6 @@ class SafeActionSearch:
 
 
 def _joined(first: Rows, second: Rows) -> Rows:
-    if not first[1].size:
-        return second
-    if not second[1].size:
-        return first
     return np.concatenate([first[0], second[0]]), np.concatenate([first[1], second[1]])
 
 

@@ -110,11 +110,3 @@ class Plant(ABC):
         """Refuse a constraint, named by `asker`, whose rows need f and g where there are none."""
         if not self.has_acceleration:
             raise UnsupportedEnvError(f"{asker} needs the acceleration that a control causes")
-
-    def require_simulation(self, asker: str) -> None:
-        """Refuse a constraint, named by `asker`, that needs rollouts of a policy where there are none."""
-        if not self.simulates:
-            raise UnsupportedEnvError(
-                f"{asker} simulates backups, which a {type(self).__name__} cannot: take plant=SimulatorPlant(), and "
-                "put other constraints' requirements into h"
-            )

@@ -9,6 +9,7 @@ from judged_loops import Scene, flagged
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.plants.mujoco.model import weight_n
 
 ROUNDING = 1e-6
 """Executed actions are rounded to float32, and a robot in contact makes more of it."""
@@ -44,7 +45,7 @@ def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_marg
     for part, admitted in ((0.99, True), (1.01, False), (-0.99, True), (-1.01, False)):
         control = np.array([part * largest * weight / 50.0])
         limit = settled(pushed_balls(cone=cone), spec, control, 40)
-        assert limit.plant.weight_n == pytest.approx(weight)
+        assert weight_n(limit.plant.model) == pytest.approx(weight)
         assert limit.admits(control) is admitted
         inside = share * 0.8 - abs(part) * largest
         assert limit.insides(control)[0] == pytest.approx(inside, abs=2e-3)

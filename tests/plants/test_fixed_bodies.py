@@ -3,8 +3,7 @@
 import mujoco
 import numpy as np
 
-import safe_wrappers as sw
-from safe_wrappers.plants.mujoco.model import fixed_bodies
+from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 
 XML = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
 <body name="shelf"><geom size=".1"/></body>
@@ -22,6 +21,4 @@ def test_the_world_mocap_bodies_and_what_is_welded_to_either():
 
 
 def test_a_hand_that_is_moved_by_the_env_is_no_weight():
-    plant = sw.MujocoPlant()
-    plant.model = mujoco.MjModel.from_xml_string(XML)
-    assert np.isclose(plant.weight_n, 3.0 * 9.81)
+    assert np.isclose(weight_n(mujoco.MjModel.from_xml_string(XML)), 3.0 * 9.81)

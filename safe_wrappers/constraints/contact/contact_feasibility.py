@@ -13,7 +13,7 @@ from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
-from safe_wrappers.plants.mujoco.model import fixed_bodies
+from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
@@ -84,7 +84,7 @@ class BoundContactFeasibility(BoundSlacks):
         along = np.einsum("ki,ki->k", found.force, found.normal)
         across = np.linalg.norm(found.force - along[:, None] * found.normal, axis=1)
         inside = np.minimum(along, self.spec.friction_share * found.friction * along - across)
-        np.minimum.at(worst, found.body, inside / self.plant.weight_n)
+        np.minimum.at(worst, found.body, inside / weight_n(self.plant.model))
         return worst[self._chosen]
 
     def slacks(self, control: Array) -> Array:

@@ -18,7 +18,7 @@ from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem, pr
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
-from safe_wrappers.plants.mujoco.model import fixed_bodies
+from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
@@ -163,7 +163,7 @@ class BoundStance(BoundConstraint):
             return -np.inf
         forces, _ = whole_body.rigid_forces(problem, control)
         missed = cone_excess(forces, problem.normals, problem.friction)
-        return -float(missed.max()) / self.plant.weight_n if len(forces) else 0.0
+        return -float(missed.max()) / weight_n(self.plant.model) if len(forces) else 0.0
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info key `whole_body/cone_margin`: of the forces that would hold the contacts."""

@@ -94,16 +94,6 @@ def checked_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
     return model
 
 
-def check_same_machine(before: mujoco.MjModel, after: mujoco.MjModel) -> None:
-    """Refuse a model that an env has made itself since a plant was bound, with other joints or actuators."""
-    expected, found = ((m.nq, m.nv, m.nu) for m in (before, after))
-    if found != expected:
-        raise UnsupportedEnvError(
-            f"the env has made itself another machine: expected (nq, nv, nu) = {expected} as when the filter was "
-            f"built, got {found}; build the filter anew"
-        )
-
-
 def control_interval(raw: Any) -> float:
     """How long an unwrapped MuJoCo env holds one action, s."""
     return physics_steps(raw) * float(raw.model.opt.timestep)

@@ -110,7 +110,12 @@ class MujocoPlant(Plant):
             _scale(model, *self._factors)
         moved = source.model is not self._env_model
         if moved and self._env_model is not None:
-            binding.check_same_machine(self._env_model, source.model)
+            expected, found = ((m.nq, m.nv, m.nu) for m in (self._env_model, source.model))
+            if found != expected:
+                raise UnsupportedEnvError(
+                    f"the env has made itself another machine: expected (nq, nv, nu) = {expected} as when the filter "
+                    f"was built, got {found}; build the filter anew"
+                )
         self.model = model
         self._constants = Constants(source.model, (*DYNAMICS, *PLACES))
         self._dynamics = Constants(source.model, DYNAMICS)
@@ -282,11 +287,6 @@ class MujocoPlant(Plant):
     def state(self) -> Array:
         return self._snapshot[1 : 1 + self._nq + self._nv]
 
-    @property
-    def weight_n(self) -> float:
-        """Weight of everything that moves, N; without gravity its mass in kg."""
-        return of_model.weight_n(self.model)
-
     def named(self, kind: str, name: str, argument: str = "") -> int:
         """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all.
 
@@ -350,10 +350,6 @@ class MujocoPlant(Plant):
             motion = data.actuator_length, data.actuator_velocity
         ends = self.actuators.acting_range(*motion, self.control_dt)
         return ends if self.action_map is None else self.action_map.actions_between(*ends)
-
-    def inertia_diagonal(self) -> Array:
-        """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""
-        return np.diag(of_model.inertia(self.model, self.forward()))
 
     def forecast(self, control: Array, horizon: int = 1, euler: bool = False) -> Forecast:
         """A control, shape (nu,), held for one control interval, then every actuator brakes its own motion.
