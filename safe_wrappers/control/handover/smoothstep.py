@@ -24,6 +24,6 @@ def smoothstep(s: ArrayLike) -> Array:
     return np.asarray(np.where(s <= 0.5, half, 1.0 - half))
 
 
-def shortest_latched_blend(step: ArrayLike, rate_limit: ArrayLike) -> Array:
+def shortest_latched_blend(step: Array | float, rate_limit: Array | float) -> Array:
     """Shortest blend time in s between two constant commands: 1.875 |step| / rate_limit, rounded up."""
     return np.asarray(SMOOTHSTEP_PEAK_RATE * np.abs(step) / rate_limit * ROUND_UP)
