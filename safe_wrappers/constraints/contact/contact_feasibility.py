@@ -1,6 +1,5 @@
 """ContactFeasibility: the ground's forces on the robot stay inside their friction cones."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
-from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
+from safe_wrappers.plants.mujoco.model import weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
@@ -32,7 +31,6 @@ class ContactFeasibility(Constraint):
         friction_share: Of the model's friction coefficient, in (0, 1]. MuJoCo's default cones are pyramids: above
             0.71 a foot may slide within its share.
         tolerance: By how much a force may miss its cone, as a share of the robot's weight: light touches scrape.
-        bodies: Names of the bodies whose contacts count; None is every moving body.
         margin: Kept free inside the cone, as a share of the weight. More than the tolerance refuses light touches.
 
     Source: appendix "Physical contact feasibility constraints".
@@ -40,14 +38,11 @@ class ContactFeasibility(Constraint):
 
     friction_share: float = 0.7
     tolerance: float = 0.01
-    bodies: Sequence[str] | None = None
     margin: float = 0.0
 
     def __post_init__(self) -> None:
         self.friction_share = checked_friction_share(self.friction_share)
         check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
-        if self.bodies is not None:
-            self.bodies = name_list("bodies", self.bodies, also="None for every body")
 
     def bind(self, plant: Plant) -> "BoundContactFeasibility":
         return BoundContactFeasibility(self, plant)
@@ -61,18 +56,7 @@ class BoundContactFeasibility(BoundSlacks):
 
     def __init__(self, spec: ContactFeasibility, plant: Plant) -> None:
         super().__init__(spec, require_contacts(plant, "ContactFeasibility"))
-        touching = touching_bodies(self.plant, "there is no cone to stay in")
-        self._chosen = np.flatnonzero(touching)
-        if self.spec.bodies is not None:
-            self._chosen = np.array([self._resting(name, touching) for name in self.spec.bodies])
-
-    def _resting(self, name: str, touching: NDArray[np.bool_]) -> int:
-        i = self.plant.named("body", name)
-        if fixed_bodies(self.plant.model)[i]:
-            raise ConfigurationError(f"the body {name!r} does not move, so the ground is part of it")
-        if not touching[i]:
-            raise UnsupportedEnvError(f"the body {name!r} cannot touch the fixed world with friction")
-        return i
+        self._chosen = np.flatnonzero(touching_bodies(self.plant, "there is no cone to stay in"))
 
     def insides(self, control: Array) -> Array:
         """By how much each body's contact forces stay inside the cone, at worst, shape (k,), shares of the weight.

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, positive, true_or_false
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
+from safe_wrappers.constraints.rollout import BoundRollout, Recent, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -71,7 +71,7 @@ class SpeedLimit(RolloutConstraint):
 class SpeedMemory(NamedTuple):
     """The memory of every rollout, and the point at the last control step, m (None: there was none)."""
 
-    rollout: RolloutMemory
+    recent: Recent
     here: Array | None = None
 
 
@@ -97,7 +97,7 @@ class BoundSpeedLimit(BoundRollout):
 
     def observe(self, memory: Memory) -> None:
         self._before = memory.here
-        super().observe(memory.rollout)
+        super().observe(memory.recent)
 
     def executed(self, control: Array) -> Memory:
         return SpeedMemory(super().executed(control), self._here)

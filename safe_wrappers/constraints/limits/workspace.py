@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import Array, name_list, non_negative
+from safe_wrappers.checks import Array, finite_array, name_list, non_negative
 from safe_wrappers.constraints.obstacles import distances, obstacle_marks, obstacles_from
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.drawing.marks import Mark, ball, edges, pad
@@ -147,10 +147,7 @@ class BoundWorkspace(BoundRollout):
 def _corner(name: str, given: Sequence[float | None] | None) -> list[float | None] | None:
     if given is None:
         return None
-    try:
-        corner = [None if v is None else float(v) for v in given]
-    except (TypeError, ValueError):
-        corner = []
-    if len(corner) != 3 or any(v is not None and not np.isfinite(v) for v in corner):
+    corner = [None if v is None else float(finite_array(name, v)) for v in given]
+    if len(corner) != 3:
         raise ConfigurationError(f"{name} is [x, y, z] in m, None where there is no bound; got {given!r}")
     return corner
