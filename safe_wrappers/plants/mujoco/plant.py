@@ -76,8 +76,8 @@ class MujocoPlant(Plant):
         control_dt: float | None = None,
         loop: ControlLoop | None = None,
     ) -> None:
-        own = isinstance(model, mujoco.MjModel)
-        self._given, self._functions = (model, (None, data)) if own else (None, (model, data))
+        self._given = model if isinstance(model, mujoco.MjModel) else None
+        self._functions: tuple[Any, Any] = (None if self._given is not None else model, data)
         if not isinstance(loop, ControlLoop | None):
             example = "sw.plants.ControlLoop(crossover=4.0, phase_margin_deg=60.0)"
             raise ConfigurationError(f"loop is a ControlLoop, such as {example}, or None; got {loop!r}")
