@@ -90,7 +90,6 @@ def wall_filter(env: gym.Env[Any, Any]) -> sw.CBFActionFilter:
     )
     barrier = sw.constraints.Barrier(
         lambda x: WALL - x[0] - x[1] ** 2 / (2.0 * BRAKE),
-        gradient=lambda x: np.array([-1.0, -x[1] / BRAKE]),
         alpha=ALPHA,
     )
     filtered = sw.CBFActionFilter(env, [barrier], plant=plant)

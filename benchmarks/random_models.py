@@ -170,7 +170,6 @@ def _filtered(machine: Machine, plants: dict[str, Any], rng: random.Random) -> g
     options = [
         limits.SpeedLimit(rng.uniform(0.05, 2.0), body=rng.choice((None, body))),
         limits.Workspace(low=[-1.0, None, 0.0], high=[1.0, 1.0, None], bodies=[body], horizon=2),
-        limits.Upright(body=body, lowest=0.1, tilt=1.0),
         limits.Clearance([limits.Plane([0.5, 0.0, 0.0], [-1.0, 0.0, 0.0])], 3.0, bodies=[body]),
     ]
     if some:

@@ -131,7 +131,7 @@ def _remedy(env: Any, single: gym.Env[Any, Any]) -> tuple[str, str]:
     Raises:
         ConfigurationError: None can be made; the message says why.
     """
-    discrete = isinstance(single.action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
+    discrete = isinstance(single.action_space, gym.spaces.Discrete)
     kind: Any = ActionShield if discrete else CBFActionFilter
     vector = isinstance(env, gym.vector.VectorEnv) and not discrete
     name = VectorCBFActionFilter.__name__ if vector else kind.__name__

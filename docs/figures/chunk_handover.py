@@ -40,10 +40,10 @@ def chunk(number: int, rng: np.random.Generator) -> NDArray[Any]:
     return (swing + rng.uniform([-0.9, -0.3], [0.9, 0.3])).astype(np.float32)
 
 
-def run(blend: str, **bounds: float) -> Log:
+def run(**bounds: float) -> Log:
     """The same chunks with another seam."""
     log = Log(gym.make("FlexJointReach-v0"))
-    env = sw.ChunkHandover(log, CHUNK, HORIZON, inference_delay=DELAY, blend=blend, **bounds)
+    env = sw.ChunkHandover(log, CHUNK, HORIZON, inference_delay=DELAY, **bounds)
     env.reset(seed=0)
     rng = np.random.default_rng(1)
     for number in range(12):
@@ -54,11 +54,11 @@ def run(blend: str, **bounds: float) -> Log:
 def draw() -> Figure:
     """Command, its first difference, and the energy that the seam leaves in the springs."""
     figure, (command, rate, energy) = panels(3, height=2.7)
-    for blend, bounds, color, name in (
-        ("replace", {}, OFF, "replaced"),
-        ("smoothstep", {"blend_time": 0.15}, ON, "blended"),
+    for bounds, color, name in (
+        ({"rate_limit": 1e9}, OFF, "replaced"),
+        ({"blend_time": 0.15}, ON, "blended"),
     ):
-        log = run(blend, **bounds)
+        log = run(**bounds)
         time = STEP_S * np.arange(len(log.commands))
         torque = np.array(log.commands)[:, 0]
         command.step(time, torque, where="post", color=color, label=name)

@@ -14,7 +14,6 @@ from safe_wrappers.constraints.contact.support_margin import SupportMargin
 from safe_wrappers.constraints.limits.joints import JointPositionLimit, JointSpeedLimit
 from safe_wrappers.constraints.limits.singularity_margin import SingularityMargin
 from safe_wrappers.constraints.limits.speed_limit import SpeedLimit
-from safe_wrappers.constraints.limits.upright import Upright
 from safe_wrappers.constraints.limits.workspace import Workspace
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
 from safe_wrappers.constraints.predictive_shield import PredictiveShield
@@ -45,7 +44,6 @@ __all__ = [
     "TrackPermission",
     "TrackedDiscs",
     "Traction",
-    "Upright",
     "WallClearance",
     "Workspace",
 ]

@@ -20,7 +20,6 @@ from safe_wrappers.control.backup.stopping import (
     approach_rows_of,
     approaches,
 )
-from safe_wrappers.control.numerics.shapes import squashed
 from safe_wrappers.drawing.marks import Mark, segment
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
@@ -135,23 +134,6 @@ class BoundClearance(BoundConstraint):
         ]
         clearances, speeds = zip(*found, strict=True)
         return np.concatenate(clearances), np.concatenate(speeds)
-
-    def feature_count(self, neighbours: int) -> int:
-        return 1 + neighbours * (self._points.coordinates + 2)
-
-    def features(self, neighbours: int) -> Array:
-        """The smallest room; of the nearest surfaces the direction away from them, clearance and approach speed.
-
-        Of all points together, in world coordinates; 1 m and 1 m/s are 0.5. Where there are fewer, the rest is far.
-        """
-        clearances, speeds = self.approach()
-        normals = np.concatenate([self._surfaces(p).normal for p, _ in self._points.motions()])
-        seen = np.zeros((neighbours, self._points.coordinates + 2))
-        seen[:, -2] = 1.0
-        order = np.argsort(clearances, kind="stable")[:neighbours]
-        for row, i in zip(seen, order.tolist(), strict=False):
-            row[:-2], row[-2:] = normals[i], (squashed(clearances[i], 1.0), squashed(speeds[i], 1.0))
-        return np.concatenate([super().features(neighbours), seen.ravel()])
 
     def draw(self) -> list[Mark]:
         """The obstacles with what is kept free before them, and every point's way until rest along its motion."""

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, non_negative, positive, whole_number
+from safe_wrappers.checks import Array, non_negative, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.plant import Plant
@@ -61,8 +61,6 @@ class PredictiveShield(Constraint):
         value: Chooses among those that are admitted, such as the critic of a learner. None: the
             nearest is taken, and no more are tried.
         margin: Kept free, in the unit of h.
-        max_decrease: The most that h can fall within the horizon, whatever is done, in its unit; from a state with
-            more than that left nothing is simulated. None: always simulate.
     """
 
     h: Callable[[Any], float] | str
@@ -73,7 +71,6 @@ class PredictiveShield(Constraint):
     candidates: int = 16
     value: Value | None = None
     margin: float = 0.0
-    max_decrease: float | None = None
 
     simulates: ClassVar[bool] = True
 
@@ -89,8 +86,6 @@ class PredictiveShield(Constraint):
                 raise ConfigurationError(f"{name} is a function or None, got {given!r}")
         self.candidates = whole_number("candidates", self.candidates, 0, "actions")
         self.margin = non_negative("margin", self.margin, "the unit of h")
-        if self.max_decrease is not None:
-            self.max_decrease = positive("max_decrease", self.max_decrease, "the unit of h")
         self.promise = "best effort" if self.terminal is None else "proved"
         several = isinstance(self.backup, list | tuple) and not _is_action(self.backup)
         backups = self.backup if several else [self.backup]
@@ -285,9 +280,6 @@ class BoundPredictiveShield(BoundConstraint):
         return slack
 
     def slack(self, control: Array) -> float:
-        far = self.spec.max_decrease
-        if far is not None and not self._unknown and self._now - self._needed.max() >= far:
-            return float(self._now - self._needed.max() - far)
         return self.plan(control).slack
 
     def candidates(self, control: Array) -> Iterable[Array]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import name_list, positive
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -14,7 +14,7 @@ from safe_wrappers.plants.plant import Plant
 
 @dataclass
 class TrackPermission(Constraint):
-    """While the permission of a track has expired, slow down to `creep` (rest), at least as hard as `braking`.
+    """While the permission of a track has expired, brake to rest, at least as hard as `braking`.
 
     An `OcclusionPenalty` inside the filter says which tracks may be relied on.
 
@@ -24,7 +24,6 @@ class TrackPermission(Constraint):
     Args:
         body: Name of the body whose frame origin is stopped.
         braking: Deceleration that the actuators can give in every direction, m/s^2.
-        creep: Speed that stays allowed, m/s.
         tracks: Names of the tracks that count (`track_names` of the OcclusionPenalty); None: all.
 
     Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
@@ -32,12 +31,10 @@ class TrackPermission(Constraint):
 
     body: str
     braking: float
-    creep: float = 0.0
     tracks: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         self.braking = positive("braking", self.braking, "m/s^2")
-        self.creep = non_negative("creep", self.creep, "m/s")
         if self.tracks is not None:
             self.tracks = name_list("tracks", self.tracks, also="None for all")
 
@@ -72,9 +69,6 @@ class BoundTrackPermission(BoundConstraint):
         v, drift, effect = v[acted], drift[acted], effect[acted]
         speed = float(np.sqrt(v @ v))
         left = max(0.0, 1.0 - self.spec.braking * self.plant.control_dt / speed) if speed > 0.0 else 0.0
-        # The speed in each axis at the end of the hold: what braking leaves, and a share of the room up to `creep`.
-        # All axes together are then no faster than the larger of the two.
-        room = max(0.0, self.spec.creep**2 - (left * speed) ** 2) / max(v.size, 1)
-        allowed = np.sqrt((left * v) ** 2 + room)
+        allowed = np.abs(left * v)  # in each axis, at the end of the hold
         least, most = ((end - v) / self.plant.control_dt - drift for end in (-allowed, allowed))
         return HalfSpaces(np.concatenate([effect, -effect]), np.concatenate([most, -least]))

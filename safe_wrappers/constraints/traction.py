@@ -241,17 +241,6 @@ class BoundTraction(BoundConstraint):
         torque = self._torques(wanted, self.seen.present) - bias
         return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
 
-    def feature_count(self, neighbours: int) -> int:
-        return 2 * len(self.spec.wheels)
-
-    def features(self, neighbours: int) -> Array:
-        """Of each wheel its slip in shares of the limit, then of each the estimated friction mu as mu / (1 + mu)."""
-        if self.seen.rate is None:
-            return np.full(self.feature_count(neighbours), np.nan)
-        shares = np.clip(self.seen.slip / self._limit, -1.0, 1.0)
-        friction = self.seen.estimate.mean
-        return np.concatenate([shares, friction / (1.0 + friction)])
-
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `slip/...`, of the state before the step."""
         return {keys.SLIP_RATIO: self.seen.slip.copy(), keys.SLIP_MU_ESTIMATE: self.seen.estimate.mean}

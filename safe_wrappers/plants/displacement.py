@@ -68,7 +68,7 @@ class DisplacementRecorder(Recorder):
         return np.zeros(4)
 
 
-_WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, SingularityMargin, Upright"
+_WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, SingularityMargin"
 
 
 class DisplacementPlant(MujocoPlant):

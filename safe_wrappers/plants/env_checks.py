@@ -87,12 +87,12 @@ def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
     ):
         return space
     expected = f"expected a continuous Box action space of shape (m,), got {space}"
-    if isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete):
+    if isinstance(space, gym.spaces.Discrete):
         raise ConfigurationError(
             f"{expected}: use ActionShield(env, [PredictiveShield(...)]), which tries every action"
         )
     raise ConfigurationError(
         f"{expected}. Give the env one flat Box of floats, from gymnasium.spaces.flatten_space where all its "
-        "parts are such, and translate in its step (gymnasium.spaces.unflatten); discrete parts alone may be one "
-        "MultiDiscrete for ActionShield"
+        "parts are such, and translate in its step (gymnasium.spaces.unflatten); discrete parts alone may be "
+        "numbered, for ActionShield"
     )

@@ -132,12 +132,9 @@ class RolloutPlant(Plant):
         elif isinstance(space, gym.spaces.Discrete):
             self.lower = np.array([float(space.start)])
             self.upper = self.lower + float(space.n - 1)
-        elif isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1:
-            self.lower = space.start.astype(float)
-            self.upper = self.lower + space.nvec - 1.0
         else:
             raise UnsupportedEnvError(
-                f"expected a Box of shape (m,), a Discrete or a MultiDiscrete action space, got {space}; give "
+                f"expected a Box of shape (m,) or a Discrete action space, got {space}; give "
                 "the env one of these from gymnasium.spaces.flatten_space, and gymnasium.spaces.unflatten in its step"
             )
         self._space = space

@@ -31,14 +31,14 @@ class ActionShield(CBFActionFilter):
     number, the last action goes on.
 
     Args:
-        env: With a Discrete or one-dimensional MultiDiscrete action space, of at most 1,024 actions in all.
+        env: With a Discrete action space, of at most 1,024 actions.
         constraints: As for `CBFActionFilter`; each must judge actions by simulation, as `PredictiveShield` does.
         plant: None simulates the env itself (`SimulatorPlant`).
         fallback: "brake" (a constraint's backup), "hold", or a function of the plant that returns an action.
         margin: As for `CBFActionFilter`.
 
-    Info: the keys of `CBFActionFilter`; ``proposed_action`` and ``executed_action`` have shape (1,) with Discrete
-    actions. ``cbf/correction`` is the distance of their numbers.
+    Info: the keys of `CBFActionFilter`; ``proposed_action`` and ``executed_action`` have shape (1,).
+    ``cbf/correction`` is the distance of their numbers.
 
     Raises:
         ConfigurationError: Another action space, or too many actions; else as `CBFActionFilter`.
@@ -71,22 +71,14 @@ class ActionShield(CBFActionFilter):
         space = env.action_space
         if isinstance(space, gym.spaces.Box):
             raise ConfigurationError(f"expected discrete actions, got {space}: use CBFActionFilter")
-        if (
-            not isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
-            or len(space.shape or ()) > 1
-        ):
+        if not isinstance(space, gym.spaces.Discrete):
             raise ConfigurationError(
-                f"expected Discrete or one-dimensional MultiDiscrete actions, got {space}. Give the env one of "
-                "these, and translate its actions in its step"
+                f"expected Discrete actions, got {space}. Give the env these, and translate its actions in its step"
             )
-        counts = np.atleast_1d(space.n if isinstance(space, gym.spaces.Discrete) else space.nvec)
-        if counts.prod() > _MOST:
-            raise ConfigurationError(
-                f"every action is tried, of which there may be {_MOST:,}; {space} has {counts.prod():,}"
-            )
-        self._counts = counts
-        self._low = np.atleast_1d(space.start).astype(np.float64)
-        self._high = self._low + counts - 1.0
+        if space.n > _MOST:
+            raise ConfigurationError(f"every action is tried, of which there may be {_MOST:,}; got {space}")
+        self._low = np.array([space.start], dtype=np.float64)
+        self._high = self._low + float(space.n) - 1.0
         self._shape, self._dtype = self._low.shape, np.float64
 
     def step(self, action: Any) -> Step:
@@ -100,21 +92,15 @@ class ActionShield(CBFActionFilter):
         """Which actions would be executed as they are in the env's present state.
 
         Returns:
-            Shape (n,) with Discrete actions. With MultiDiscrete ones, shape (sum of nvec,), as MaskablePPO wants it:
-            whether an entry belongs to some admitted action; combinations of such entries may still be refused. If
-            none is admitted, the one that violates least alone is; if the state is not a number, all are.
+            Shape (n,). If none is admitted, the one that violates least alone is; if the state is not a number, all.
         """
         self.observe()
-        every = self._low + np.stack(np.unravel_index(np.arange(self._counts.prod()), self._counts), axis=1)
+        every = np.arange(self._low[0], self._high[0] + 1.0)[:, None]
         engine = self.filter
         if engine.margin != engine.margin:
-            return np.ones(int(self._counts.sum()) if self._counts.size > 1 else len(every), dtype=bool)
+            return np.ones(len(every), dtype=bool)
         admitted = np.array([engine.admits(control) for control in every])
         if not admitted.any():
             slacks = [min(c.slack(control) / c.scale for c in engine.bound) for control in every]
             admitted[int(np.argmax(slacks))] = True
-        if self._counts.size == 1:
-            return admitted
-        table = admitted.reshape(self._counts)
-        axes = range(table.ndim)
-        return np.concatenate([table.any(axis=tuple(b for b in axes if b != a)) for a in axes])
+        return admitted

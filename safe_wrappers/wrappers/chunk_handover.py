@@ -22,13 +22,11 @@ from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_mode
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.chunk_queue import (
-    REPLACE,
     ChunkQueue,
     ChunkSizes,
     Command,
     Upsampling,
     blend_bounds,
-    bounds_for_springs,
 )
 from safe_wrappers.wrappers.commands import FallbackController
 from safe_wrappers.wrappers.layer import (
@@ -63,7 +61,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         chunk_size: H, entries of a chunk.
         execution_horizon: s, control steps from one chunk's observation to the next; `d <= s <= H - d`.
         inference_delay: d, control steps; or [least, most], drawn anew for every chunk.
-        blend: "smoothstep" or "quintic"; or "replace", a baseline without any bound: the new chunk at once.
+        blend: "smoothstep" or "quintic".
         blend_time: s, the least duration of a blend; without it and `rate_limit` blends are as long as the left-over.
         rate_limit: Bound on |u[k+1] - u[k]| / control interval, for all components or one each, action units per s.
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
@@ -120,8 +118,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         space = check_actions(env)
         plant = own_plant(plant)
         sizes = ChunkSizes.checked(chunk_size, execution_horizon, inference_delay, steps_per_entry)
-        if blend not in (*BLENDS, REPLACE):
-            raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, REPLACE))}")
+        if blend not in BLENDS:
+            raise UnknownNameError(f"no blend {blend!r}; choose {', '.join(BLENDS)}")
         limits = None if limits is None else settings_from(SeamLimits, limits, "limits")
         blend_time, rate_limit, control_dt = map(plain_numbers, (blend_time, rate_limit, control_dt))
         self._record(
@@ -146,9 +144,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self.action_space = gym.spaces.Box(low, high, dtype=space.dtype)
         self._fallback = FallbackController(env, fallback, plant)
         springs = self._springs(flexible)
-        if springs is not None:
-            blend_time, rate_limit = bounds_for_springs(springs, space, blend_time, rate_limit)
-        bounds = blend_time, rate_limit, limits
+        bounds = blend_time, rate_limit, limits, springs
         fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, *bounds)
         self._check = None if limits is None else self._bound_check(limits)
         queue = space, self.control_dt, blend, fewest, rate_limits, self._check

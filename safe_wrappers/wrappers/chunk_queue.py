@@ -11,16 +11,12 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.control.handover.curves import hermite_spline
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import BLENDS, LOOK_BACK, Seam, drawn_out, join
+from safe_wrappers.control.handover.seams import LOOK_BACK, Seam, drawn_out, join
 from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE, shortest_latched_blend, smoothstep
 from safe_wrappers.control.handover.vibration import shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck
 from safe_wrappers.wrappers.layer import whole_steps
-
-REPLACE: Final = "replace"
-"""The baseline without a bound on the seam: the new chunk at once."""
-
 
 _VIBRATION_SHARE: Final = 0.01
 """Of the energy that a step of torque leaves in springs, what a blend over the whole action range may leave."""
@@ -53,7 +49,7 @@ class ChunkQueue:
     Args:
         space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
         control_dt: Control interval, s.
-        blend: A blend of `control/handover/seams.py`, or "replace".
+        blend: A blend of `control/handover/seams.py`.
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
         check: Of the machine's limits; None accepts all blends.
@@ -129,7 +125,7 @@ class ChunkQueue:
         starved = control is None
         if control is None:
             control = np.clip(fallback(), self._low, self._high)
-        if starved != self._starved and len(self._sent) and not seam and self._blend in BLENDS:
+        if starved != self._starved and len(self._sent) and not seam:
             # A longer chunk that takes over blends by itself; everything else starts from the last command.
             self._fade = (self._sent[-1], self._fade_steps(control), 0)
         self._starved = starved
@@ -151,17 +147,18 @@ class ChunkQueue:
     def _take_over(self, chunk: Chunk) -> bool | None:
         """Let a chunk take over: whether it is a seam; None if no blend keeps the limits."""
         fresh = chunk.commands[self.now - chunk.observed :]
-        joined: Seam | None = None
-        if self._blend in BLENDS and len(chunk.commands) > 1:
-            joined = self._joined(fresh)
-            if joined is None:
-                return None
+        joined = (
+            self._joined(fresh)
+            if len(chunk.commands) > 1
+            else Seam(fresh, 0, np.zeros(len(fresh), dtype=bool))
+        )
+        if joined is None:
+            return None
         self._coming = [c for c in self._coming if c.observed > chunk.observed]
         self._observed = chunk.observed
-        if joined is None:
-            self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
-            return self._blend == REPLACE and len(self._sent) > 0
         self._plan, self._limited, self._asked = joined.plan, joined.limited, fresh
+        if len(chunk.commands) == 1:
+            return False
         self._fade = None
         return len(self._sent) > 0
 
@@ -220,7 +217,7 @@ class ChunkQueue:
     def _sendable(self, control: Array) -> tuple[NDArray[Any], bool]:
         """The command in the env's dtype, within the box and the limit, and whether it had to be held back."""
         control = np.clip(control, self._low, self._high)
-        if self._blend not in BLENDS or not len(self._sent):
+        if not len(self._sent):
             return control.astype(self._dtype), False
         last = self._sent[-1]
         kept = np.clip(control, last - self._step, last + self._step)
@@ -272,57 +269,41 @@ def blend_bounds(
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
     limits: SeamLimits | None = None,
+    springs: RigidModelCheck | None = None,
 ) -> tuple[int, Array]:
-    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
-    fewest, rate_limits = 0, np.full(space.shape, np.inf)
-    given = {"blend_time": blend_time, "rate_limit": rate_limit, "limits": limits}
-    named = [name for name, one in given.items() if one is not None]
-    if blend == REPLACE:
-        if named:
-            bounded = ", ".join(BLENDS)
-            baseline = f"blend={blend!r} is a baseline that bounds nothing"
-            raise ConfigurationError(
-                f"{baseline}: blend_time, rate_limit, limits and flexible are for {bounded}"
-            )
-        return fewest, rate_limits
+    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none.
+
+    Springs ask for the time from which on a smoothstep leaves at most 1 % of a step's energy in them, and for the
+    steepest rate of such a blend over the whole action range.
+    """
     if limits is not None and blend != "quintic":
         raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
-    if blend_time is not None:
-        fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
-        available = sizes.chunk - sizes.delay[1]
-        if fewest >= available and sizes.chunk > 1:
-            left = f"{available} control steps of {control_dt} s"
-            longer = f"blend_time = {blend_time} s is longer than a chunk's rest, {left}"
-            raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
+    rates, shortest = (
+        np.full(space.shape, np.inf),
+        0.0 if blend_time is None else positive("blend_time", blend_time, "s"),
+    )
     if rate_limit is not None:
-        rate_limits = _rate_limits(rate_limit, rate_limits.size)
-        resolution = _rounding(space)
-        if (rate_limits * control_dt <= resolution).any():
-            least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
-            raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
-    if not named:
-        fewest = sizes.chunk - sizes.horizon - sizes.delay[1]  # the least left-over
+        rates = _rate_limits(rate_limit, rates.size)
+    if springs is not None:
+        calm = shortest_smoothstep(_VIBRATION_SHARE, springs.resonances[0])
+        rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / calm, rates)
+        shortest = max(calm, shortest)
+    resolution = _rounding(space)
+    if (rates * control_dt <= resolution).any():
+        least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
+        raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
+    fewest = max(whole_steps(shortest, control_dt) - 1, 1) if shortest else 0
+    available = sizes.chunk - sizes.delay[1]
+    if fewest >= available and sizes.chunk > 1:
+        left = f"{available} control steps of {control_dt} s"
+        longer = f"blend_time = {shortest} s is longer than a chunk's rest, {left}"
+        raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
+    if not shortest and rate_limit is None and limits is None:
+        fewest = available - sizes.horizon  # the least left-over
         if fewest == 0:
             has = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"
             raise ConfigurationError(f"{has}: no left-over to blend with: pass rate_limit or blend_time")
-    return fewest, rate_limits
-
-
-def bounds_for_springs(
-    check: RigidModelCheck,
-    space: gym.spaces.Box,
-    blend_time: float | None,
-    rate_limit: float | Sequence[float] | None,
-) -> tuple[float, Sequence[float] | float | None]:
-    """Blend time, s, and rate limit, each the stricter of the user's and of what springs ask.
-
-    These ask for the time from which on a smoothstep leaves at most 1 % of a step's energy in them, and for the
-    steepest rate of such a blend over the whole action range, if every component has one.
-    """
-    shortest = shortest_smoothstep(_VIBRATION_SHARE, check.resonances[0])
-    own = np.full(space.shape, np.inf) if rate_limit is None else _rate_limits(rate_limit, space.shape[0])
-    rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / shortest, own)
-    return max(shortest, blend_time or 0.0), rates.tolist() if np.isfinite(rates).all() else rate_limit
+    return fewest, rates
 
 
 def _delay(value: Any) -> tuple[int, int]:

@@ -53,7 +53,6 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     Args:
         env: With a Box action space; it must say how long a step lasts (`dt`) if nothing inside counts the time.
-        control_dt: The time that a step lasts, s; None reads the env's.
         arguments: Of the fault itself, for the spec.
 
     Raises:
@@ -66,16 +65,13 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     _last: Any
 
-    def __init__(self, env: Env, control_dt: float | None = None, **arguments: Any) -> None:
-        self._record({"control_dt": control_dt, **arguments})
+    def __init__(self, env: Env, **arguments: Any) -> None:
+        self._record(arguments)
         LayerWrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
-        self.control_dt = 0.0 if self._inside is not None else check_timing(env, control_dt)
-        if self._inside is not None and control_dt is not None:
-            inside = type(self._inside).__name__
-            raise ConfigurationError(f"{inside} inside counts the time: leave control_dt out")
+        self.control_dt = 0.0 if self._inside is not None else check_timing(env, None)
         self._passes_numbers = not any(
             getattr(inner, "layer", None) in _DECIDING for inner in wrappers_of(env)
         )
@@ -155,9 +151,9 @@ def probability(name: str, value: float) -> float:
 class RepeatedCommands(Fault):
     """Loses a `share` of the commands, from 0 to 1, each by itself, and sends the last one once more."""
 
-    def __init__(self, env: Env, share: float, control_dt: float | None = None) -> None:
+    def __init__(self, env: Env, share: float) -> None:
         self._share = probability("share", share)
-        super().__init__(env, control_dt, share=self._share)
+        super().__init__(env, share=self._share)
 
     def begin(self) -> None:
         self._before: Carried | None = None
@@ -176,9 +172,9 @@ class Jitter(Fault):
     overtaken are lost.
     """
 
-    def __init__(self, env: Env, longest_s: float, control_dt: float | None = None) -> None:
+    def __init__(self, env: Env, longest_s: float) -> None:
         self._longest_s = positive("longest_s", longest_s, "s")
-        super().__init__(env, control_dt, longest_s=self._longest_s)
+        super().__init__(env, longest_s=self._longest_s)
 
     def begin(self) -> None:
         self._coming: list[tuple[float, Carried]] = []
@@ -217,11 +213,9 @@ class OnOffProcess:
 class Outages(Fault):
     """Loses all commands during outages of `mean_length_s`, `mean_between_s` apart, s on average."""
 
-    def __init__(
-        self, env: Env, mean_between_s: float, mean_length_s: float, control_dt: float | None = None
-    ) -> None:
+    def __init__(self, env: Env, mean_between_s: float, mean_length_s: float) -> None:
         self._process = OnOffProcess(mean_between_s, mean_length_s)
-        super().__init__(env, control_dt, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
+        super().__init__(env, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
 
     def begin(self) -> None:
         self._process.begin(self.random)

@@ -9,10 +9,11 @@ from typing import Any, ClassVar, Final, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import OF_NUMBERS, numbers_of, shown
-from safe_wrappers.errors import ActionError, UnsupportedEnvError
+from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.default import PlantTemplate
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.serialize import recorded
@@ -79,6 +80,33 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         while frame is not None and str(frame.f_globals.get("__name__")).startswith(_WRAPPERS):
             level, frame = level + 1, frame.f_back
         warnings.warn(message, category, stacklevel=level)
+
+    def _widen_observation(self, name: str, more: spaces.Box) -> None:
+        """A flat Box of floats becomes longer, a Dict gets an entry, any other becomes one of `"observation"`."""
+        space = self.env.observation_space
+        if (
+            isinstance(space, spaces.Box)
+            and len(space.shape) == 1
+            and space.dtype in (np.float32, np.float64)
+        ):
+            low, high = (np.concatenate(ends) for ends in ((space.low, more.low), (space.high, more.high)))
+            kind = space.dtype.type
+            self.observation_space = spaces.Box(low.astype(kind), high.astype(kind), dtype=kind)
+            return
+        entries = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        if name in entries:
+            raise ConfigurationError(f"the observation has {name!r} already: {sorted(entries)}")
+        self.observation_space = spaces.Dict({**entries, name: more})
+
+    def _with_numbers(self, observation: Any, name: str, numbers: NDArray[Any]) -> Any:
+        """The observation with the numbers that `_widen_observation` has announced."""
+        space = self.observation_space
+        if isinstance(space, spaces.Box):
+            return np.concatenate([observation, numbers]).astype(space.dtype)
+        assert isinstance(space, spaces.Dict)
+        inside = isinstance(self.env.observation_space, spaces.Dict)
+        entries = observation if inside else {"observation": observation}
+        return {**entries, name: numbers.astype(space[name].dtype)}
 
     def _record(self, arguments: Mapping[str, Any], **plain: Any) -> None:
         """Record the constructor's arguments (its `locals()`), some as plain data; a plant as a template."""

@@ -190,23 +190,7 @@ class FilterObservation(LayerWrapper):
         low, high = np.ravel(self._observer.action_space.low), np.ravel(self._observer.action_space.high)  # type: ignore[attr-defined]
         self._low, self._high = low.astype(np.float64), high.astype(np.float64)
         count = sum(c.feature_count(self.neighbours) for c in self._observer.filter.bound) + low.size
-        self.observation_space = self._space(env.observation_space, count)
-
-    def _space(self, space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
-        features = spaces.Box(-1.0, 1.0, (count,), np.float32)
-        if isinstance(space, spaces.Dict):
-            if KEY in space.spaces:
-                raise ConfigurationError(f"the observation has a key {KEY!r} already: {sorted(space.spaces)}")
-            return spaces.Dict({**space.spaces, KEY: features})
-        if (
-            isinstance(space, spaces.Box)
-            and len(space.shape) == 1
-            and space.dtype in (np.float32, np.float64)
-        ):
-            ones = np.ones(count)
-            low, high = np.concatenate([space.low, -ones]), np.concatenate([space.high, ones])
-            return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
-        return spaces.Dict({"observation": space, KEY: features})
+        self._widen_observation(KEY, spaces.Box(-1.0, 1.0, (count,), np.float32))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env; no correction yet."""
@@ -234,10 +218,4 @@ class FilterObservation(LayerWrapper):
             parts = [c.features(self.neighbours) for c in observed.bound]
         else:  # the state is not a number, and nothing was judged
             parts = [np.full(c.feature_count(self.neighbours), np.nan) for c in observed.bound]
-        features = np.concatenate([*parts, shares])
-        space = self.observation_space
-        if isinstance(space, spaces.Box):
-            return np.concatenate([observation, features]).astype(space.dtype)
-        if isinstance(self.env.observation_space, spaces.Dict):
-            return {**observation, KEY: features.astype(np.float32)}
-        return {"observation": observation, KEY: features.astype(np.float32)}
+        return self._with_numbers(observation, KEY, np.concatenate([*parts, shares]))

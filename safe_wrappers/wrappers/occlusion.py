@@ -1,7 +1,7 @@
 """What an `OcclusionPenalty` is made of: sensors, inertial units and tracks."""
 
 from collections.abc import Callable, Sequence, Sized
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
@@ -208,18 +208,12 @@ class Sensor:
             parts.append(apparent @ turned[:d, :d].T + own_velocity)
         return np.concatenate(parts, axis=1)
 
-    def data(self) -> dict[str, Any]:
-        """Plain data, from which it can be made again."""
-        return asdict(self)
-
 
 def sensor_from(given: Any) -> Sensor:
     """A sensor itself, the name of a camera, or the dict of a recorded one."""
     if isinstance(given, str):
         return Sensor(camera=given)
-    if isinstance(given, Sensor | dict):
-        return settings_from(Sensor, given, "a sensor")
-    raise ConfigurationError(f"sensor is a Sensor(...), or the name of a camera of the model; got {given!r}")
+    return settings_from(Sensor, given, "sensor", ", or the name of a camera")
 
 
 @dataclass
@@ -282,10 +276,6 @@ class Track:
             [position, _each("start_velocity_std", self.start_velocity_std, coordinates, "m/s")]
         )
 
-    def data(self) -> dict[str, Any]:
-        """Plain data, from which it can be made again."""
-        return asdict(self)
-
 
 def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = False) -> Array:
     """One number per coordinate."""
@@ -300,14 +290,6 @@ def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = Fal
     for value in () if signed else values:
         non_negative(name, value, unit)
     return values
-
-
-def track_from(given: Any) -> Track:
-    """A track itself, or rebuilt from the dict of a recorded one."""
-    if isinstance(given, Track | dict):
-        return settings_from(Track, given, "a track")
-    example = f"sw.occlusion.Track({given!r}, acceleration_noise=0.1)"
-    raise ConfigurationError(f"expected a Track, such as {example} (m^2/s^3); got {given!r}")
 
 
 class Tracked(NamedTuple):

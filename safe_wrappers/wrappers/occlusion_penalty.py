@@ -9,13 +9,14 @@ import mujoco
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, positive, true_or_false
+from safe_wrappers.checks import Array, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.control.estimation.observability import unobservable_directions
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
+from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.occlusion import (
@@ -24,7 +25,6 @@ from safe_wrappers.wrappers.occlusion import (
     Sensor,
     Track,
     sensor_from,
-    track_from,
     tracked_things,
 )
 
@@ -49,7 +49,7 @@ class OcclusionPenalty(LayerWrapper):
             sensor's range; in units of the task's reward per step.
         sigmas: k of the bound that is compared with the tolerance.
         axes: "xy" tracks in the plane, "xyz" in space.
-        observe: Whether the observation (a flat Box, or a Dict under "tracks") gains, for each track, the estimated
+        observe: Whether the observation (other than a flat Box under "tracks") gains, for each track, the estimated
             position from the sensor's body (m, world axes), velocity (m/s) and deviation along each axis (m).
 
     Info, at every step and at reset: ``occlusion/visible``, ``occlusion/expired`` (bool arrays, one per track),
@@ -65,7 +65,7 @@ class OcclusionPenalty(LayerWrapper):
         unobservable: Track name -> directions of its state that the sensor cannot resolve even in sight.
 
     Raises:
-        UnsupportedEnvError: No MuJoCo model, or with `observe` neither a flat Box nor a Dict observation.
+        UnsupportedEnvError: No MuJoCo model.
         ConfigurationError: A number outside its range, a name that the model does not have, or a wrong order.
 
     Example:
@@ -101,7 +101,7 @@ class OcclusionPenalty(LayerWrapper):
             raise UnsupportedEnvError(f"OcclusionPenalty needs MuJoCo's .model and .data; {raw} has none")
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
-        self.tracks = [track_from(t) for t in tracks]
+        self.tracks = [settings_from(Track, track, "a track") for track in tracks]
         self.sensor = sensor_from(sensor)
         if self.sensor.velocity_std is not None and any(t.published is not None for t in self.tracks):
             raise ConfigurationError("velocity_std: velocities are measured of bodies alone")
@@ -112,7 +112,7 @@ class OcclusionPenalty(LayerWrapper):
             raise ConfigurationError(f"axes is 'xy' or 'xyz', got {axes!r}")
         self.observe = true_or_false("observe", observe)
         plain = {name: getattr(self, name) for name in ("tolerance", "weight", "sigmas")}
-        parts = {"tracks": [t.data() for t in self.tracks], "sensor": self.sensor.data()}
+        parts = {"tracks": plain_data(self.tracks), "sensor": plain_data(self.sensor)}
         self._record(arguments, **parts, **plain, observe=self.observe)
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
         self._control_dt = control_interval(raw)
@@ -127,7 +127,8 @@ class OcclusionPenalty(LayerWrapper):
         self.last_seen_positions = np.zeros((len(self.track_names), self._d))
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
         if self.observe:
-            self.observation_space = _with_tracks(env.observation_space, 3 * self._d * len(self.track_names))
+            size = 3 * self._d * len(self.track_names)
+            self._widen_observation("tracks", gym.spaces.Box(-np.inf, np.inf, (size,), np.float64))
 
     def _look_at(self, model: mujoco.MjModel) -> None:
         """Resolve names on a model."""
@@ -272,22 +273,4 @@ class OcclusionPenalty(LayerWrapper):
         tracking = self.tracking
         deviations = np.sqrt(np.diagonal(tracking.position_covariances, axis1=1, axis2=2))
         flat = np.concatenate([tracking.positions - body, tracking.velocities, deviations], axis=1).ravel()
-        if isinstance(observation, dict):
-            return observation | {"tracks": flat}
-        return np.concatenate([observation, flat.astype(observation.dtype)])
-
-
-def _with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:
-    """The observation space with so many numbers more."""
-    if isinstance(space, gym.spaces.Dict):
-        if "tracks" in space.spaces:
-            raise UnsupportedEnvError("the observation has an entry 'tracks' already; pass observe=False")
-        more = gym.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float64)
-        return gym.spaces.Dict({**space.spaces, "tracks": more})
-    flat = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-    if not (flat and np.issubdtype(space.dtype or object, np.floating)):
-        raise UnsupportedEnvError(f"no flat Box of floats and no Dict: {space}; pass observe=False")
-    box: Any = space
-    bound = np.full(size, np.inf)
-    low, high = np.concatenate([box.low, -bound]), np.concatenate([box.high, bound])
-    return gym.spaces.Box(low.astype(box.dtype), high.astype(box.dtype), dtype=box.dtype.type)
+        return self._with_numbers(observation, "tracks", flat)

@@ -19,15 +19,13 @@ COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
 
 
 class _Tally:
-    """A figure of the episode so far."""
+    """A figure of the episode so far: the numbers that were reported, of which NaN is none."""
 
     def __init__(self, figure: keys.EpisodeFigure) -> None:
         self.figure = figure
         of = [keys.KEYS[name] for name in figure.of]
         self._read = [(key.name, key.number if key.shape else float) for key in of]
-        self._whole = of[0].dtype == "int64"
-        self._reports = 0
-        self._total: int | float = math.inf if figure.how == "min" else 0
+        self._counts = of[0].dtype == "int64"
         self._numbers: list[float] = []
         self._before: Any = None
 
@@ -36,41 +34,34 @@ class _Tally:
         self._before = info.get(self.figure.of[0])
 
     def add(self, info: dict[str, Any]) -> None:
-        """Count a step; NaN is no report, and no `margin_min` is infinite."""
-        numbers = [n for name, read in self._read if name in info and (n := read(info[name])) == n]
-        if not numbers:
+        """Take a step's number."""
+        found = [n for name, read in self._read if name in info and (n := read(info[name])) == n]
+        if not found:
             return
-        number, how = numbers[0], self.figure.how
-        self._reports += 1
-        if how == "count":
-            self._total += int(number) if self._whole else max(numbers) > 0.0
-        elif how in ("sum", "mean"):
-            self._total += number
-        elif how == "p95":
-            self._numbers.append(number)
-        elif how == "min":
-            self._total = min(number, self._total) if math.isfinite(number) else self._total
-        elif how == "last":
-            self._total = int(number)
-        elif how == "any":
-            self._total = bool(self._total or number)
-        else:
+        number = found[0]
+        if self.figure.how == "count" and not self._counts:
+            number = max(found) > 0.0
+        elif self.figure.how == "onsets":
             now = np.asarray(info[self.figure.of[0]])
-            self._total += 0 if self._before is None else int((now & ~self._before).sum())
+            number = 0 if self._before is None else int((now & ~self._before).sum())
             self._before = now
+        self._numbers.append(number)
 
     def value(self, steps: int) -> int | float | None:
         """The figure after so many steps; None if nobody reported it, or for a 0 that is not of every step."""
-        how = self.figure.how
+        numbers, how = self._numbers, self.figure.how
         if how == "min":
-            return self._total if math.isfinite(self._total) else None
-        if how in ("last", "any"):
-            return self._total if self._reports else None
-        if self._reports < steps and (how == "p95" or not self._total):
-            return None
+            return min(filter(math.isfinite, numbers), default=None)
+        if how == "last":
+            return int(numbers[-1]) if numbers else None
+        if how == "any":
+            return bool(max(numbers)) if numbers else None
         if how == "p95":
-            return float(np.percentile(self._numbers, 95))
-        return self._total / steps if how == "mean" else self._total
+            return float(np.percentile(numbers, 95)) if len(numbers) == steps else None
+        total = sum(numbers) if how in ("sum", "mean") else int(sum(numbers))
+        if not total and len(numbers) < steps:
+            return None
+        return total / steps if how == "mean" else total
 
 
 class RecordInterventions(LayerWrapper):

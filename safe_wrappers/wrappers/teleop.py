@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.faults import OnOffProcess, probability
 from safe_wrappers.wrappers.layer import Env, WrapperRng
@@ -16,8 +16,6 @@ from safe_wrappers.wrappers.stopping_budget import BoundBudget, BudgetLike, budg
 
 __all__ = ["Link", "RoundTripCeiling"]
 
-LONGEST_DELAY_S: Final = 10.0
-"""What a line remembers, s."""
 _RELEASE: Final = 0.8
 """Authority comes back only when the round trip is below this share of the ceiling."""
 
@@ -35,7 +33,7 @@ class Link:
         outage_length_s: Mean length of an outage, s.
 
     Raises:
-        ConfigurationError: A negative or too long time, a probability outside of 0 to 1, half of an outage.
+        ConfigurationError: A negative time, a probability outside of 0 to 1, half of an outage.
     """
 
     delay_s: float = 0.0
@@ -47,21 +45,12 @@ class Link:
 
     def __post_init__(self) -> None:
         check_fields(self, non_negative, ["delay_s", "jitter_s"], "s")
-        if self.longest_s > LONGEST_DELAY_S:
-            most = f"at most {LONGEST_DELAY_S:g} s"
-            raise ConfigurationError(f"delay_s + jitter_s is {most}; got {self.longest_s:g} s")
         object.__setattr__(self, "loss", probability("loss", self.loss))
-        if not isinstance(self.in_order, bool):
-            raise ConfigurationError(f"in_order is True or False, got {self.in_order!r}")
+        true_or_false("in_order", self.in_order)
         if (self.outage_between_s is None) != (self.outage_length_s is None):
             given = f"{self.outage_between_s!r} and {self.outage_length_s!r}"
             raise ConfigurationError(f"an outage needs outage_between_s and outage_length_s, s; got {given}")
         check_fields(self, positive, ["outage_between_s", "outage_length_s"], "s")
-
-    @property
-    def longest_s(self) -> float:
-        """The longest time that a packet may take by itself, s."""
-        return self.delay_s + self.jitter_s
 
 
 def link_from(name: str, given: Any) -> Link:

@@ -10,7 +10,6 @@ from scipy.optimize import lsq_linear
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
-from safe_wrappers.control.contact.impact import BODY_REGIONS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 # A mass on a slide before a wall ------------------------------------------------------------------------------
@@ -166,35 +165,6 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
 # What the world is like ---------------------------------------------------------------------------------------
 
 
-def test_a_region_brings_its_spring_its_mass_and_its_limit():
-    chest = BODY_REGIONS["chest"]
-    reduced = 1.0 / (1.0 / MASS + 1.0 / chest.mass)
-
-    def region(**more):
-        return limit(region="chest", **{"force_limit": None, "stiffness": None, **more})
-
-    def left(constraint):
-        return value_at(slide(), constraint, 0.3, gap=-1e-8)[0]
-
-    assert left(region()) == pytest.approx(280.0 - 0.3 * np.sqrt(chest.stiffness * reduced), abs=1e-2)
-    assert left(region(clamped=True)) == pytest.approx(
-        140.0 - 0.3 * np.sqrt(chest.stiffness * MASS), abs=1e-2
-    )
-    padded = 1.0 / (1.0 / chest.stiffness + 1.0 / 5e3)
-    assert left(region(stiffness=5e3)) == pytest.approx(280.0 - 0.3 * np.sqrt(padded * reduced), abs=1e-2)
-    assert left(region(force_limit=99.0)) == pytest.approx(
-        99.0 - 0.3 * np.sqrt(chest.stiffness * reduced), abs=1e-2
-    )
-    face = limit(region="face", force_limit=50.0, stiffness=None)
-    assert left(face) == pytest.approx(50.0 - 0.3 * np.sqrt(75e3 / (1.0 / MASS + 1.0 / 4.4)), abs=1e-2)
-    # What moves in the model has the model's mass, not the region's on top of it.
-    ball = '<body name="ball" pos=".4 0 0"><freejoint/><geom name="ball" size=".1" mass="1.25"/></body>'
-    env = slide(extra=ball)
-    env.data.qpos[0], env.data.qvel[0] = 0.2 + 1e-8, 0.3
-    hit = region(against=["ball"])
-    assert asked(env, hit).value() == pytest.approx(280.0 - 0.3 * np.sqrt(chest.stiffness), abs=1e-2)
-
-
 def test_a_wall_that_the_env_moves_by_hand_is_taken_where_it_is():
     env = slide(wall='mocap="true"')
     constraint = limit()
@@ -263,15 +233,7 @@ REACHER = {"bodies": ["fingertip"], "against": ["sideE"]}
     [
         ({"force_limit": 0.0}, ConfigurationError, "force_limit must be a finite number > 0 in N, got 0.0"),
         ({"margin": 100.0}, ConfigurationError, "the margin 100.0 N leaves nothing of the limit 100.0 N"),
-        ({"stiffness": None}, ConfigurationError, r"give a force_limit \(N\) and the interface's stiffness"),
-        ({"clamped": True}, ConfigurationError, "name the region too"),
-        (
-            {"region": "torso"},
-            UnknownNameError,
-            "no body region 'torso'; choose skull and forehead, face, neck",
-        ),
-        ({"region": "face", "force_limit": None}, ConfigurationError, "foresees no contact with 'face'"),
-        ({"region": "face", "force_limit": None, "clamped": True}, ConfigurationError, "foresees no contact"),
+        ({"stiffness": None}, ConfigurationError, "stiffness must be a number in N/m"),
         ({"bodies": []}, ConfigurationError, r"bodies is a list of names of bodies or geoms; got \[\]"),
         ({"bodies": ["hand"]}, UnknownNameError, "no body or geom 'hand'; bodies: world, body0.*fingertip"),
         ({"against": ["body0"]}, ConfigurationError, "'body0' is part of the machine itself"),

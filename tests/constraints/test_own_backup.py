@@ -32,12 +32,16 @@ class BoundStopBefore(BoundBackupClearance):
     def clearance(self):
         return np.array([self._left(*self.plant.state)])
 
-    def clearance_after(self, control):
+    def _after(self, control):
         x, v = self.plant.state
         # A step that turns back reaches farthest on its way.
         turned = v**2 / (-2.0 * control[0]) if v > 0.0 and v + DT * control[0] < 0.0 else 0.0
         ends = x + DT * v + 0.5 * DT**2 * control[0], v + DT * control[0]
-        return np.array([min(self._left(*ends), WALL - x - turned)])
+        return min(self._left(*ends), WALL - x - turned)
+
+    def admits(self, control):
+        left = self._after(control)
+        return left >= self.spec.margin or left >= self._after(self.backup())
 
     def backup(self):
         return np.array([-min(self.spec.brake, max(self.plant.state[1], 0.0) / DT)])

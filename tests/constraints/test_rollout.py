@@ -23,7 +23,6 @@ LIMITS = {
     "workspace": lambda **more: sw.constraints.Workspace(
         [-1.0, None, None], [1.0, None, None], bodies=["b0"], **more
     ),
-    "upright": lambda **more: sw.constraints.Upright("b0", lowest=-1.0, **more),
 }
 kinds = pytest.mark.parametrize("kind", LIMITS)
 

@@ -18,10 +18,8 @@ def tracked(tolerance, sensor=NOTHING_SEEN, noise=0.1, start=0.1):
     return sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), [cars], sensor, tolerance)
 
 
-def stopping(tolerance, braking=3.0, **options):
-    return sw.CBFActionFilter(
-        tracked(tolerance), [sw.constraints.TrackPermission("robot", braking, **options)]
-    )
+def stopping(tolerance):
+    return sw.CBFActionFilter(tracked(tolerance), [sw.constraints.TrackPermission("robot", 3.0)])
 
 
 def test_while_permissions_are_in_force_the_action_passes_bit_for_bit():
@@ -35,9 +33,8 @@ def test_while_permissions_are_in_force_the_action_passes_bit_for_bit():
         assert info["executed_action"].tobytes() == action.astype(np.float64).tobytes()
 
 
-@pytest.mark.parametrize("creep", [0.0, 0.3])
-def test_when_they_expire_it_slows_down_as_declared_and_turns_as_it_likes(creep):
-    env = stopping(tolerance=0.45, creep=creep)
+def test_when_they_expire_it_slows_down_as_declared_and_turns_as_it_likes():
+    env = stopping(tolerance=0.45)
     env.reset(seed=0, options=FAR_CARS)
     speed, stopped_for, expired = 0.0, 0, False
     for k in range(110):
@@ -46,9 +43,9 @@ def test_when_they_expire_it_slows_down_as_declared_and_turns_as_it_likes(creep)
         assert not info["cbf/infeasible"] and not info["cbf/fallback"]
         if expired:
             # 3 m/s^2 over 0.04 s, up to what damping adds within the held step.
-            assert now <= max(speed - 3.0 * 0.04, creep) + 0.02, (k, now, speed)
+            assert now <= max(speed - 3.0 * 0.04, 0.0) + 0.02, (k, now, speed)
             assert info["executed_action"][2] == 1.0
-            stopped_for += now <= creep + 1e-3
+            stopped_for += now <= 1e-3
         speed, expired = now, bool(info["occlusion/expired"].any())
     assert stopped_for > 10 and abs(env.unwrapped.data.qvel[2]) > 3.0
 
@@ -76,7 +73,6 @@ def test_only_the_tracks_that_count_stop_it():
 def test_what_it_is_given_is_checked():
     for words, given in (
         ("braking.*m/s", {"braking": 0.0}),
-        ("creep", {"braking": 1.0, "creep": -1}),
         ("list of names", {"braking": 1.0, "tracks": "car0"}),
         ("tracks is a list of names, or None for all", {"braking": 1.0, "tracks": []}),
     ):

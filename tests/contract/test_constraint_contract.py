@@ -31,8 +31,7 @@ CONSTRAINTS = [
     of.ContactFeasibility(0.6, 0.02, ["torso"], 0.01),
     of.EscapeClearance("robot", [OBSTACLES[5], DISCS, OBSTACLES[3]], 0.2, 0.1, 2.0),
     of.HeadingDriveClearance([of.Discs("hazards", 0.2)], "robot", 0.004, 0.01, 0.1, True),
-    of.ImpactSpeedLimit(["body1"], ["sideE"], None, "hands and fingers", True, 1e4, 1.0, 4),
-    of.ImpactSpeedLimit(["fingertip"], ["sideE"], force_limit=100.0, stiffness=1e4),
+    of.ImpactSpeedLimit(["body1"], ["sideE"], 100.0, 1e4, 1.0, 4),
     of.JointPositionLimit([-1.0, -math.inf], 2.0, ["joint1", "joint0"], 0.1, 7, 0.5),
     of.JointSpeedLimit([4.0, 3.0], ["joint1", "joint0"], 0.1, 2, 0.5),
     of.SingularityMargin(
@@ -43,9 +42,8 @@ CONSTRAINTS = [
     of.SpeedLimit(1.5, "torso", "-x", "substep", 0.1, 4, 0.7, 0.6, True),
     of.Stance(0.6, "exact", 0.2),
     of.SupportMargin(0.02, 0.01),
-    of.TrackPermission("robot", 3.0, 0.1, ("car0",)),
+    of.TrackPermission("robot", 3.0, ("car0",)),
     of.Traction(["left", "right"], 0.1, 0.3, 0.4, 0.01),
-    of.Upright("trunk", 0.4, 1.5, 0.5, 0.05, 6, 0.2),
     of.WallClearance(0.02, 4.0),
     of.Workspace(
         [None, -0.5, None], [0.5, None, None], [DISC, *OBSTACLES[:3:2]], ["tip"], radius=0.01, margin=0.02

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from safe_wrappers.control.contact.friction_cone import (
     cone_excess,
     friction_pyramid,
-    normal_and_tangential,
     tangents,
 )
 from safe_wrappers.errors import ConfigurationError
@@ -72,7 +71,6 @@ def test_four_edges_along_a_contact_frame_are_mujocos_pyramid():
         (lambda: friction_pyramid(UP, 0.5, 2), "edges"),
         (lambda: friction_pyramid(UP, -0.1), "friction"),
         (lambda: cone_excess([0, 0, math.nan], UP, 0.5), "forces must be finite"),
-        (lambda: normal_and_tangential([0, 1], [0, 1]), "shape"),
     ],
 )
 def test_bad_input_is_refused(call, said):

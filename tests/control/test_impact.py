@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 from safe_wrappers.control.contact.impact import (
     braked_deflection,
     complementarity_residuals,
-    in_series,
     peak_force,
     speed_limit,
     time_to_peak,
@@ -83,13 +82,6 @@ def test_braking_that_starts_at_the_peak_or_later_is_too_late(v, m, k, a):
     np.testing.assert_array_equal(braked_deflection(v, m, k, a, late), free)
     deeper = braked_deflection(v, m, k, a, quarter * np.linspace(0.0, 0.999, 20))
     assert (np.diff(deeper) > 0.0).all() and (deeper > 0.0).all() and (deeper < free).all()
-
-
-def test_springs_and_masses_in_series():
-    assert in_series(2.0, np.inf) == pytest.approx(2.0) and in_series(np.inf, np.inf) == np.inf
-    k = np.array([40e3, 15e3, 8e3])  # under one force the deflections add up
-    assert (100.0 / k).sum() == pytest.approx(100.0 / in_series(*k))
-    assert in_series(np.ones((2, 1)), np.ones(3)).shape == (2, 3)
 
 
 def test_a_drop_in_mujoco_has_the_peak_force_of_its_spring():

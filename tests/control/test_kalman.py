@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from safe_wrappers.control.estimation.covariance import discretise, discretise_drift
-from safe_wrappers.control.estimation.kalman import predict, update
+from safe_wrappers.control.estimation.tracks import predict, update
 
 INTEGRATOR = np.array([[0.0, 1.0], [0.0, 0.0]])
 seeds = st.integers(0, 10**6)

@@ -110,12 +110,3 @@ def test_no_sample_above_the_threshold_needs_more_and_no_smaller_number_would_do
     else:
         assert found == pytest.approx(w.min())
     assert validated_threshold(samples, 0.5, limit / 2.0) == found
-
-
-@pytest.mark.parametrize(
-    ("jacobian", "message"),
-    [([1.0, 2.0], "a Jacobian has the shape"), ([[np.nan, 1.0]], "jacobian must be finite")],
-)
-def test_nonsense_is_refused(jacobian, message):
-    with pytest.raises(ConfigurationError, match=message):
-        manipulability(jacobian)

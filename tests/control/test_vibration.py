@@ -5,9 +5,10 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import smoothstep_share
 from scipy.integrate import quad
 
-from safe_wrappers.control.handover.vibration import modes, shortest_smoothstep, smoothstep_share
+from safe_wrappers.control.handover.vibration import modes, shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
 
 

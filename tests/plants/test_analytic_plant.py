@@ -64,9 +64,7 @@ class Slow(gym.Env):
 
 def on_cart(env, **timing):
     plant = sw.AnalyticPlant(np.zeros_like, lambda x: np.eye(1), lambda env: env.v, **timing)
-    return sw.CBFActionFilter(
-        env, [sw.constraints.Barrier(lambda x: 1.5 - x[0], gradient=lambda x: -np.ones(1))], plant=plant
-    )
+    return sw.CBFActionFilter(env, [sw.constraints.Barrier(lambda x: 1.5 - x[0])], plant=plant)
 
 
 def test_a_step_of_unknown_length_is_asked_for_and_not_assumed():

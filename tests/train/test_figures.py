@@ -32,7 +32,7 @@ def flags(count, *where):
 
 def test_which_constraint_refused_and_how_much():
     refused = np.column_stack([flags(200, slice(0, 20)), flags(200, slice(10, 50)), flags(200)])
-    names = np.array(["JointSpeedLimit", "Clearance<2>", "Upright"])
+    names = np.array(["JointSpeedLimit", "Clearance<2>", "Workspace"])
     sizes = np.where(flags(200, slice(0, 50)), np.linspace(0.1, 2.0, 200), 0).astype(np.float32)
     log = steps(refused=refused, constraint_names=names, intervened=sizes > 0, correction=sizes)
     said = refusals({"safe": log}).reading

@@ -81,7 +81,7 @@ class Slow:
         tick.limited = limited
         acting = "the fallback" if tick.starved else "the chunks"
         if self.sent and acting != self.acting:
-            if self.blend in BLENDS and not tick.seam:
+            if not tick.seam:
                 change = max(abs(a - b) for a, b in zip(control, self.sent[-1], strict=True))
                 tick.blend_steps = self.fade_steps(change)
                 self.fade = (list(self.sent[-1]), tick.blend_steps, 1)
@@ -96,7 +96,7 @@ class Slow:
                 self.fade = (start, steps, i + 1)
             else:
                 self.fade = None
-        if self.blend in BLENDS and self.sent:
+        if self.sent:
             held = [
                 min(max(b, a - self.step), a + self.step) for a, b in zip(self.sent[-1], control, strict=True)
             ]
@@ -137,10 +137,7 @@ class Slow:
         tick.latency = age
         self.in_force = newest["observed"]
         fresh = newest["rows"][age:]
-        if self.blend == "replace":
-            self.plan = [(row, True, False) for row in fresh]
-            tick.seam = bool(self.sent)
-        elif len(newest["rows"]) == 1:
+        if len(newest["rows"]) == 1:
             self.plan = [(row, True, False) for row in fresh]
         else:
             tick.blend_steps = self.join(fresh)

@@ -1,4 +1,4 @@
-"""ActionShield on grids and wheels whose safe actions are known."""
+"""ActionShield on grids whose safe actions are known."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ import safe_wrappers as sw
 from safe_wrappers.constraints import PredictiveShield
 
 sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
-from simulated_worlds import GRID, MOVES, Grid, TwoWheels
+from simulated_worlds import GRID, MOVES, Grid
 
 EVERY = [0, 1, 2, 3]
 
@@ -62,20 +62,6 @@ def test_if_nothing_is_admitted_that_is_said_and_one_action_is_left():
     assert masks.sum() == 1
     info = env.step(2)[4]
     assert info["cbf/infeasible"] and info["cbf/fallback"] and info["executed_action"][0] in (0.0, 1.0, 3.0)
-
-
-def test_multidiscrete_actions():
-    slow = PredictiveShield(lambda o: 3.0 - o[0], horizon=1, backup="hold")
-    env = sw.ActionShield(TwoWheels(), [slow])
-    env.reset(seed=0)
-    assert env.action_masks().tolist() == [True] * 6  # each speed is part of an admitted pair
-    info = env.step(np.array([2, 2]))[4]
-    assert info["cbf/intervened"] and info["executed_action"].sum() == 3.0  # the nearest
-    assert not env.step(np.array([2, 1]))[4]["cbf/intervened"]
-    slower = PredictiveShield(lambda o: 1.0 - o[0], horizon=1, backup=np.array([0, 0]))
-    env = sw.ActionShield(TwoWheels(), [slower])
-    env.reset(seed=0)
-    assert env.action_masks().tolist() == [True, True, False] * 2
 
 
 def test_a_state_that_is_not_a_number_lets_the_last_action_go_on():

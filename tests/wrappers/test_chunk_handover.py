@@ -76,7 +76,7 @@ class Scenario:
 
     def oracle(self):
         fewest = self.fewest or 0
-        if self.fewest is None and self.limit is None and self.blend in BLENDS:
+        if self.fewest is None and self.limit is None:
             fewest = self.size - self.horizon - self.delay[1]
         return Slow(
             HOLD,
@@ -106,21 +106,20 @@ EVENTS = ("fresh",) * 8 + ("nothing", "stale", "older", "future", "nan", "inf")
 
 
 @st.composite
-def scenarios(draw, blends=(*BLENDS, *BLENDS, "replace"), size=None, limited=None):
+def scenarios(draw, blends=BLENDS, size=None, limited=None):
     most = draw(st.integers(0, 4)) if size is None else 0
     delay = (draw(st.integers(0, most)), most)
     horizon = draw(st.integers(max(most, 1), 6)) if size is None else 1
     chunk = horizon + most + draw(st.integers(0, 6)) if size is None else size
     blend = draw(st.sampled_from(blends))
     fewest, limit = None, None
-    if blend in BLENDS:
-        if draw(st.booleans()) and chunk - most > 1:
-            fewest = draw(st.integers(1, chunk - most - 1))
-        elif chunk == 1 and draw(st.booleans()):
-            fewest = draw(st.integers(1, 5))
-        nothing = fewest is None and chunk - horizon - most == 0
-        if limited or nothing or (limited is None and draw(st.booleans())):
-            limit = draw(st.floats(0.05, 50.0))
+    if draw(st.booleans()) and chunk - most > 1:
+        fewest = draw(st.integers(1, chunk - most - 1))
+    elif chunk == 1 and draw(st.booleans()):
+        fewest = draw(st.integers(1, 5))
+    nothing = fewest is None and chunk - horizon - most == 0
+    if limited or nothing or (limited is None and draw(st.booleans())):
+        limit = draw(st.floats(0.05, 50.0))
     bound = draw(st.sampled_from([1.0, 1.0, 0.3, math.inf]))
     return Scenario(
         chunk,
@@ -286,7 +285,7 @@ def numbered(k, size):
 @pytest.mark.parametrize(("size", "horizon"), [(8, 4), (6, 3), (4, 2)])
 def test_what_is_executed_when_for_every_delay_up_to_the_horizon(size, horizon):
     for delay in range(min(horizon, size - horizon) + 1):
-        env = ChunkHandover(Line(), size, horizon, delay, blend="replace", fallback="zero")
+        env = ChunkHandover(Line(), size, horizon, delay, rate_limit=1e9, fallback="zero")
         commands, infos = run(env, [numbered(k, size) for k in range(1, 6)])
         for t, command in enumerate(commands[:, 0]):
             k, j = divmod(t - delay, horizon)  # chunk k took over at k horizon + delay
@@ -320,7 +319,7 @@ def test_random_delays_are_drawn_within_bounds_all_of_them_and_again_with_the_se
     [(0.0, "old"), (0.4, "a repeat"), (0.39, "a repeat"), (0.7, "the future"), (-1.0, "old")],
 )
 def test_chunks_that_are_not_newer_or_from_the_future_are_refused(stamp, why):
-    env = ChunkHandover(Line(), 8, 2, blend="replace", fallback="zero")
+    env = ChunkHandover(Line(), 8, 2, rate_limit=1e9, fallback="zero")
     env.reset(seed=0)
     for k in (1, 2, 3):
         env.step(numbered(k, 8))  # the third is from 0.4 s
@@ -348,7 +347,7 @@ def test_a_reset_forgets_chunks_stamps_and_commands():
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("where", [0, 5, 11])
 def test_a_chunk_with_one_bad_entry_is_refused_whole_then_left_over_then_fallback(bad, where):
-    env = ChunkHandover(Line(), 12, 4, blend="replace", fallback="hold")
+    env = ChunkHandover(Line(), 12, 4, rate_limit=1e9, fallback="hold")
     env.reset(seed=0)
     env.step(numbered(1, 12))
     broken = numbered(2, 12)
@@ -429,11 +428,8 @@ def test_what_was_executed_is_measured_not_what_was_sent():
     assert [i["handover/peak_jerk"] for i in infos] == [10.0] * 3
 
 
-# Ensembling and replacement -------------------------------------------------------------------------------------
-
-
-def test_replacement_is_the_new_chunk_at_once_and_its_seam_is_measured():
-    env = ChunkHandover(Line(), 4, 2, blend="replace", fallback="zero")
+def test_within_a_wide_limit_the_new_chunk_comes_at_once_and_its_seam_is_measured():
+    env = ChunkHandover(Line(), 4, 2, rate_limit=1e9, fallback="zero")
     commands, infos = run(env, [np.full((4, 1), x, np.float32) for x in (1.0, -1.0)])
     assert commands[:, 0].tolist() == [1.0, 1.0, -1.0, -1.0]
     assert infos[1]["handover/peak_jerk"] == pytest.approx(20.0)
@@ -463,8 +459,7 @@ def handover(env, **changed):
         ({"chunk_size": True, "execution_horizon": 1}, "chunk_size .* at least 1; got True"),
         ({"chunk_size": 0}, "at least 1; got 0"),
         ({"execution_horizon": 0}, "at least 1; got 0"),
-        ({"blend": "linear"}, "no blend 'linear'; choose smoothstep, quintic, replace"),
-        ({"blend": "replace"}, "baseline that bounds nothing.*smoothstep"),
+        ({"blend": "linear"}, "no blend 'linear'; choose smoothstep, quintic"),
         ({"rate_limit": 0.0}, "rate_limit .*> 0"),
         ({"rate_limit": math.nan}, "rate_limit .*finite"),
         ({"rate_limit": [5.0, 5.0]}, "one for each of the 1 action components"),

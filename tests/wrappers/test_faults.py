@@ -267,7 +267,7 @@ def test_repeats_are_caught_though_commands_keep_coming():
 @every_fault
 def test_chunks_are_carried_lost_and_repeated_as_a_whole(kind):
     cart = BrakedCart()
-    chunks = sw.ChunkHandover(cart, 6, 2, blend="replace", fallback="zero")
+    chunks = sw.ChunkHandover(cart, 6, 2, rate_limit=1e9, fallback="zero")
     heard, stamps = [], []
     step, stamp = chunks.step, chunks.set_observation_time
     chunks.set_observation_time = lambda observed_s: (stamps.append(observed_s), stamp(observed_s))[1]

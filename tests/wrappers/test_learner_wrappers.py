@@ -230,18 +230,15 @@ def test_an_unfiltered_learner_sees_what_the_filtered_one_sees():
     assert steps > 10
 
 
-def test_the_room_of_a_clearance_and_its_nearest_surfaces():
+def test_the_room_of_a_clearance():
     walls = [sw.constraints.Plane([-0.9], [1.0]), sw.constraints.Plane([0.9], [-1.0])]
     limit = sw.constraints.Clearance(walls, bodies=["cart"], braking=8.0)
-    env = sw.FilterObservation(gym.make("InvertedPendulum-v5"), [limit], neighbours=1)
+    env = sw.FilterObservation(gym.make("InvertedPendulum-v5"), [limit])
     observation, _ = env.reset(seed=0)
     for _ in range(8):
-        place, speed = env.unwrapped.data.qpos[0], env.unwrapped.data.qvel[0]
-        clearance, away = 0.9 - abs(place), -np.sign(place)
+        clearance = 0.9 - abs(env.unwrapped.data.qpos[0])
         shown = features_of(env, observation)
         assert shown[0] <= clearance / (1 + clearance) + 1e-6
-        wanted = [away, 0, 0, clearance / (1 + clearance), -away * speed / (1 + abs(speed))]
-        np.testing.assert_allclose(shown[1:6], wanted, atol=1e-6)
         observation = env.step(np.array([3.0], dtype=np.float32))[0]
 
 

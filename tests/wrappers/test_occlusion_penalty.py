@@ -329,7 +329,7 @@ def made(env=None, tracks=None, sensor=EYE, tolerance=1.0, **options):
         ({"tracks": []}, ConfigurationError, "at least one Track"),
         ({"tracks": "thing"}, ConfigurationError, "at least one Track"),
         ({"tracks": straight()}, ConfigurationError, "at least one Track"),
-        ({"tracks": ["thing"]}, ConfigurationError, "acceleration_noise"),
+        ({"tracks": ["thing"]}, ConfigurationError, "a track is a Track"),
         ({"tracks": [straight("think")]}, UnknownNameError, "'think'; it has: robot, thing, thing2"),
         ({"tracks": [straight("")]}, UnknownNameError, "no body ''"),
         ({"tracks": [straight("thing"), straight("thing*")]}, ConfigurationError, "twice: thing$"),
@@ -361,18 +361,8 @@ def made(env=None, tracks=None, sensor=EYE, tolerance=1.0, **options):
         ),
         ({"env": gym.make("Pendulum-v1")}, UnsupportedEnvError, "model and .data"),
         (
-            {"env": Turning(space=gym.spaces.Box(0, 255, (4,), np.uint8))},
-            UnsupportedEnvError,
-            "flat Box of floats",
-        ),
-        (
-            {"env": Turning(space=gym.spaces.Box(0, 1, (2, 2), np.float64))},
-            UnsupportedEnvError,
-            "observe=False",
-        ),
-        (
             {"env": Turning(space=gym.spaces.Dict({"tracks": gym.spaces.Box(0, 1, (2,))}))},
-            UnsupportedEnvError,
+            ConfigurationError,
             "'tracks' already",
         ),
     ],

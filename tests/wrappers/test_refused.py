@@ -21,7 +21,7 @@ LIMITS = {
     ],
     "HalfCheetah-v5": [
         sw.constraints.SpeedLimit(0.5, "torso", "+x"),
-        sw.constraints.Upright("torso", lowest=-0.15, tilt=0.2, horizon=3),
+        sw.constraints.Workspace(low=[None, None, -0.2], bodies=["torso"], horizon=3),
         sw.constraints.JointSpeedLimit(12.0),
     ],
 }

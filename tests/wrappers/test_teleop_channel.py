@@ -12,7 +12,7 @@ import safe_wrappers as sw
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
 from safe_wrappers.wrappers.faults import Jitter, Outages
-from safe_wrappers.wrappers.teleop import LONGEST_DELAY_S, Line
+from safe_wrappers.wrappers.teleop import Line
 
 
 def rollout(env, actions, seed=0):
@@ -288,7 +288,6 @@ def test_random_numbers_are_seeded_and_kept_apart():
         {"loss": 1.1},
         {"loss": -0.1},
         {"in_order": 1},
-        {"delay_s": LONGEST_DELAY_S, "jitter_s": 0.1},
         {"outage_between_s": 1.0},
         {"outage_length_s": 1.0},
         {"outage_between_s": 0.0, "outage_length_s": 1.0},

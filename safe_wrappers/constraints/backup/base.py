@@ -19,9 +19,8 @@ class BoundBackupClearance(BoundConstraint):
     held control, and the manoeuvre after it, keep the clearance. So from a safe state the first control of the
     manoeuvre is always admitted, for any number of obstacles at once.
 
-    A subclass overrides `clearance`, `clearance_after` and `backup`. It may override `read_constants`, `candidates`
-    and `rows`; `admits` instead of `clearance_after` where that costs less; `slack` where it can measure it. The
-    specification has a `margin`, m.
+    A subclass overrides `clearance`, `admits` and `backup`. It may override `read_constants`, `candidates` and
+    `rows`, and `slack` where it can measure it. The specification has a `margin`, m.
     """
 
     predicts: bool = True
@@ -44,13 +43,6 @@ class BoundBackupClearance(BoundConstraint):
     def backup(self) -> Array:
         """The first control of the manoeuvre, shape (m,)."""
 
-    def clearance_after(self, control: Array) -> Array:
-        """What is left if a control, shape (m,), is held for one control interval before the manoeuvre.
-
-        Margin not taken off, m, shape (k,); the way of the held control counts.
-        """
-        raise NotImplementedError(f"{type(self).__name__} overrides neither clearance_after nor admits")
-
     def observe(self, memory: Memory) -> None:
         self._memory = memory
         self._value = self.clearance()
@@ -59,12 +51,12 @@ class BoundBackupClearance(BoundConstraint):
         """The clearance along the manoeuvre, margin not taken off, m, shape (k,)."""
         return self._value
 
+    @abstractmethod
     def admits(self, control: Array) -> bool:
-        """Whether a held control leaves the margin, or at least as much as the backup leaves."""
-        left = self.clearance_after(control)
-        if (left >= self.spec.margin).all():
-            return True
-        return bool(left.min() >= self.clearance_after(self.backup()).min())
+        """Whether a held control and the manoeuvre after it keep the margin; the way of the held control counts.
+
+        It must admit the first control of the manoeuvre from a safe state, whatever rounding has taken.
+        """
 
     def slack(self, control: Array) -> float:
         """Not measured: 0 for a control that is admitted, else minus infinity."""

@@ -22,7 +22,6 @@ class GeomGaps:
     Attributes:
         pairs: Ids of the geoms, (machine's, world's).
         touch: Distance from which MuJoCo lets each pair's contact act, shape (pairs,), m.
-        moves: Whether joints move the world's geom, shape (pairs,).
 
     Raises:
         UnknownNameError: Neither a body nor a geom has such a name.
@@ -47,7 +46,6 @@ class GeomGaps:
             others += found
         self.pairs = [(a, b) for a in dict.fromkeys(own) for b in dict.fromkeys(others)]
         self.touch = np.array([max(m.geom_margin[a], m.geom_margin[b], 0.0) for a, b in self.pairs])
-        self.moves = np.array([tree[b] >= 0 for _, b in self.pairs])
 
     def nearest(self, model: mujoco.MjModel, data: mujoco.MjData, pair: int) -> tuple[float, Array, Array]:
         """Distance (m), the unit normal from the machine to the world, and the nearest points of both, shape (6,)."""

@@ -7,11 +7,11 @@ from typing import ClassVar, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, name_list, positive
+from safe_wrappers.checks import Array, name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
-from safe_wrappers.control.contact.impact import BODY_REGIONS, in_series, peak_force, speed_limit
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.control.contact.impact import peak_force, speed_limit
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
@@ -33,21 +33,16 @@ class ImpactSpeedLimit(RolloutConstraint):
     Args:
         bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.
         against: Names of bodies or geoms of the world; the speed of free ones counts.
-        force_limit: Largest peak force, N, of each pair of geoms. None takes the region's.
-        region: Of a human body (`control.contact.impact.BODY_REGIONS`, ISO/TS 15066:2016, to be checked against its
-            text).
-        clamped: The region cannot recoil: its quasi-static limit, and no effective mass of its own.
-        stiffness: Of the interface, N/m; with a region that of the robot's side alone, where None is a rigid robot.
+        force_limit: Largest peak force, N, of each pair of geoms.
+        stiffness: Of the interface, N/m: of both sides in series.
         margin: Kept free below the limit, N.
         horizon: Control steps to forecast; cover the time of braking and of a contact.
     """
 
     bodies: Sequence[str]
     against: Sequence[str]
-    force_limit: float | None = None
-    region: str | None = None
-    clamped: bool = False
-    stiffness: float | None = None
+    force_limit: float
+    stiffness: float
     margin: float = 0.0
     horizon: int = 5
 
@@ -58,34 +53,11 @@ class ImpactSpeedLimit(RolloutConstraint):
         self._check_shared()
         for name in ("bodies", "against"):
             setattr(self, name, name_list(name, getattr(self, name), "names of bodies or geoms"))
-        check_fields(self, positive, ("force_limit",), "N")
-        check_fields(self, positive, ("stiffness",), "N/m")
-        self._force, self._stiffness, self._other_mass = self._interface()
-        if self.margin >= self._force:
+        self.force_limit = positive("force_limit", self.force_limit, "N")
+        self.stiffness = positive("stiffness", self.stiffness, "N/m")
+        if self.margin >= self.force_limit:
             nothing = f"the margin {self.margin} N leaves nothing"
-            raise ConfigurationError(f"{nothing} of the limit {self._force} N")
-
-    def _interface(self) -> tuple[float, float, float]:
-        """Force limit in N, stiffness in N/m, and mass in kg of what is hit."""
-        if self.region is None:
-            if self.clamped:
-                raise ConfigurationError("clamped says how a region is hit: name the region too")
-            if self.force_limit is None or self.stiffness is None:
-                wanted = "a force_limit (N) and the interface's stiffness (N/m)"
-                raise ConfigurationError(f"give {wanted}, or a region of the human body")
-            return self.force_limit, self.stiffness, np.inf
-        if self.region not in BODY_REGIONS:
-            raise UnknownNameError(f"no body region {self.region!r}; choose {', '.join(BODY_REGIONS)}")
-        region = BODY_REGIONS[self.region]
-        limit = region.quasi_static_force if self.clamped else region.transient_force
-        force = self.force_limit if self.force_limit is not None else limit
-        if force is None or (region.transient_force is None and self.force_limit is None):
-            raise ConfigurationError(
-                f"ISO/TS 15066 foresees no contact with {self.region!r}: keep away from it (Workspace), or declare a "
-                "force_limit (N) of your own"
-            )
-        pad = np.inf if self.stiffness is None else self.stiffness
-        return force, float(in_series(pad, region.stiffness)), np.inf if self.clamped else region.mass
+            raise ConfigurationError(f"{nothing} of the limit {self.force_limit} N")
 
     def bind(self, plant: Plant) -> "BoundImpactSpeedLimit":
         return BoundImpactSpeedLimit(self, plant)
@@ -123,7 +95,7 @@ class BoundImpactSpeedLimit(BoundRollout):
 
     @property
     def scale(self) -> float:
-        return self.spec._force
+        return self.spec.force_limit
 
     def __init__(self, spec: ImpactSpeedLimit, plant: Plant) -> None:
         plant.require_acceleration("ImpactSpeedLimit")
@@ -132,7 +104,7 @@ class BoundImpactSpeedLimit(BoundRollout):
         self._gaps = GeomGaps(self.plant, self.spec.bodies, self.spec.against)
         self._probe = mujoco.MjData(m)
         self._integration = np.zeros(mujoco.mj_stateSize(m, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
-        self._limit = self.spec._force - self.spec.margin
+        self._limit = self.spec.force_limit - self.spec.margin
         self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
         self._mobile = np.zeros((1, m.nv))
 
@@ -172,7 +144,7 @@ class BoundImpactSpeedLimit(BoundRollout):
         given = self._mobile[0].copy()
         mobility = float(row @ given)
         speed = float(row @ self._speeds)
-        stiffness = self.spec._stiffness
+        stiffness = self.spec.stiffness
         if mobility < _FIXED:
             return Contact(gap, 0.0, 1.0 / _FIXED, stiffness, 0.0, 0.0)
         mass = 1.0 / mobility
@@ -180,8 +152,6 @@ class BoundImpactSpeedLimit(BoundRollout):
         mujoco.mj_jacDot(m, d, first_dot, None, points[:3], m.geom_bodyid[robot])
         mujoco.mj_jacDot(m, d, second_dot, None, points[3:], m.geom_bodyid[other])
         moving += float(normal @ (first_dot - second_dot) @ self._speeds)
-        if not self._gaps.moves[pair]:
-            mass = float(in_series(mass, self.spec._other_mass))
         push = mass * max(moving, float(given @ self._resting), 0.0)
         return Contact(gap, max(speed, 0.0), mass, stiffness, push, max(-gap, 0.0))
 
@@ -198,7 +168,7 @@ class BoundImpactSpeedLimit(BoundRollout):
         contacts = _together([self.contact(pair) for pair in range(len(self._gaps.pairs))])
         there = contacts.gap <= self._gaps.touch
         # Only a contact that is there counts; before it, how it will be is the forecast's to say.
-        left = self.spec._force - contacts.peak
+        left = self.spec.force_limit - contacts.peak
         self._lost = np.where(there, np.minimum(contacts.left(self._limit), 0.0), 0.0)
         return np.where(there, left, np.maximum(left, 0.0))
 

@@ -1,6 +1,5 @@
 """Limits on the positions and the speeds of hinges and slides, and which joints a constraint means."""
 
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -15,11 +14,9 @@ from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, HINGE, SCALAR_JOINTS
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, SCALAR_JOINTS
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-
-_LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
 def driven_joints(model: mujoco.MjModel) -> list[int]:
@@ -40,39 +37,6 @@ def _direct(model: mujoco.MjModel) -> list[int]:
     return sorted({int(model.actuator_trnid[a, 0]) for a in range(model.nu) if kinds[a] in AT_A_JOINT})
 
 
-def _tied(model: mujoco.MjModel) -> list[set[int]]:
-    """Joints that are moved together: by an equality, or by a tendon with a limit, a spring or an equality."""
-    groups, tendons = [], (model.tendon_limited != 0) | (model.tendon_stiffness > 0.0)
-    for e in np.flatnonzero(model.eq_active0).tolist():
-        kind, ends = int(model.eq_type[e]), (int(model.eq_obj1id[e]), int(model.eq_obj2id[e]))
-        if kind == int(mujoco.mjtEq.mjEQ_JOINT):
-            groups.append(set(ends))
-        elif kind == int(mujoco.mjtEq.mjEQ_TENDON):
-            groups.append(set().union(*(_of_tendon(model, t) for t in ends if t >= 0)))
-        elif kind in _LOOPS:
-            at_sites = model.eq_objtype[e] == int(mujoco.mjtObj.mjOBJ_SITE)
-            first, second = (
-                set(chain(model, int(model.site_bodyid[end]) if at_sites else end)) for end in ends
-            )
-            groups.append(first ^ second)
-    return groups + [_of_tendon(model, t) for t in np.flatnonzero(tendons).tolist()]
-
-
-def _of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
-    """The joints that move a tendon; of one through sites, those that do not move all of these."""
-    found: set[int] = set()
-    chains: list[set[int]] = []
-    first = int(model.tendon_adr[tendon])
-    for w in range(first, first + int(model.tendon_num[tendon])):
-        kind, thing = int(model.wrap_type[w]), int(model.wrap_objid[w])
-        if kind == int(mujoco.mjtWrap.mjWRAP_JOINT):
-            found.add(thing)
-        elif kind == int(mujoco.mjtWrap.mjWRAP_SITE):
-            chains.append(set(chain(model, int(model.site_bodyid[thing]))))
-    common = set.intersection(*chains) if chains else set[int]()
-    return found.union(*chains) - common
-
-
 def chain(model: mujoco.MjModel, body: int) -> list[int]:
     """The joints between a body and the world."""
     found: list[int] = []
@@ -86,17 +50,15 @@ def chain(model: mujoco.MjModel, body: int) -> list[int]:
 def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, forces: bool = True) -> None:
     """Refuse to take the driven joints for all where an action moves others of these joints (ids) as well.
 
-    It does where actions are displacements, not `forces`, pull at a tendon or a site, or drive a ball joint, and
-    where a driven joint is tied to another one. What only swings, slides or flexes along is not meant. The message
-    says which joints would be covered, which not, and the `remedy`.
+    It does where actions are displacements, not `forces`, pull at a tendon or a site, or drive a ball joint, and it
+    may where the model has equalities, or tendons that hold. What only swings, slides or flexes along is not meant.
+    The message says which joints would be covered, which not, and the `remedy`.
     """
     covered = driven_joints(model)
     only_joints = bool(np.isin(model.actuator_trntype, AT_A_JOINT).all()) and _direct(model) == covered
     rest = [j for j in joints if j not in covered]
-    if forces and only_joints:
-        ties = [group for group in _tied(model) if group.intersection(covered)]
-        rest = [j for j in rest if any(j in group for group in ties)]
-    if rest:
+    tied = model.eq_active0.any() or (model.tendon_limited != 0).any() or (model.tendon_stiffness > 0.0).any()
+    if rest and not (forces and only_joints and not tied):
         named = [", ".join(model.joint(j).name or f"#{j}" for j in ids) for ids in (covered, rest)]
         raise ConfigurationError(
             "an action of this machine may move more joints than those that an actuator drives directly. Covered "
@@ -196,27 +158,11 @@ class BoundJointPositionLimit(BoundRollout):
                 f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {self._low[j]:g} to "
                 f"{self._high[j]:g} with a margin of {self.spec.margin:g} at both ends"
             )
-        self._warn_of_degrees(own)
         self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
         if not (self._below.any() or self._above.any()):
             named = ", ".join(repr(model.joint(j).name) for j in ids)
             raise ConfigurationError(
                 f"none of these joints has a range in the model: pass lower and upper ({named})"
-            )
-
-    def _warn_of_degrees(self, own: Array) -> None:
-        """Warn of a bound beyond a full turn and beyond twice the hinge's own range, shape (n, 2)."""
-        model: mujoco.MjModel = self.plant.model
-        given = np.column_stack([self._low, self._high])
-        known, farthest = (
-            np.abs(np.where(np.isfinite(ends), ends, 0.0)).max(axis=1) for ends in (own, given)
-        )
-        hinges = model.jnt_type[self._ids] == HINGE
-        for i in np.flatnonzero(hinges & (farthest > 2.0 * np.maximum(known, np.pi))):
-            warnings.warn(
-                f"JointPositionLimit keeps the hinge {model.joint(self._ids[i]).name!r} between {self._low[i]:g} and "
-                f"{self._high[i]:g} rad, and a full turn is 6.28 rad. If these are degrees, give np.deg2rad of them",
-                stacklevel=2,
             )
 
     def now(self) -> Array:

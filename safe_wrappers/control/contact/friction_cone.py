@@ -16,16 +16,13 @@ from numpy.typing import ArrayLike
 from safe_wrappers.checks import Array, finite_array, finite_arrays, whole_number
 from safe_wrappers.errors import ConfigurationError
 
-_UNIT = 1e-6
-"""Tolerance of a normal's length."""
-
 
 def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
     """The part of each force along its normal, shape (...), below 0 where it pulls, and the rest, (..., 3), N.
 
     Forces are on the robot, shape (..., 3), N; unit normals point at the robot, shape (..., 3).
     """
-    f, n = finite_arrays(forces=forces, normals=_unit(normals))
+    f, n = finite_arrays(forces=forces, normals=normals)
     along = np.einsum("...i,...i->...", f, n)
     return along, f - along[..., None] * n
 
@@ -44,7 +41,7 @@ def tangents(normals: ArrayLike, first: ArrayLike | None = None) -> Array:
         first: Direction whose tangential part the first tangent follows, shape (..., 3); None takes the axis of the
             world that is farthest from the normal.
     """
-    n = _unit(normals)
+    n = finite_array("normals", normals)
     if first is None:
         wanted = np.zeros(n.shape)
         np.put_along_axis(wanted, np.abs(n).argmin(axis=-1)[..., None], 1.0, axis=-1)
@@ -77,23 +74,13 @@ def friction_pyramid(
         Shape (..., edges + 1, 3): one row for each side, then `-normal`.
     """
     edges = whole_number("edges", edges, 3)
-    n, mu = _unit(normals), checked_friction(friction)
+    n, mu = finite_array("normals", normals), checked_friction(friction)
     frame = tangents(n, first)
     middle = (np.arange(edges) + 0.5) * (2.0 * math.pi / edges)
     facing = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
     slope = mu[..., None, None] * math.cos(math.pi / edges) * n[..., None, :]
     sides = facing @ frame - slope
     return np.concatenate([sides, np.broadcast_to(-n, (*sides.shape[:-2], 3))[..., None, :]], axis=-2)
-
-
-def _unit(normals: ArrayLike) -> Array:
-    n = finite_array("normals", normals)
-    if n.ndim == 0 or n.shape[-1] != 3:
-        raise ConfigurationError(f"normals must have shape (..., 3), got {n.shape}")
-    length = np.linalg.norm(n, axis=-1)
-    if not (np.abs(length - 1.0) <= _UNIT).all():
-        raise ConfigurationError(f"normals must have length 1, got lengths {length}")
-    return n
 
 
 def checked_friction(friction: ArrayLike) -> Array:

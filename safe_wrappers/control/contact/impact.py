@@ -39,16 +39,6 @@ def complementarity_residuals(gap: ArrayLike, force: ArrayLike) -> Complementari
     return ComplementarityResiduals(np.maximum(-g, 0.0), np.abs(g * f))
 
 
-def in_series(*parts: ArrayLike) -> Array:
-    """`1 / (1/p1 + 1/p2 + ...)`, shape (...): stiffness of springs in series; mass of two free bodies' motion.
-
-    Args:
-        *parts: N/m or kg, > 0, shape (...); inf is rigid, or a wall.
-    """
-    with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / sum(1.0 / _positive("what is in series", part) for part in parts))
-
-
 def peak_force(
     speed: ArrayLike,
     mass: ArrayLike,
@@ -118,41 +108,3 @@ def _positive(name: str, value: ArrayLike) -> Array:
     if not (array > 0.0).all():
         raise ConfigurationError(f"{name} must be positive, got {array}")
     return array
-
-
-class BodyRegion(NamedTuple):
-    """What ISO/TS 15066 lets a robot do to a region of the human body, and the region's spring and mass.
-
-    Attributes:
-        quasi_static_force: Permissible force while clamped between the robot and something fixed, N.
-        transient_force: Permissible peak force on a region free to recoil, N; None where contact is not foreseen.
-        stiffness: Spring constant, N/m (the standard's is in N/mm).
-        mass: Effective mass, kg.
-    """
-
-    quasi_static_force: float
-    transient_force: float | None
-    stiffness: float
-    mass: float
-
-
-BODY_REGIONS: dict[str, BodyRegion] = {
-    "skull and forehead": BodyRegion(130.0, None, 150e3, 4.4),
-    "face": BodyRegion(65.0, None, 75e3, 4.4),
-    "neck": BodyRegion(150.0, 300.0, 50e3, 1.2),
-    "back and shoulders": BodyRegion(210.0, 420.0, 35e3, 40.0),
-    "chest": BodyRegion(140.0, 280.0, 25e3, 40.0),
-    "abdomen": BodyRegion(110.0, 220.0, 10e3, 40.0),
-    "pelvis": BodyRegion(180.0, 360.0, 25e3, 40.0),
-    "upper arms and elbow joints": BodyRegion(150.0, 300.0, 30e3, 3.0),
-    "lower arms and wrist joints": BodyRegion(160.0, 320.0, 40e3, 2.0),
-    "hands and fingers": BodyRegion(140.0, 280.0, 75e3, 0.6),
-    "thighs and knees": BodyRegion(220.0, 440.0, 50e3, 75.0),
-    "lower legs": BodyRegion(130.0, 260.0, 60e3, 75.0),
-}
-"""By the names of Table A.3 of ISO/TS 15066:2016, Annex A, with Table A.2; ISO 10218-2:2025 has taken them over.
-
-**Written down from memory and compared with secondary sources where there were any, not with the standard's text**:
-before a machine meets a person, check every number against the edition that applies. The limits are of pain onset in
-healthy adults; they leave out pressure (a sharp edge exceeds it far below these forces) and repeated contact.
-"""

@@ -7,8 +7,7 @@ Source: appendix "Bumpless transfer and smoothstep blending".
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, finite_arrays
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.checks import Array
 
 SMOOTHSTEP_PEAK_RATE = 1.875
 """Largest derivative of the smoothstep, alpha'(1/2)."""
@@ -25,13 +24,6 @@ def smoothstep(s: ArrayLike) -> Array:
     return np.asarray(np.where(s <= 0.5, half, 1.0 - half))
 
 
-def shortest_latched_blend(step: ArrayLike, rate_limit: ArrayLike) -> Array:
-    """Shortest blend time in s between two constant commands: 1.875 |step| / rate_limit, rounded up.
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or input that is not finite.
-    """
-    step, limit = finite_arrays(step=step, rate_limit=rate_limit)
-    if not (limit > 0.0).all():
-        raise ConfigurationError(f"rate_limit must be > 0, got {limit}")
-    return np.asarray(SMOOTHSTEP_PEAK_RATE * np.abs(step) / limit * ROUND_UP)
+def shortest_latched_blend(step: Array | float, rate_limit: Array | float) -> Array:
+    """Shortest blend time in s between two constant commands: 1.875 |step| / rate_limit, rounded up."""
+    return np.asarray(SMOOTHSTEP_PEAK_RATE * np.abs(step) / rate_limit * ROUND_UP)

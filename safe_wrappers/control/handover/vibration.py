@@ -9,7 +9,6 @@ Source: appendix "Flexible joint dynamics and singular perturbations".
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
@@ -41,18 +40,12 @@ def modes(inertia: Array, stiffness: Array, damping: Array) -> Modes:
     return Modes(omega, ratios, shapes)
 
 
-def smoothstep_share(phase: ArrayLike) -> Array:
-    """Most that a smoothstep leaves, s = 10 x^3 - 15 x^4 + 6 x^5, x = t / T, at a phase w T, rad.
-
-    The integral is 15 j2(k) / k^2 with k = w T / 2 and the spherical Bessel function j2, which stays below
-    sqrt(1 + 3/k^2 + 9/k^4) / k.
-    """
-    k = np.asarray(phase, dtype=np.float64) / 2.0
-    return np.asarray(np.minimum(1.0, 15.0 / k**3 * np.sqrt(1.0 + 3.0 / k**2 + 9.0 / k**4)) ** 2)
-
-
 def shortest_smoothstep(share: float, resonance: float) -> float:
-    """Duration, s, from which on a smoothstep leaves at most a share in a resonance (rad/s) and any faster one."""
+    """Duration, s, from which on a smoothstep leaves at most a share in a resonance (rad/s) and any faster one.
+
+    The integral of s = 10 x^3 - 15 x^4 + 6 x^5, x = t / T, is 15 j2(k) / k^2, k = w T / 2, with the spherical Bessel
+    function j2, which stays below sqrt(1 + 3/k^2 + 9/k^4) / k.
+    """
     if not 0.0 < share < 1.0:
         raise ConfigurationError(f"a share of a step's energy is above 0 and below 1, got {share!r}")
     # The bound falls all along: as a polynomial in k^2, at this share, it has one positive root.

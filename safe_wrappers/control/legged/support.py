@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, finite_arrays
 from safe_wrappers.control.numerics.compiled import compiled, hypot
-from safe_wrappers.errors import ConfigurationError
 
 COPLANAR_M = 0.01
 """m; the largest distance of coplanar contacts from their plane."""
@@ -40,8 +39,6 @@ def support_distances(instant: ArrayLike, points: ArrayLike, normals: ArrayLike,
     """
     p, n, f = finite_arrays(points=points, normals=normals, forces=forces)
     when = np.asarray(instant)
-    if p.ndim != 2 or p.shape[1] != 3 or when.shape != p.shape[:1]:
-        raise ConfigurationError(f"expected instants (n,) and points (n, 3), got {when.shape} and {p.shape}")
     order = np.argsort(when, kind="stable")
     each = np.split(order, np.flatnonzero(np.diff(when[order])) + 1)
     found = np.array([_distance(p[these], n[these], f[these]) for these in each])

@@ -88,7 +88,7 @@ def refuse_mapped(action_map: ActionMap | None, asker: str) -> None:
         raise UnsupportedEnvError(
             f"{asker} needs actions that are the model's controls; this env makes its controls of them by control = "
             "offset + scale * action. Constraints that forecast take that into account (SpeedLimit, JointSpeedLimit, "
-            "JointPositionLimit, Workspace, Upright), as do Clearance, Barrier and ImpactSpeedLimit"
+            "JointPositionLimit, Workspace), as do Clearance, Barrier and ImpactSpeedLimit"
         )
 
 

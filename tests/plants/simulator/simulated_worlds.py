@@ -102,18 +102,3 @@ class Grid(gym.Env):
             False,
             {"cost": float(kind == "#")},
         )
-
-
-class TwoWheels(gym.Env):
-    """Two wheels with three speeds each, MultiDiscrete; both at full speed is too fast."""
-
-    def __init__(self):
-        self.action_space = gym.spaces.MultiDiscrete([3, 3])
-        self.observation_space = gym.spaces.Box(0.0, 4.0, (1,), np.float64)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1), {}
-
-    def step(self, action):
-        return np.array([float(np.sum(action))]), 0.0, False, False, {}
