@@ -1,7 +1,11 @@
 import gymnasium as gym
 import pytest
 
-from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS, register_envs
+from safe_wrappers.envs import register_envs
+
+POINT_GOAL_IDS, CAR_GOAL_IDS = (
+    tuple(f"Safe{robot}Goal{level}-v0" for level in range(3)) for robot in ("Point", "Car")
+)
 
 if not all(env_id in gym.registry for env_id in POINT_GOAL_IDS + CAR_GOAL_IDS):
     register_envs()

@@ -11,7 +11,6 @@ from flexible_joint import bias_of, inertia_of, manifold, resonances, step_energ
 from oracles import damping_ratios
 from scipy.stats import kstest
 
-from safe_wrappers.envs import FLEX_JOINT_REACH_ID
 from safe_wrappers.envs.flex_joint_reach import TORQUE_RATING
 
 MOTORS, SPRINGS = [0, 2], [1, 3]
@@ -20,7 +19,7 @@ ELBOWS = [0.0, 0.7, 1.5, 2.4, math.pi]
 
 @pytest.fixture
 def env():
-    made = gym.make(FLEX_JOINT_REACH_ID)
+    made = gym.make("FlexJointReach-v0")
     made.reset(seed=0)
     return made
 

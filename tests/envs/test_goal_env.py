@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from recordings import check_costs
 
-from safe_wrappers.envs import POINT_GOAL_IDS
 from safe_wrappers.errors import ConfigurationError
 
 
@@ -159,7 +158,7 @@ def test_sleeping_vases_change_nothing(make_env):
 
 def test_level_that_does_not_exist():
     with pytest.raises(ConfigurationError, match="0, 1, 2; got 3"):
-        gym.make(POINT_GOAL_IDS[0], level=3)
+        gym.make("SafePointGoal0-v0", level=3)
 
 
 def test_hull_is_the_model_s(make_env):

@@ -14,9 +14,11 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import safe_wrappers.envs
-from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS
 from safe_wrappers.errors import ActionError
 
+POINT_GOAL_IDS, CAR_GOAL_IDS = (
+    tuple(f"Safe{robot}Goal{level}-v0" for level in range(3)) for robot in ("Point", "Car")
+)
 GOAL_IDS = POINT_GOAL_IDS + CAR_GOAL_IDS
 OBSERVED = dict(zip(GOAL_IDS, (28, 60, 60, 40, 72, 72), strict=True))
 TASKS = [

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.envs import OCCLUDED_CROSSING_ID
 from safe_wrappers.envs.traffic import CAR_MEAN_SPEED, CAR_SPEED_STD, noise_covariance, transition
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
 
@@ -22,7 +21,7 @@ OPEN = {"agent": [0.0, -2.9, math.pi / 2], "goal": [0.0, 2.9], "cars": NO_CARS, 
 
 @pytest.fixture
 def env():
-    made = gym.make(OCCLUDED_CROSSING_ID).unwrapped
+    made = gym.make("OccludedCrossing-v0").unwrapped
     yield made
     made.close()
 
@@ -68,7 +67,7 @@ _KEPT = {}
 def _open_field():
     """One env for all of hypothesis's examples, far from everything."""
     if not _KEPT:
-        _KEPT["env"] = gym.make(OCCLUDED_CROSSING_ID).unwrapped
+        _KEPT["env"] = gym.make("OccludedCrossing-v0").unwrapped
     env = _KEPT["env"]
     start(env, pillars=[[FAR, FAR]] * 4)
     return env
@@ -140,7 +139,7 @@ def replayed(env, seed, actions, layout):
 
 def test_cost_and_collisions_count_every_substep(env):
     """Independent oracle: a replay substep by substep, distances judged one by one."""
-    other = gym.make(OCCLUDED_CROSSING_ID).unwrapped
+    other = gym.make("OccludedCrossing-v0").unwrapped
     rng = np.random.default_rng(2)
     costs = between = begun = 0
     for seed in range(16):

@@ -12,7 +12,6 @@ from hypothesis.extra.numpy import arrays
 import safe_wrappers as sw
 from benchmarks.cases import patrolled
 from benchmarks.drivers import patrol_seeking
-from safe_wrappers.envs import PATROLLED_MAZE_ID
 from safe_wrappers.errors import UnknownNameError
 
 gym.register_envs(pytest.importorskip("gymnasium_robotics"))
@@ -23,7 +22,7 @@ CONTACT = 0.25
 
 @functools.cache
 def shared():
-    return gym.make(PATROLLED_MAZE_ID).unwrapped
+    return gym.make("PatrolledPointMaze-v0").unwrapped
 
 
 def place(env, ball, velocity, along, speeds):
@@ -34,7 +33,7 @@ def place(env, ball, velocity, along, speeds):
 
 
 def test_physics_observations_rewards_and_goals_are_point_mazes():
-    ours = gym.make(PATROLLED_MAZE_ID, reset_target=True)
+    ours = gym.make("PatrolledPointMaze-v0", reset_target=True)
     theirs = gym.make("PointMaze_UMaze-v3", reset_target=True, max_episode_steps=1000)
     rng = np.random.default_rng(0)
     goals = set()
@@ -139,7 +138,7 @@ def blocked(a, b):
 
 
 def test_walls_hide_patrols():
-    env = patrolled(gym.make(PATROLLED_MAZE_ID))
+    env = patrolled(gym.make("PatrolledPointMaze-v0"))
     raw, rng, seen = env.unwrapped, np.random.default_rng(0), []
     env.reset(seed=0)
     for _ in range(150):
@@ -155,25 +154,25 @@ def test_walls_hide_patrols():
 
 
 def test_protect_knows_it():
-    bare = sw.protect(gym.make(PATROLLED_MAZE_ID))
+    bare = sw.protect(gym.make("PatrolledPointMaze-v0"))
     assert [type(c) for c in bare.constraints] == [
         sw.constraints.WallClearance,
         sw.constraints.EscapeClearance,
     ]
     assert bare.constraints[1].obstacles[0].attribute == "patrol_tracks"
     for patrols, attribute in (("estimated", "tracking"), ("true", "patrol_tracks"), ("", "tracking")):
-        env = sw.protect(patrolled(gym.make(PATROLLED_MAZE_ID)), patrols=patrols, sigmas=2.0)
+        env = sw.protect(patrolled(gym.make("PatrolledPointMaze-v0")), patrols=patrols, sigmas=2.0)
         (tracked,) = env.constraints[1].obstacles
         assert (tracked.attribute, tracked.sigmas, tracked.radius) == (attribute, 2.0, 0.15)
-    last = sw.protect(patrolled(gym.make(PATROLLED_MAZE_ID)), patrols="last_seen")
+    last = sw.protect(patrolled(gym.make("PatrolledPointMaze-v0")), patrols="last_seen")
     assert last.constraints[1].obstacles[0].attribute == "last_seen_positions"
     with pytest.raises(UnknownNameError, match="true, last_seen, estimated"):
-        sw.protect(gym.make(PATROLLED_MAZE_ID), patrols="all")
+        sw.protect(gym.make("PatrolledPointMaze-v0"), patrols="all")
 
 
 def drive(driver, steps, patrols=None, sigmas=3.0, seed=0):
     """Collisions with patrols, those in a step not flagged, and steps flagged and changed."""
-    env = patrolled(gym.make(PATROLLED_MAZE_ID))
+    env = patrolled(gym.make("PatrolledPointMaze-v0"))
     if patrols is not None:
         env = sw.protect(env, patrols=patrols, sigmas=sigmas)
     raw = env.unwrapped

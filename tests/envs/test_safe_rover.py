@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from safe_wrappers.control.vehicle.slip import slip_ratio
-from safe_wrappers.envs import SAFE_ROVER_ID
 from safe_wrappers.envs.ground import GROUNDS, MAGIC_FORMULA, SLOWEST, MagicFormula, tyre_force
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
@@ -26,7 +25,7 @@ EMPTY = {"agent": [0.0, 0.0, 0.0], "goal": [3.5, 3.5], "hazards": [], "patches":
 
 @pytest.fixture
 def env():
-    made = gym.make(SAFE_ROVER_ID).unwrapped
+    made = gym.make("SafeRover-v0").unwrapped
     yield made
     made.close()
 

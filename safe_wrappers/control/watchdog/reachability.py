@@ -44,69 +44,38 @@ class MotionLimits:
 
 
 def furthest(
-    duration: ArrayLike,
-    velocity: ArrayLike,
-    acceleration: ArrayLike,
-    max_speed: ArrayLike,
-    max_acceleration: ArrayLike,
-    max_jerk: ArrayLike = np.inf,
+    duration: ArrayLike, velocity: ArrayLike, max_speed: ArrayLike, max_acceleration: ArrayLike
 ) -> tuple[Array, Array]:
     """Bounds on the displacement, m, at any moment within a time, from a moving start to any speed at the end.
 
     The lowest (<= 0) and the highest (>= 0), shape (...) each; (inf, -inf) where the duration is negative or anything
-    is not finite. No admissible motion gets farther; the bound is exact where the speed limit is not reached or the
-    jerk not limited. A start outside the limits widens them.
+    is not finite. They are exact: no admissible motion gets farther. A start outside the limits widens them.
 
     Args:
         duration: s, shape (...).
         velocity: At the start, m/s, shape (...).
-        acceleration: At the start, m/s^2, shape (...); without effect if the jerk is not limited.
         max_speed: m/s, shape (...); inf: none.
         max_acceleration: m/s^2, shape (...), finite.
-        max_jerk: m/s^3, shape (...); inf: none.
     """
-    a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
-    time, v, a = (np.asarray(x, dtype=np.float64) for x in (duration, velocity, acceleration))
-    known = np.isfinite(time) & np.isfinite(v) & np.isfinite(a) & (time >= 0.0)
-    time, v, a = (np.where(known, x, 0.0) for x in (time, v, a))
-    up, down = _highest(time, v, a, v_max, a_max, jerk), _highest(time, -v, -a, v_max, a_max, jerk)
+    a_max, v_max, _ = checked_limits(max_acceleration, max_speed, np.inf)
+    time, v = (np.asarray(x, dtype=np.float64) for x in (duration, velocity))
+    known = np.isfinite(time) & np.isfinite(v) & (time >= 0.0)
+    time, v = (np.where(known, x, 0.0) for x in (time, v))
+    up, down = _highest(time, v, v_max, a_max), _highest(time, -v, v_max, a_max)
     known = np.broadcast_to(known, up.shape)
     return np.where(known, -down, np.inf), np.where(known, up, -np.inf)
 
 
-def _highest(time: Array, v: Array, a: Array, v_max: Array, a_max: Array, jerk: Array) -> Array:
-    """The largest displacement of the upper envelope within the time."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # Without a limit on the jerk the envelope starts at full acceleration: a ramp of no length.
-        free = np.isinf(jerk)
-        a = np.where(free, a_max, a)
-        j = np.where(free, 1.0, jerk)
-        a_max = np.maximum(a_max, a)
-        growing = np.where(free, 0.0, np.maximum(a, 0.0))
-        v_max = np.maximum(v_max, v + 0.5 * growing * (growing / j))
-        ramp = (a_max - a) / j
-        gain = v_max - v
-        root = np.sqrt(a * a + 2.0 * j * gain)
-        rising = np.where(a > 0.0, 2.0 * gain / (a + root), (root - a) / j)
-        after = v + ramp * (a + 0.5 * j * ramp)
-        full = np.where(rising <= ramp, rising, ramp + (v_max - after) / a_max)
-        climb = np.minimum(time, full)
-        first = np.minimum(climb, ramp)
-        second = climb - first
-        at_end = first * (v + first * (0.5 * a + j / 6.0 * first))
-        at_end = at_end + second * (v + first * (a + 0.5 * j * first) + 0.5 * a_max * second)
-        cruise = time - climb
-        at_end = at_end + np.where(cruise > 0.0, v_max * cruise, 0.0)
-        # Braking at the start: the highest point may be where the motion reverses.
-        square = a * a - 2.0 * j * v
-        turn = 2.0 * v / (np.sqrt(np.maximum(square, 0.0)) - a)
-        turns = (v > 0.0) & (a < 0.0) & (square > 0.0)
-        turn = np.minimum(np.where(turns, turn, 0.0), time)
-        at_turn = turn * (v + turn * (0.5 * a + j / 6.0 * turn))
-        peak = np.maximum(np.maximum(at_end, at_turn), 0.0)
-        speeds = np.abs(v) + climb * (np.abs(a) + a_max)
-        size = speeds * climb + np.where(cruise > 0.0, v_max * cruise, 0.0)
-        return np.asarray(peak + _ROUNDING * size)
+def _highest(time: Array, v: Array, v_max: Array, a_max: Array) -> Array:
+    """The largest displacement within the time: full acceleration, then full speed."""
+    top = np.maximum(v_max, v)
+    climb = np.minimum(time, (top - v) / a_max)
+    cruise = time - climb
+    with np.errstate(invalid="ignore"):
+        cruised = np.where(cruise > 0.0, top * cruise, 0.0)
+    way = climb * (v + 0.5 * a_max * climb) + cruised
+    size = climb * (np.abs(v) + a_max * climb) + np.abs(cruised)
+    return np.asarray(np.maximum(way, 0.0) + _ROUNDING * size)
 
 
 def admits(
@@ -116,23 +85,13 @@ def admits(
     duration: ArrayLike,
     max_speed: ArrayLike,
     max_acceleration: ArrayLike,
-    max_jerk: ArrayLike = np.inf,
-    acceleration: ArrayLike | None = 0.0,
 ) -> NDArray[np.bool_]:
     """Whether a position may be reached within a time, at any speed, axis by axis: a necessary condition.
 
     False: no admissible motion gets there, anything is not finite, or the duration is negative. `goal` and `position`
-    are in m, shape (...), the other arguments those of `furthest`. An acceleration of None is not measured: the
-    largest one is assumed, and the jerk limit only matters for a start above the speed limit.
+    are in m, shape (...), the other arguments those of `furthest`.
     """
-    if acceleration is None:
-        a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
-        v = np.asarray(velocity, dtype=np.float64)
-        # A start inside the limits stays inside: without a limit on the jerk.
-        _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
-        lowest, _ = furthest(duration, v, -a_max, v_max, a_max, np.where(v < -v_max, jerk, np.inf))
-    else:
-        lowest, highest = furthest(duration, velocity, acceleration, max_speed, max_acceleration, max_jerk)
+    lowest, highest = furthest(duration, velocity, max_speed, max_acceleration)
     end, start = np.asarray(goal, dtype=np.float64), np.asarray(position, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         way, slack = end - start, _ROUNDING * (np.abs(end) + np.abs(start))
