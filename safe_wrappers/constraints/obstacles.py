@@ -8,10 +8,9 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from safe_wrappers.checks import Array, non_negative, positive, settings_from
-from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
 from safe_wrappers.control.numerics.shapes import BLOCK, PLANE, ROUND, SURFACE_NUMBERS, nearest_points
-from safe_wrappers.drawing.marks import Mark, ball, block, ellipsoid, pad, ring, spatial
+from safe_wrappers.drawing.marks import Mark, ball, block, pad, ring, spatial
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
@@ -229,9 +228,10 @@ class Discs(_Round):
 class TrackedDiscs:
     """Discs (or balls) that an `OcclusionPenalty` inside the filter tracks.
 
-    Each is the ellipsoid of `sigmas` standard deviations about its estimate. It moves with the estimated velocity and
-    grows as it would within `horizon_s` without further measurements (not for `Workspace`). The bound is not hard: at
-    each moment the centre is outside with the probability of the tail of `sigmas`.
+    Each is the box of `sigmas` standard deviations along every coordinate about its estimate, and `radius` around it.
+    It moves with the estimated velocity and grows as it would within `horizon_s` without further measurements (not
+    for `Workspace`). The bound is not hard: at each moment the centre is outside with the probability of the tail of
+    `sigmas`.
 
     Args:
         radius: m; the machine's own radius is the constraint's business.
@@ -261,39 +261,31 @@ class TrackedDiscs:
         return tracks
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
-        tracks = self.tracks(plant)
-        d, n = tracks.coordinates, len(tracks.mean)
+        times = self.horizon_s * np.array(_SHARES)
+        centers, halves = self.boxes(plant, np.concatenate([[0.0], times]))
+        n, d = centers.shape[1:]
         refuse_more_dimensions(d, point.size, "tracks")
-        normal, velocity, nothing = np.zeros((3, n, point.size))
-        offset = point[:d] - tracks.positions
-        covariances = tracks.position_covariances
-        if not (np.isfinite(offset).all() and np.isfinite(covariances).all()):
-            return Nearest(np.full(n, np.nan), normal, velocity, nothing)
-        distance, normal[:, :d] = ellipsoid_gap(offset, self.sigmas**2 * covariances)
-        velocity[:, :d] = self._velocity(tracks, normal[:, :d])
-        return Nearest(distance - self.radius, normal, velocity, nothing)
-
-    def _velocity(self, tracks: Tracks, normal: Array) -> Array:
-        """The estimated velocity, and along the normal the fastest rate at which the bound moves outwards."""
-        times = np.array([share * self.horizon_s for share in _SHARES])
-        positions, covariances = tracks.ahead(times.tolist())
-        along = ((positions - tracks.positions) * normal).sum(axis=-1)
-        grown = _deviation(covariances, normal) - _deviation(tracks.position_covariances, normal)
-        fastest = ((along + self.sigmas * grown) / times[:, None]).max(axis=0)
-        own = tracks.velocities
-        return np.asarray(own + (fastest - (own * normal).sum(axis=-1))[:, None] * normal)
+        blocks = np.zeros((n, SURFACE_NUMBERS))
+        blocks[:, 0], blocks[:, 1], blocks[:, 2 : 2 + d], blocks[:, 5 : 5 + d] = (
+            BLOCK,
+            d,
+            centers[0],
+            halves[0],
+        )
+        distance, normal, _ = nearest_points(blocks, point)
+        # The estimated velocity, and along the normal the fastest rate at which the box moves outwards.
+        out, own = normal[:, :d], self.tracks(plant).velocities
+        reach = (centers * out + halves * np.abs(out)).sum(axis=-1)
+        fastest = ((reach[1:] - reach[0]) / times[:, None]).max(axis=0)
+        velocity = np.zeros_like(normal)
+        velocity[:, :d] = own + (fastest - (own * out).sum(axis=-1))[:, None] * out
+        return Nearest(distance - self.radius, normal, velocity, np.zeros_like(normal))
 
     def boxes(self, plant: Plant, times_s: Array) -> tuple[Array, Array]:
         """Centres and half-widths, (k, n, d), m, of boxes that hold the bounds at times ahead, if nothing is seen."""
         positions, covariances = self.tracks(plant).ahead(times_s.tolist())
         variances = np.diagonal(covariances, axis1=-2, axis2=-1)
         return positions, self.sigmas * np.sqrt(np.maximum(variances, 0.0))
-
-
-def _deviation(covariances: Array, normal: Array) -> Array:
-    """Standard deviations along the normals, shape (..., n)."""
-    variance = (normal * (covariances @ normal[:, :, None])[..., 0]).sum(axis=-1)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 KINDS: dict[str, type[Any]] = {k.__name__: k for k in (Disc, Sphere, Plane, Box, Discs, TrackedDiscs)}
@@ -348,8 +340,7 @@ def obstacle_marks(obstacles: Sequence[Any], plant: Plant, inset: float, point: 
             foot = at - ((at - of) @ normal - inset) * normal
             found.append(pad("keep out", foot, normal, _PAD_M))
         elif isinstance(obstacle, TrackedDiscs):
-            tracks = obstacle.tracks(plant)
-            bounds = zip(tracks.positions, tracks.position_covariances, strict=True)
-            radius = obstacle.radius + inset
-            found += [ellipsoid("estimate", p, cov, obstacle.sigmas, radius) for p, cov in bounds]
+            centers, halves = (part[0] for part in obstacle.boxes(plant, np.zeros(1)))
+            sizes = halves + obstacle.radius + inset
+            found += [block("estimate", *one) for one in zip(centers, sizes, strict=True)]
     return found

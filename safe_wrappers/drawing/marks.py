@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from safe_wrappers.checks import Array
 
 Role = Literal["keep out", "limit", "way", "estimate", "proposed", "executed"]
-Shape = Literal["sphere", "ellipsoid", "capsule", "box", "arrow"]
+Shape = Literal["sphere", "capsule", "box", "arrow"]
 
 _CORNERS: Final = 16
 THIN: Final = 0.012
@@ -38,7 +38,7 @@ class Mark:
         role: What it says, which is its colour.
         position: Of its centre, of an arrow's tail, shape (3,), m.
         size: Shape (3,), m, as `mujoco.mjv_initGeom` takes it: radius (and half length) of what is round, half sizes
-            along its axes of a box, half axes of an ellipsoid; of an arrow twice its radius, then its length.
+            along its axes of a box; of an arrow twice its radius, then its length.
         axes: Its own x, y and z axis in the world, as columns, shape (3, 3); what is long is along z.
     """
 
@@ -91,25 +91,6 @@ def pad(role: Role, foot: ArrayLike, normal: ArrayLike, half_size: float) -> Mar
     """A thin square of a plane around a point of it, m."""
     thin = 0.002 + 0.005 * half_size
     return _mark("box", role, spatial(foot), [half_size, half_size, thin], _frame(spatial(normal, 0.0)))
-
-
-def ellipsoid(role: Role, center: ArrayLike, covariance: Array, sigmas: float, radius: float) -> Mark:
-    """The ellipsoid of so many standard deviations, each of its half axes longer by a radius, m.
-
-    Args:
-        role: What it says.
-        center: Shape (d,).
-        covariance: Shape (d, d), m^2; in the plane it is as high as the radius.
-        sigmas: Standard deviations.
-        radius: m.
-    """
-    variances, axes = np.linalg.eigh(covariance)
-    d = len(variances)
-    size, frame = np.full(3, radius), np.eye(3)
-    size[:d] += sigmas * np.sqrt(np.maximum(variances, 0.0))
-    frame[:d, :d] = axes
-    frame[:, 0] *= np.linalg.det(frame)  # no reflection
-    return _mark("ellipsoid", role, spatial(center), size.tolist(), frame)
 
 
 def segment(role: Role, start: ArrayLike, end: ArrayLike, radius: float) -> Mark:

@@ -43,7 +43,7 @@ def test_a_permission_and_ways_out_together_stop_where_it_is_safe_to():
     )
     both = [
         sw.constraints.EscapeClearance("robot", [sw.constraints.TrackedDiscs(0.4)], 0.2),
-        sw.constraints.TrackPermission("robot", 3.0, creep=0.4),
+        sw.constraints.TrackPermission("robot", 3.0),
     ]
     filtered = sw.CBFActionFilter(env, both)
     filtered.reset(seed=2)
