@@ -98,7 +98,7 @@ class Side:
     def reset(self, seed: int) -> None:
         """Begin an episode."""
         self.observation, _ = self.env.reset(seed=seed)
-        self.policy.begin(self.env)
+        self.policy.reset()
         self.trail = [self.task.agent_position]
         self.mark: tuple[int, int, int] | None = None
 
@@ -220,7 +220,7 @@ def whole_episodes() -> dict[str, Any]:
         env, total = make(trained), Count()
         for seed in COUNTED:
             observation, _ = env.reset(seed=seed)
-            trained.begin()
+            trained.reset()
             truncated = False
             while not truncated:
                 observation, reward, _, truncated, info = env.step(trained(observation))

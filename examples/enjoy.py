@@ -18,7 +18,7 @@ trained = load_policy(options.run)
 env = trained.make_env()  # make_env("none"): without the filter
 for seed in range(options.episodes):
     observation = env.reset(seed=seed)[0]
-    trained.begin()
+    trained.reset()
     done = False
     while not done:
         observation, reward, terminated, truncated, info = env.step(trained(observation))

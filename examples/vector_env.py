@@ -1,4 +1,4 @@
-"""A policy-gradient loop in plain torch, as in CleanRL: one filter decides for all envs of a vector env.
+"""A policy-gradient loop in plain torch, as in CleanRL: all envs of a vector env are filtered.
 
 python examples/vector_env.py --steps 100000
 """

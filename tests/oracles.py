@@ -69,9 +69,3 @@ def damping_ratios(arm, inertia):
     values = np.linalg.eigvals(system)
     ringing = sorted(values[values.imag > 1.0], key=abs)
     return np.array([-value.real / abs(value) for value in ringing])
-
-
-def smoothstep_share(phase):
-    """Most of a step's energy that a smoothstep leaves in a resonance w over its duration T, at a phase w T, rad."""
-    k = np.asarray(phase) / 2.0
-    return np.minimum(1.0, 15.0 / k**3 * np.sqrt(1.0 + 3.0 / k**2 + 9.0 / k**4)) ** 2

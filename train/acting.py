@@ -65,7 +65,7 @@ def enjoy_command(
     with closing(trained.make_env(action_filter, "human" if window else None)) as env:
         for seed in range(episodes):
             observation, info = env.reset(seed=seed)
-            trained.begin()
+            trained.reset()
             done = False
             while not done:
                 observation, _, terminated, truncated, info = env.step(trained(observation))

@@ -124,7 +124,7 @@ def film_episode(policy: TrainedPolicy, env: gym.Env[Any, Any], seed: int) -> tu
     changed: list[bool] = []
     violated: list[bool] = []
     observation, info = env.reset(seed=seed)
-    policy.begin()
+    policy.reset()
     done = False
     while not done:
         if len(changed) % stride == 0:

@@ -27,9 +27,6 @@ def measure_steps(env: Env, recording: Recording) -> Measured:
     steps = command_steps(env, recording)
     figure = float(np.percentile(steps, 99.0))
     evidence = [Evidence("median command step", float(np.median(steps)), "of the range")]
-    gaps = np.diff(np.flatnonzero(steps > 0.5 * figure)) if figure > 0.0 else np.zeros(0)
-    if gaps.size:
-        evidence.append(Evidence("control steps between large ones, median", float(np.median(gaps)), ""))
     return Measured(figure, evidence)
 
 

@@ -72,8 +72,8 @@ class LagrangianMultiplier(BaseCallback):
 
     Raises:
         ConfigurationError: Numbers outside these ranges; in training: an env that reports no cost or one that is
-            not finite, hindsight replay, or an off-policy learner behind a VecNormalize: both replay the env's own
-            rewards.
+            not finite, hindsight replay, `ExecutedActionReplayBuffer(mode="both")`, or an off-policy learner behind a
+            VecNormalize: they replay the env's own rewards.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -99,9 +99,10 @@ class LagrangianMultiplier(BaseCallback):
                 "LagrangianMultiplier: an off-policy learner behind a VecNormalize stores the env's own rewards,"
                 " without a price on cost; leave VecNormalize out, or use an on-policy learner"
             )
-        if isinstance(getattr(self.model, "replay_buffer", None), HerReplayBuffer):
+        buffer: Any = getattr(self.model, "replay_buffer", None)
+        if isinstance(buffer, HerReplayBuffer) or getattr(buffer, "mode", "") == "both":
             raise ConfigurationError(
-                "LagrangianMultiplier: hindsight replay asks the task for rewards anew, without a price on cost; use"
+                "LagrangianMultiplier: hindsight replay and mode 'both' have rewards without a price on cost; use"
                 " another replay buffer"
             )
         self._episode_cost = np.zeros(self.training_env.num_envs)

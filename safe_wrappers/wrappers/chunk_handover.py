@@ -18,7 +18,6 @@ from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.chunk_queue import (
@@ -70,10 +69,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
         limits: Of the machine, which every "quintic" keeps between its ends, too: it is stretched until it does, or
             its chunk is refused.
-        flexible: A `plants.rigid_model_check`, or "auto", which makes one now: where it finds that springs ring on,
-            `blend_time` and `rate_limit` are so strict that a blend over the whole action range leaves at most 1 % of
-            the energy that a step of torque leaves in the springs, and smoothsteps that the next seam comes before
-            the end of fade out beside the next one.
 
     Info, at every step (see `safe_wrappers.info`): ``handover/peak_jerk``, ``handover/starved``,
     ``handover/limited``, ``handover/refused``, ``action/clipped``. The inner layers' info is merged
@@ -111,7 +106,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         control_dt: float | None = None,
         steps_per_entry: int = 1,
         limits: SeamLimits | Mapping[str, Any] | None = None,
-        flexible: RigidModelCheck | Mapping[str, Any] | str | None = None,
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)  # first: with a handover inside the actions are no vector either
@@ -133,7 +127,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             control_dt=control_dt,
             steps_per_entry=sizes.steps_per_entry,
             limits=plain_data(limits),
-            flexible=plain_data(flexible),
         )
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
         self.control_dt = check_timing(env, control_dt)
@@ -143,12 +136,10 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         low, high = (np.repeat(end[None], sizes.entries, axis=0) for end in (space.low, space.high))
         self.action_space = gym.spaces.Box(low, high, dtype=space.dtype)
         self._fallback = FallbackController(env, fallback, plant)
-        springs = self._springs(flexible)
-        bounds = blend_time, rate_limit, limits, springs
+        bounds = blend_time, rate_limit, limits
         fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, *bounds)
         self._check = None if limits is None else self._bound_check(limits)
-        queue = space, self.control_dt, blend, fewest, rate_limits, self._check
-        self._queue = ChunkQueue(*queue, overlap=springs is not None)
+        self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rate_limits, self._check)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
         self._start()
@@ -198,16 +189,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     def now_s(self) -> float:
         """Seconds of the episode so far, on the clock of control steps."""
         return self._queue.now * self.control_dt
-
-    def _springs(self, flexible: Any) -> RigidModelCheck | None:
-        """What the user or the env's model says about springs that ring on; None where there are none."""
-        if flexible is None:
-            return None
-        if isinstance(flexible, str) and flexible == "auto":
-            plant = self._fallback.plant
-            flexible = rigid_model_check(self.env, plant if isinstance(plant, MujocoPlant) else None)
-        check = settings_from(RigidModelCheck, flexible, "flexible", ', or "auto"')
-        return None if check.rigid_is_good_enough else check
 
     def _bound_check(self, limits: SeamLimits) -> SeamCheck:
         if not limits.needs_dynamics:

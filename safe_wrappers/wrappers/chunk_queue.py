@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -11,15 +11,10 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.control.handover.curves import hermite_spline
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import LOOK_BACK, Seam, drawn_out, join
-from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE, shortest_latched_blend, smoothstep
-from safe_wrappers.control.handover.vibration import shortest_smoothstep
+from safe_wrappers.control.handover.seams import LOOK_BACK, Seam, join
+from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.queries.rigid_model import RigidModelCheck
 from safe_wrappers.wrappers.layer import whole_steps
-
-_VIBRATION_SHARE: Final = 0.01
-"""Of the energy that a step of torque leaves in springs, what a blend over the whole action range may leave."""
 
 
 class Command(NamedTuple):
@@ -53,9 +48,6 @@ class ChunkQueue:
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
         check: Of the machine's limits; None accepts all blends.
-        overlap: A smoothstep that the next seam comes before the end of is not cut short: what is left of it fades
-            out beside the next one. A left-over that is shorter than a blend is drawn out. What keeps the rate limit
-            is then the sending alone.
     """
 
     def __init__(
@@ -66,11 +58,9 @@ class ChunkQueue:
         fewest: int,
         rate_limit: Array,
         check: SeamCheck | None = None,
-        overlap: bool = False,
     ) -> None:
         self._control_dt, self._blend, self._fewest = control_dt, blend, fewest
         self._rate_limit, self._check = rate_limit, check
-        self._overlap = overlap and blend == "smoothstep"
         step = np.asarray(rate_limit * control_dt)
         # The difference of two commands, divided by the interval again, must not come out above the limit.
         self._step = np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)
@@ -88,7 +78,6 @@ class ChunkQueue:
         self._observed = -1
         self._sent = self._none
         self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
-        self._asked = self._none  # the chunk in force as it came; it ends with the plan
         self._coming: list[Chunk] = []
         self._starved: bool | None = None
         self._fade: tuple[Array, int, int] | None = None  # the latched command, steps, done
@@ -156,7 +145,7 @@ class ChunkQueue:
             return None
         self._coming = [c for c in self._coming if c.observed > chunk.observed]
         self._observed = chunk.observed
-        self._plan, self._limited, self._asked = joined.plan, joined.limited, fresh
+        self._plan, self._limited = joined.plan, joined.limited
         if len(chunk.commands) == 1:
             return False
         self._fade = None
@@ -164,17 +153,10 @@ class ChunkQueue:
 
     def _joined(self, fresh: Array) -> Seam | None:
         """The blend into a chunk's rest, shape (n, m); None if none keeps the machine's limits."""
-        prior = self._plan
-        if self._overlap and len(prior):
-            fading = (prior - self._asked[-len(prior) :])[: len(fresh)]
-            fresh = fresh.copy()
-            fresh[: len(fading)] += fading
-            fresh = np.clip(fresh, self._low, self._high)
-            prior = drawn_out(prior, len(fresh))
         blend: Any = self._blend  # checked by the wrapper
         return join(
             self._sent,
-            prior,
+            self._plan,
             fresh,
             self._control_dt,
             blend=blend,
@@ -183,7 +165,6 @@ class ChunkQueue:
             low=self._low,
             high=self._high,
             accepts=None if self._check is None else partial(self._check.accepts, self._sent, fresh),
-            hold_back=not self._overlap,
         )
 
     def _planned(self) -> tuple[Array | None, bool]:
@@ -269,36 +250,25 @@ def blend_bounds(
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
     limits: SeamLimits | None = None,
-    springs: RigidModelCheck | None = None,
 ) -> tuple[int, Array]:
-    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none.
-
-    Springs ask for the time from which on a smoothstep leaves at most 1 % of a step's energy in them, and for the
-    steepest rate of such a blend over the whole action range.
-    """
+    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
     if limits is not None and blend != "quintic":
         raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
-    rates, shortest = (
-        np.full(space.shape, np.inf),
-        0.0 if blend_time is None else positive("blend_time", blend_time, "s"),
-    )
+    fewest, rates = 0, np.full(space.shape, np.inf)
     if rate_limit is not None:
         rates = _rate_limits(rate_limit, rates.size)
-    if springs is not None:
-        calm = shortest_smoothstep(_VIBRATION_SHARE, springs.resonances[0])
-        rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / calm, rates)
-        shortest = max(calm, shortest)
     resolution = _rounding(space)
     if (rates * control_dt <= resolution).any():
         least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
         raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
-    fewest = max(whole_steps(shortest, control_dt) - 1, 1) if shortest else 0
     available = sizes.chunk - sizes.delay[1]
-    if fewest >= available and sizes.chunk > 1:
-        left = f"{available} control steps of {control_dt} s"
-        longer = f"blend_time = {shortest} s is longer than a chunk's rest, {left}"
-        raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
-    if not shortest and rate_limit is None and limits is None:
+    if blend_time is not None:
+        fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
+        if fewest >= available and sizes.chunk > 1:
+            left = f"{available} control steps of {control_dt} s"
+            longer = f"blend_time = {blend_time} s is longer than a chunk's rest, {left}"
+            raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
+    if blend_time is None and rate_limit is None and limits is None:
         fewest = available - sizes.horizon  # the least left-over
         if fewest == 0:
             has = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"

@@ -1,5 +1,6 @@
 """ContactMonitor and BalanceMonitor: what contacts and balance did in each control step."""
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -39,6 +40,8 @@ class StepMonitor(LayerWrapper, ABC):
     layer: ClassVar = Layer.MONITOR
     partial: ClassVar[str]
     """Its info key for steps that could not be replayed."""
+    nothing: ClassVar[dict[str, Any]]
+    """The other info keys, where there was no contact and no motion."""
 
     def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
@@ -47,6 +50,13 @@ class StepMonitor(LayerWrapper, ABC):
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
             raise UnsupportedEnvError(f"{name} needs an env with MuJoCo's .model and .data; {raw} has none")
         self._replay = Replay(raw)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
+        """Reset the env; its info holds the keys of a step, as of nothing."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._begin(self.unwrapped.model)  # type: ignore[attr-defined]
+        info.update(copy.deepcopy(self.nothing), **{self.partial: False})
+        return observation, info
 
     def step(self, action: Any) -> Step:
         """Step the env, and look at the physics of that step."""
@@ -111,6 +121,9 @@ class ContactMonitor(StepMonitor):
     """
 
     partial: ClassVar = keys.CONTACT_PARTIAL
+    nothing: ClassVar = dict.fromkeys(
+        (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL), 0.0
+    )
 
     def __init__(
         self,
@@ -135,14 +148,6 @@ class ContactMonitor(StepMonitor):
         first, second = (model.body(i).name if i < model.nbody else "" for i in self._peak_bodies)
         return first, second
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; its info holds the keys of a step, as 0."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        raw: Any = self.unwrapped
-        self._begin(raw.model)
-        info.update(self._figures(raw.data), **{self.partial: False})
-        return observation, info
-
     def _begin(self, model: mujoco.MjModel) -> None:
         if self._contacts.model is not model:
             self._contacts = Contacts(model, self.bodies, self.against)
@@ -162,18 +167,16 @@ class ContactMonitor(StepMonitor):
                 self._peak, self._peak_bodies = force, bodies
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
-        peak, depth, residual = self._peak, 0.0, 0.0
-        if self._gaps:
-            gaps, forces = np.array(self._gaps), np.array(self._forces)
-            if np.isfinite(gaps).all() and np.isfinite(forces).all():
-                residuals = complementarity_residuals(gaps, forces)
-                depth, residual = float(residuals.penetration.max()), float(residuals.product.max())
-            else:
-                peak = depth = residual = math.nan
+        if not self._gaps:
+            return dict(self.nothing)
+        gaps, forces = np.array(self._gaps), np.array(self._forces)
+        if not (np.isfinite(gaps).all() and np.isfinite(forces).all()):
+            return dict.fromkeys(self.nothing, math.nan)
+        residuals = complementarity_residuals(gaps, forces)
         return {
-            keys.CONTACT_PEAK_FORCE: peak,
-            keys.CONTACT_PENETRATION: depth,
-            keys.CONTACT_RESIDUAL: residual,
+            keys.CONTACT_PEAK_FORCE: self._peak,
+            keys.CONTACT_PENETRATION: float(residuals.penetration.max()),
+            keys.CONTACT_RESIDUAL: float(residuals.product.max()),
         }
 
 
@@ -214,6 +217,12 @@ class BalanceMonitor(StepMonitor):
     """
 
     partial: ClassVar = keys.BALANCE_PARTIAL
+    nothing: ClassVar = {
+        keys.BALANCE_FRICTION_USED: 0.0,
+        keys.BALANCE_ZMP_MARGIN: keys.NOT_JUDGED,
+        keys.BALANCE_LINEAR_MOMENTUM: np.zeros(3),
+        keys.BALANCE_ANGULAR_MOMENTUM: np.zeros(3),
+    }
 
     def __init__(self, env: Env, bodies: Sequence[str] | None = None) -> None:
         StepMonitor.__init__(self, env)
@@ -221,12 +230,6 @@ class BalanceMonitor(StepMonitor):
         self._robot = _Robot(raw.model, bodies)
         self.bodies = None if bodies is None else list(bodies)
         self._record({"bodies": self.bodies})
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; its info holds the keys of a step, as 0."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        info.update(_NOTHING | {key: np.zeros(3) for key in _MOMENTA}, **{self.partial: False})
-        return observation, info
 
     def _begin(self, model: mujoco.MjModel) -> None:
         if self._robot.model is not model:
@@ -237,17 +240,15 @@ class BalanceMonitor(StepMonitor):
         self._robot.contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
-        found = self._robot.grounded()
-        figures: dict[str, Any] = dict(_NOTHING) if found is None else self._of_contacts(found)
-        momentum = self._robot.momentum.read(data)
-        figures[keys.BALANCE_LINEAR_MOMENTUM] = np.zeros(3) if momentum is None else momentum.linear
-        figures[keys.BALANCE_ANGULAR_MOMENTUM] = np.zeros(3) if momentum is None else momentum.angular
-        return figures
+        figures: dict[str, Any] = copy.deepcopy(self.nothing)
+        found, momentum = self._robot.grounded(), self._robot.momentum.read(data)
+        if momentum is not None:
+            figures[keys.BALANCE_LINEAR_MOMENTUM] = momentum.linear
+            figures[keys.BALANCE_ANGULAR_MOMENTUM] = momentum.angular
+        return figures if found is None or not found.steps else figures | self._of_contacts(found)
 
     def _of_contacts(self, found: ContactForecast) -> dict[str, Any]:
         """The figures of finite contacts."""
-        if not found.steps:
-            return dict(_NOTHING)
         normal, tangential = normal_and_tangential(found.force, found.normal)
         held = found.friction * normal
         loaded = (normal >= PRESSING * self._robot.weight_n()) & (held > 0.0)
@@ -257,13 +258,6 @@ class BalanceMonitor(StepMonitor):
             keys.BALANCE_FRICTION_USED: float(used.max(initial=0.0)),
             keys.BALANCE_ZMP_MARGIN: float(distances.min()) if distances.size else keys.NOT_JUDGED,
         }
-
-
-_MOMENTA: Final = (keys.BALANCE_LINEAR_MOMENTUM, keys.BALANCE_ANGULAR_MOMENTUM)
-_NOTHING: Final = {
-    keys.BALANCE_FRICTION_USED: 0.0,
-    keys.BALANCE_ZMP_MARGIN: keys.NOT_JUDGED,
-}
 
 
 class _Robot:

@@ -11,13 +11,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorActionWrapper, 
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint, ConstraintBatch
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.stack import refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, CBFActionFilter
-from safe_wrappers.wrappers.layer import action_array
+from safe_wrappers.wrappers.layer import Step, action_array
 
 Mask = NDArray[np.bool_]
 
@@ -123,26 +124,39 @@ class VectorCBFActionFilter(_Wrapper):
         if not all(single.started for single in self.filters):
             raise gym.error.ResetNeeded("call reset before step; the last one may have failed")
         given = action_array(actions, (self.num_envs, *self._low.shape))
-        if self.constraint_batch is not None:
-            self._judge_together(given)
+        if self.constraint_batch is None:
+            return self.env.step(list(given))
+        proposed = given.astype(np.float64)
+        margins, admitted = self._judge_together(proposed)
         answer = self.env.step(list(given))
         self._ended = np.asarray(answer[2] | answer[3])
+        self._report(answer[4], admitted & ~self._ended, margins, proposed)
         return answer
 
-    def _judge_together(self, given: NDArray[Any]) -> None:
-        """Tell the filters whose proposals are admitted; the others will judge alone."""
+    def _judge_together(self, proposed: Array) -> tuple[Array, Mask]:
+        """The smallest h of each env, and whose proposals are admitted; the others' filters will judge alone."""
         judged = ~self._ended if self._next_step else np.ones(self.num_envs, dtype=bool)
         self._follow_models(judged)
         batch = self.constraint_batch
         assert batch is not None
-        proposed = given.astype(np.float64)
         inside = ((proposed >= self._low) & (proposed <= self._high)).all(axis=1)
         margins, admitted = batch.judge(np.clip(proposed, self._low, self._high))
         # An unsafe or unreadable state (NaN) gets a warning from its own filter.
-        usual = judged & inside & admitted & (margins >= -SAFE_TOLERANCE)
+        usual: Mask = judged & inside & admitted & (margins >= -SAFE_TOLERANCE)
         batch.executed(usual)
         for i in np.flatnonzero(usual).tolist():
             self.filters[i].admitted = float(margins[i])
+        return margins, usual
+
+    def _report(self, infos: dict[str, Any], quiet: Mask, margins: Array, proposed: Array) -> None:
+        """Write the info keys of envs that changed nothing and whose episode goes on; the others' are written."""
+        for key, value in self.filters[0].quiet_report(0.0, proposed[0]).items():
+            if key not in infos:
+                infos[key] = np.zeros((self.num_envs, *np.shape(value)), dtype=np.asarray(value).dtype)
+                infos[f"_{key}"] = np.zeros(self.num_envs, dtype=bool)
+            infos[f"_{key}"][quiet] = True
+        infos[keys.CBF_MARGIN][quiet] = np.where(np.isfinite(margins), margins, 0.0)[quiet]
+        infos[keys.PROPOSED_ACTION][quiet] = infos[keys.EXECUTED_ACTION][quiet] = proposed[quiet]
 
 
 class _FilterOfMany(CBFActionFilter):
@@ -162,17 +176,31 @@ class _FilterOfMany(CBFActionFilter):
     def judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
         if self.batch is None:
             return super().judge(action)
+        self.filter.memories = [self.batch.memory(self.place)]
+        judged = super().judge(action)
+        self.batch.restart(self.place, self.filter.memories[0])
+        return judged
+
+    def step(self, action: Any) -> Step:
+        """As ever; of what was admitted the vector filter reports, unless the episode ends."""
         if self.admitted is None:
-            self.filter.memories = [self.batch.memory(self.place)]
-            judged = super().judge(action)
-            self.batch.restart(self.place, self.filter.memories[0])
-            return judged
+            return super().step(action)
         margin, self.admitted = self.admitted, None
-        proposed = action.astype(np.float64)
-        self.filter.last = proposed
+        self.filter.last = proposed = action.astype(np.float64)
         self.plant.executed(proposed)
+        self.filter_calls += 1
+        observation, reward, terminated, truncated, info = self.plant.step(self.env, action)
+        mismatch = self.deviates()
+        if terminated or truncated:
+            info |= self.quiet_report(margin, proposed)
+        if terminated or truncated or mismatch:
+            info[keys.CBF_MISMATCH] = mismatch
+        return observation, reward, terminated, truncated, info
+
+    def quiet_report(self, margin: float, proposed: Array) -> dict[str, Any]:
+        """The info keys of a step that changes nothing."""
         report = self._quiet_report() | {keys.CBF_MARGIN: margin if math.isfinite(margin) else 0.0}
-        return action, report | {keys.PROPOSED_ACTION: proposed, keys.EXECUTED_ACTION: proposed.copy()}
+        return report | {keys.PROPOSED_ACTION: proposed, keys.EXECUTED_ACTION: proposed.copy()}
 
 
 def single_envs(env: VectorEnv[Any, Any, Any]) -> list[gym.Env[Any, Any]]:

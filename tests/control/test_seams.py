@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from safe_wrappers.control.handover.seams import BLENDS, drawn_out, join, limit_rate
+from safe_wrappers.control.handover.seams import BLENDS, join, limit_rate
 
 HOLD = 0.1
 blends = pytest.mark.parametrize("blend", BLENDS)
@@ -187,22 +187,3 @@ def test_limit_rate_is_a_chase_at_limited_speed(seed, n, m, step, started):
                 assert kept[i].tobytes() == commands[i].tobytes()
     fits = np.abs(np.diff(commands if before is None else np.vstack([before, commands]), axis=0))
     assert limited.any() == bool((fits > step).any())
-
-
-def test_a_stream_is_drawn_out_at_a_rate_that_falls_evenly_to_nothing():
-    stream = np.array([[0.0, 1.0], [0.3, 0.4]])
-    longer = drawn_out(stream, 7)
-    assert np.array_equal(longer[:2], stream)
-    shares = np.array([5.0, 4.0, 3.0, 2.0, 1.0])[:, None] / 6.0
-    np.testing.assert_allclose(np.diff(longer, axis=0)[1:], shares * [[0.3, -0.6]], atol=1e-12)
-    assert drawn_out(longer, 7) is longer and np.array_equal(drawn_out(stream[:1], 3), stream[[0, 0, 0]])
-
-
-@pytest.mark.parametrize("sent", [0, 3])
-def test_what_is_not_held_back_is_left_to_the_caller(sent):
-    new = np.array([0.0, 2.0, -2.0, 2.0, 0.0, 0.0])[:, None]
-    before, prior = np.zeros((sent, 1)), np.zeros((0, 1))
-    held = join(before, prior, new, HOLD, fewest=1, rate_limit=1.0)
-    left = join(before, prior, new, HOLD, fewest=1, rate_limit=1.0, hold_back=False)
-    assert held.limited.any() and not left.limited.any()
-    assert np.array_equal(left.plan[left.steps :], new[left.steps :])

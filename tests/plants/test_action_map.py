@@ -178,14 +178,6 @@ class Relative(Machine):
         return self.observed(), 0.0, False, False, {}
 
 
-class Ramp(Machine):
-    def act(self, control):
-        before = self.data.ctrl.copy()
-        for part in range(1, 5):
-            self.data.ctrl[:] = before + (control - before) * part / 4
-            mujoco.mj_step(self.model, self.data)
-
-
 class Squared(Machine):
     def act(self, control):
         super().act(np.sign(control) * control**2)
@@ -204,7 +196,6 @@ class Frozen(Machine):
             r"not by control = offset \+ scale \* action: in 100 steps .* up to \d.* away .*'(push|servo)'",
         ),
         (Squared(), r"not by control = offset \+ scale \* action.*AnalyticPlant"),
-        (Ramp(), r"does not hold one control for 4 physics steps: its state was up to \d"),
         (
             Frozen(),
             r"no copy of it can be stepped to find out how \(RuntimeError: no robot is connected\).*AnalyticPlant\(",

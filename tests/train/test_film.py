@@ -37,7 +37,7 @@ class Shot(gym.Env):
 class Still:
     """A policy."""
 
-    def begin(self):
+    def reset(self):
         pass
 
     def __call__(self, observation):

@@ -145,9 +145,9 @@ def test_a_policy_acts_in_evaluation_as_it_was_trained(tmp_path):
     held = evaluated_steps(tmp_path, "filter_on").proposed[:48].reshape(12, 4, 2)
     assert (held == held[:, :1]).all()
     policy.deterministic = False
-    policy.begin()
+    policy.reset()
     first = policy(observation)
-    policy.begin()
+    policy.reset()
     assert not np.array_equal(policy(observation), first)
 
 

@@ -92,7 +92,7 @@ def test_the_policies_that_ship_act_safely_in_their_filter(name):
     trained = load_policy(SHIPPED / name)
     env = trained.make_env("protect")
     observation, _ = env.reset(seed=0)
-    trained.begin()
+    trained.reset()
     for _ in range(100):
         observation, _, _, _, info = env.step(trained(observation))
         assert info["cost"] == 0.0

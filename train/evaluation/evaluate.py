@@ -113,7 +113,7 @@ def _episode(
 ) -> dict[str, Any]:
     """Runs an episode, and records its steps; its figures as `RecordInterventions` has them."""
     observation, _ = env.reset(seed=episode_seed)
-    policy.begin()
+    policy.reset()
     steps.begin(episode_seed)
     done = False
     while not done:

@@ -55,7 +55,7 @@ class TrainedPolicy:
         spaces = SpacesEnv(self.model.observation_space, self.model.action_space)
         scaled = load_normalize(folder, DummyVecEnv([lambda: spaces]))
         self._normalize = scaled if isinstance(scaled, VecNormalize) else None
-        self.begin()
+        self.reset()
 
     def make_env(
         self, action_filter: Literal["trained", "none", "protect"] = "trained", render_mode: str | None = None
@@ -69,7 +69,7 @@ class TrainedPolicy:
         used = {"trained": self.arm.filter, "none": FilterConfig(), "protect": FilterConfig(protect={})}
         return make_stack(self.arm.env, used[action_filter], render_mode=render_mode)
 
-    def begin(self) -> None:
+    def reset(self) -> None:
         """Start an episode: its first action is the policy's."""
         self._held, self._left = None, 0
 

@@ -295,12 +295,13 @@ def admits(at: Look, drive: float, turn: float) -> bool:
 
 
 @compiled
-def rows(at: Look) -> tuple[Array, Array]:
+def secants(scene: Scene) -> tuple[Array, Array]:
     """Secants of the clearance after one hold over (drive, turn), one row per model and disc in play.
 
     Returns:
         `normals @ (drive, turn) <= offsets`: shapes (k, 2) and (k,), rows that no control can break left out.
     """
+    at = look(scene)
     near, outside = len(at.discs), at.least < 0.0
     each = 1 if outside else near
     normals, offsets, k = np.zeros(((len(at.models) - 1) * each, 2)), np.zeros((len(at.models) - 1) * each), 0
@@ -327,11 +328,12 @@ def rows(at: Look) -> tuple[Array, Array]:
 
 
 @compiled
-def passing_side(at: Look, drive: float, turn: float, side: float) -> float:
+def way_around(scene: Scene, drive: float, turn: float, side: float) -> float:
     """The way to turn to get around the disc in the way: 1 left, -1 right, 0 if there is nothing to go around.
 
     `side` is that of a detour that goes on already, or 0.
     """
+    at = look(scene)
     if not len(at.discs) or drive == 0.0:
         return 0.0
     m = at.motion
@@ -385,18 +387,6 @@ def least_clearance(qpos: Array, qvel: Array, place: Array, scene: Scene) -> tup
 def is_admitted(scene: Scene, drive: float, turn: float) -> bool:
     """Whether the end of a held control still has a safe stopping path."""
     return admits(look(scene), drive, turn)
-
-
-@compiled
-def secants(scene: Scene) -> tuple[Array, Array]:
-    """Half-spaces of (drive, turn) that keep the clearance, about: shapes (k, 2) and (k,)."""
-    return rows(look(scene))
-
-
-@compiled
-def way_around(scene: Scene, drive: float, turn: float, side: float) -> float:
-    """1 (left), -1 (right), or 0 with nothing to go around; `side` is that of a detour that goes on, or 0."""
-    return passing_side(look(scene), drive, turn, side)
 
 
 @compiled

@@ -192,65 +192,6 @@ def _towards(at: At, admitted: Pair, asked: Pair) -> Pair:
     return _between(admitted, asked, low)
 
 
-@compiled
-def near(at: At, control: Pair) -> Array:
-    """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
-    x_axis, y_axis = at.among.x_axis, at.among.y_axis
-    asked = max(x_axis.low, min(control[0], x_axis.high)), max(y_axis.low, min(control[1], y_axis.high))
-    turned, count = np.empty((0, 2)), 0
-    if _is_inside(at):
-        turned = _turned(at, asked)
-    found = np.empty((len(turned) + 2, 2))
-    for i in range(len(turned)):
-        one = turned[i, 0], turned[i, 1]
-        if admits(at, one, 0.0):
-            if at.among.clip_known:
-                one = _towards(at, one, asked)
-            found[count, 0], found[count, 1] = one
-            count += 1
-    if count == 0:  # where the path fits and no rectangle does
-        for first in range(2):
-            one = backup(at)
-            for axis in (first, 1 - first):
-                one = _towards(at, one, _replaced(one, axis, asked[axis]))
-            found[count, 0], found[count, 1] = one
-            count += 1
-    away = np.empty(count)
-    for i in range(count):
-        away[i] = hypot(found[i, 0] - asked[0], found[i, 1] - asked[1])
-    return found[np.argsort(away, kind="mergesort")]  # of equally near ones the first stays first
-
-
-@compiled
-def bounds(at: At) -> tuple[Array, Array]:
-    """A convex part of what is admitted, braking included, as half-spaces: normals (k, 2) and offsets (k,)."""
-    halt, wanted = backup(at), at.room + HAIR_M
-    around, area = reached(at.among, at.motion, halt[0], halt[1]), reachable(at.among, at.motion)
-    normals, offsets, count = np.zeros((2 * len(at.among.walls), 2)), np.zeros(2 * len(at.among.walls)), 0
-    index = closer(area, at.among.walls, wanted, 0)
-    while index >= 0:
-        wall = one_of(at.among.walls, index)
-        gap = gaps(around, wall)
-        corner = 0.0 < gap[0] < wanted and 0.0 < gap[1] < wanted
-        # At a corner both axes keep their share of the distance; else the one with more room keeps it all.
-        share = min(1.0, wanted / hypot(gap[0], gap[1])) if corner else 0.0
-        more = 1 if gap[1] > gap[0] else 0
-        for axis in range(2):
-            if not corner and axis != more:
-                continue
-            start, end, from_, to = wall[0], wall[1], around[0], around[1]
-            if axis == 1:
-                start, end, from_, to = wall[2], wall[3], around[2], around[3]
-            before = start - to >= from_ - end
-            sign = 1.0 if before else -1.0
-            limit = _stopped_at(at, axis, wall, before, share * gap[axis] if corner else wanted)
-            normals[count, axis] = sign
-            offsets[count] = max(sign * limit, sign * halt[axis])
-            count += 1
-        index = closer(area, at.among.walls, wanted, index + 1)
-    return normals[:count], offsets[:count]
-
-
 Scene = tuple[Array, Array, Array, Array, Array, Array]
 """What the functions below take first, as a plain tuple, which compiled code takes fastest.
 
@@ -325,8 +266,32 @@ def is_admitted(scene: Scene, motion: Array, left: float, control: Array) -> boo
 
 @compiled
 def candidates(scene: Scene, motion: Array, left: float, control: Array) -> Array:
-    """Admissible pairs near a refused control, the nearest first, shape (k, 2)."""
-    return near(_at(scene, motion, left), _pair(scene, control))
+    """Admissible pairs near a refused control, the nearest first: those that slide along walls in its way, (k, 2)."""
+    at, pair = _at(scene, motion, left), _pair(scene, control)
+    x_axis, y_axis = at.among.x_axis, at.among.y_axis
+    asked = max(x_axis.low, min(pair[0], x_axis.high)), max(y_axis.low, min(pair[1], y_axis.high))
+    turned, count = np.empty((0, 2)), 0
+    if _is_inside(at):
+        turned = _turned(at, asked)
+    found = np.empty((len(turned) + 2, 2))
+    for i in range(len(turned)):
+        one = turned[i, 0], turned[i, 1]
+        if admits(at, one, 0.0):
+            if at.among.clip_known:
+                one = _towards(at, one, asked)
+            found[count, 0], found[count, 1] = one
+            count += 1
+    if count == 0:  # where the path fits and no rectangle does
+        for first in range(2):
+            one = backup(at)
+            for axis in (first, 1 - first):
+                one = _towards(at, one, _replaced(one, axis, asked[axis]))
+            found[count, 0], found[count, 1] = one
+            count += 1
+    away = np.empty(count)
+    for i in range(count):
+        away[i] = hypot(found[i, 0] - asked[0], found[i, 1] - asked[1])
+    return found[np.argsort(away, kind="mergesort")]  # of equally near ones the first stays first
 
 
 @compiled
@@ -337,5 +302,30 @@ def backup_pair(scene: Scene, motion: Array, left: float) -> Pair:
 
 @compiled
 def half_spaces(scene: Scene, motion: Array, left: float) -> tuple[Array, Array]:
-    """Bounds on the pair: a convex part of what is admitted, shapes (k, 2) and (k,)."""
-    return bounds(_at(scene, motion, left))
+    """A convex part of what is admitted, braking included: normals of the pair (k, 2) and offsets (k,)."""
+    at = _at(scene, motion, left)
+    halt, wanted = backup(at), at.room + HAIR_M
+    around, area = reached(at.among, at.motion, halt[0], halt[1]), reachable(at.among, at.motion)
+    normals, offsets, count = np.zeros((2 * len(at.among.walls), 2)), np.zeros(2 * len(at.among.walls)), 0
+    index = closer(area, at.among.walls, wanted, 0)
+    while index >= 0:
+        wall = one_of(at.among.walls, index)
+        gap = gaps(around, wall)
+        corner = 0.0 < gap[0] < wanted and 0.0 < gap[1] < wanted
+        # At a corner both axes keep their share of the distance; else the one with more room keeps it all.
+        share = min(1.0, wanted / hypot(gap[0], gap[1])) if corner else 0.0
+        more = 1 if gap[1] > gap[0] else 0
+        for axis in range(2):
+            if not corner and axis != more:
+                continue
+            start, end, from_, to = wall[0], wall[1], around[0], around[1]
+            if axis == 1:
+                start, end, from_, to = wall[2], wall[3], around[2], around[3]
+            before = start - to >= from_ - end
+            sign = 1.0 if before else -1.0
+            limit = _stopped_at(at, axis, wall, before, share * gap[axis] if corner else wanted)
+            normals[count, axis] = sign
+            offsets[count] = max(sign * limit, sign * halt[axis])
+            count += 1
+        index = closer(area, at.among.walls, wanted, index + 1)
+    return normals[:count], offsets[:count]

@@ -51,7 +51,6 @@ def join(
     low: Array | float = -np.inf,
     high: Array | float = np.inf,
     accepts: Callable[[int], bool] | None = None,
-    hold_back: bool = True,
 ) -> Seam | None:
     """The shortest blend from what was sent into a new stream that keeps the rate limit.
 
@@ -72,12 +71,10 @@ def join(
         high: Likewise.
         accepts: Whether a blend of so many steps will do, 0 for none, asked from the shortest on of those that keep
             the rate limit and that the box does not cut. If none will do, the result is None.
-        hold_back: False leaves it to the caller to limit the rate of what no blend can.
     """
     step = np.asarray(rate_limit * control_dt)
-    held = step if hold_back else np.inf
     if not len(sent):
-        plan, limited = limit_rate(new, None, held)
+        plan, limited = limit_rate(new, None, step)
         return Seam(plan, 0, limited)
     fewest = min(fewest, len(new) - 1)
     uncut: NDArray[np.bool_] = np.ones(len(new), dtype=bool)
@@ -100,7 +97,7 @@ def join(
         return None
     steps = first + chosen
     plan = np.concatenate([candidates[chosen, :steps], new[steps:]])
-    plan, limited = limit_rate(plan, sent[-1], held)
+    plan, limited = limit_rate(plan, sent[-1], step)
     return Seam(plan, steps, limited)
 
 
@@ -121,16 +118,6 @@ def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tu
         limited[i] = (held != kept[i]).any()
         kept[i] = last = held
     return kept, limited
-
-
-def drawn_out(stream: Array, size: int) -> Array:
-    """A stream, shape (n, m), that goes on to `size` commands at a rate that falls evenly to zero."""
-    more = size - len(stream)
-    if more <= 0:
-        return stream
-    rate = backward_differences(stream, 2)[1]
-    i = np.arange(1.0, more + 1.0)[:, None]
-    return np.concatenate([stream, stream[-1] + rate * (i - i * (i + 1.0) / (2.0 * (more + 1.0)))])
 
 
 def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:

@@ -1,7 +1,4 @@
-"""Resonances of springs in a machine, and what share of a step's energy a gradual change of torque leaves in them.
-
-A change s(t) of the torque from 0 to 1 excites a resonance w as a step does, times |integral of s'(t) exp(-i w t)|;
-the energy that is left goes with the square, the **share**. The phase is w T, over the change's duration T.
+"""Resonances of springs in a machine.
 
 Source: appendix "Flexible joint dynamics and singular perturbations".
 """
@@ -11,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError
 
 
 class Modes(NamedTuple):
@@ -38,16 +34,3 @@ def modes(inertia: Array, stiffness: Array, damping: Array) -> Modes:
     own = np.einsum("ji,jk,ki->i", shapes, damping, shapes)
     ratios = np.divide(own, 2.0 * omega, out=np.zeros_like(own), where=~rigid)
     return Modes(omega, ratios, shapes)
-
-
-def shortest_smoothstep(share: float, resonance: float) -> float:
-    """Duration, s, from which on a smoothstep leaves at most a share in a resonance (rad/s) and any faster one.
-
-    The integral of s = 10 x^3 - 15 x^4 + 6 x^5, x = t / T, is 15 j2(k) / k^2, k = w T / 2, with the spherical Bessel
-    function j2, which stays below sqrt(1 + 3/k^2 + 9/k^4) / k.
-    """
-    if not 0.0 < share < 1.0:
-        raise ConfigurationError(f"a share of a step's energy is above 0 and below 1, got {share!r}")
-    # The bound falls all along: as a polynomial in k^2, at this share, it has one positive root.
-    squares = np.roots([share, 0.0, 0.0, -225.0, -675.0, -2025.0])
-    return float(2.0 * np.sqrt(squares.real[squares.imag == 0.0].max()) / resonance)

@@ -9,7 +9,6 @@ What is not finite raises `ConfigurationError`.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,22 +17,8 @@ from safe_wrappers.checks import Array, finite_arrays, float_array, positive
 from safe_wrappers.errors import ConfigurationError
 
 
-class Waves(NamedTuple):
-    """A pair of waves, shape (..., m), sqrt(W): u into the component, w out of it."""
-
-    u: Array
-    w: Array
-
-
-class EffortAndWave(NamedTuple):
-    """Effort F, N, and outgoing wave, sqrt(W), of a side whose flow is known; shape (..., m)."""
-
-    effort: Array
-    outgoing: Array
-
-
-def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
-    """The wave transform, `u = (F + b v) / sqrt(2 b)` and `w = (F - b v) / sqrt(2 b)` (equation 3).
+def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> tuple[Array, Array]:
+    """The wave transform, `u = (F + b v) / sqrt(2 b)` and `w = (F - b v) / sqrt(2 b)` (equation 3), sqrt(W).
 
     Their power `(|u|^2 - |w|^2) / 2` is `F.v`.
 
@@ -45,10 +30,10 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
     f, v = finite_arrays(effort=effort, flow=flow)
     b = positive("impedance", impedance, "N s/m")
     root = math.sqrt(2.0 * b)
-    return Waves(np.asarray((f + b * v) / root), np.asarray((f - b * v) / root))
+    return (f + b * v) / root, (f - b * v) / root
 
 
-def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> EffortAndWave:
+def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> tuple[Array, Array]:
     """The operator's side: effort F and outgoing wave u for a known flow and the incoming wave w.
 
     Args:
@@ -59,7 +44,7 @@ def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) 
     v, w = finite_arrays(flow=flow, incoming=incoming)
     b = positive("impedance", impedance, "N s/m")
     root = math.sqrt(2.0 * b)
-    return EffortAndWave(np.asarray(b * v + root * w), np.asarray(root * v + w))
+    return b * v + root * w, root * v + w
 
 
 class ChannelLedger:

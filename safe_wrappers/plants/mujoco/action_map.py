@@ -5,7 +5,7 @@ An env may count its actions in other units than its model's controls: the hands
 """
 
 import copy
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import gymnasium as gym
 import mujoco
@@ -112,21 +112,12 @@ class MappedRecorder(Recorder):
         return self._map.action(super().braking(data))
 
 
-class _Tried(NamedTuple):
-    """What a copy of an env did in so many steps, k."""
-
-    actions: Array  # shape (k, nu)
-    controls: Array  # that the env left in the data, shape (k, nu)
-    departure: float  # largest difference of its states from those of this control, held
-
-
-def find_action_map(env: gym.Env[Any, Any], source: Any, substeps: int, ranges_agree: bool) -> ActionMap:
+def find_action_map(env: gym.Env[Any, Any], source: Any, ranges_agree: bool) -> ActionMap:
     """The map by which an env makes controls of actions, found on a copy of it.
 
     Args:
         env: Its action space has one action per control. It and its random generator stay as they are.
         source: Has the unwrapped env's `.model` and `.data`.
-        substeps: Physics steps of one step of the env.
         ranges_agree: The action space is the control range, as far as there is one: then actions are controls where
             no copy can be stepped.
 
@@ -137,7 +128,7 @@ def find_action_map(env: gym.Env[Any, Any], source: Any, substeps: int, ranges_a
     assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
     box = space.low.astype(np.float64), space.high.astype(np.float64)
     try:
-        tried = _tried(env.unwrapped, source, space, substeps)
+        actions, controls = _tried(env.unwrapped, source, space)
     except Exception as error:
         if ranges_agree:
             return ActionMap(np.zeros(box[0].size), np.ones(box[0].size), *box)
@@ -145,13 +136,13 @@ def find_action_map(env: gym.Env[Any, Any], source: Any, substeps: int, ranges_a
             f"{name} rescales or limits actions in its own step, and no copy of it can be stepped to find out how "
             f"({type(error).__name__}: {error}). {_INSTEAD}"
         ) from error
-    guesses = [_ends_to_ends(source.model, box), _through_two(tried, box)]
-    errors = [np.abs(tried.controls - np.array([g.control(a) for a in tried.actions])) for g in guesses]
+    guesses = [_ends_to_ends(source.model, box), _through_two(actions, controls, box)]
+    errors = [np.abs(controls - g.control(actions)) for g in guesses]
     best = int(np.argmin([np.nan_to_num(error, nan=np.inf).max() for error in errors]))
-    worst, allowed = errors[best].max(axis=0), _ROUNDING * np.abs(tried.controls).max(axis=0)
+    worst, allowed = errors[best].max(axis=0), _ROUNDING * np.abs(controls).max(axis=0)
     if not (worst <= allowed).all():
         i = int(np.nanargmax(worst - allowed))
-        seen = tried.controls[:, i]
+        seen = controls[:, i]
         says = (
             f"in {_TRIALS} steps of random actions its controls were up to {worst[i]:.3g} away from that, at "
             f"actuator {source.model.actuator(i).name or i!r}, which had {seen.min():.3g} to {seen.max():.3g}"
@@ -159,12 +150,6 @@ def find_action_map(env: gym.Env[Any, Any], source: Any, substeps: int, ranges_a
         raise UnsupportedEnvError(
             f"{name} rescales or limits actions in its own step, and not by control = offset + scale * action: "
             f"{says}. The map may depend on its state. {_INSTEAD}"
-        )
-    if not tried.departure <= _ROUNDING:
-        raise UnsupportedEnvError(
-            f"{name} does not hold one control for {substeps} physics steps: its state was up to "
-            f"{tried.departure:.3g} away from that of the control that it leaves in its data (it may change the "
-            f"control, or the state, between or after its physics steps). {_INSTEAD}"
         )
     return guesses[best]
 
@@ -179,30 +164,30 @@ def _ends_to_ends(model: mujoco.MjModel, box: tuple[Array, Array]) -> ActionMap:
     return ActionMap(np.where(known, offset, 0.0), np.where(known, scale, 1.0), *box)
 
 
-def _through_two(tried: _Tried, box: tuple[Array, Array]) -> ActionMap:
+def _through_two(actions: Array, controls: Array, box: tuple[Array, Array]) -> ActionMap:
     """The map through the first two actions that were tried; see `_tried`."""
-    (first, second, *_), (at_first, at_second, *_) = tried.actions, tried.controls
+    (first, second, *_), (at_first, at_second, *_) = actions, controls
     with np.errstate(all="ignore"):
         scale = np.nan_to_num((at_second - at_first) / (second - first), posinf=0.0, neginf=0.0)
     return ActionMap(np.nan_to_num(at_first - scale * first), scale, *box)
 
 
-def _tried(raw: Any, source: Any, space: gym.spaces.Box, substeps: int) -> _Tried:
-    """Step a copy of an unwrapped env: by the middle of its actions, their upper end, and random ones."""
+def _tried(raw: Any, source: Any, space: gym.spaces.Box) -> tuple[Array, Array]:
+    """Step a copy of an unwrapped env: by the middle of its actions, their upper end, and random ones.
+
+    Returns the actions, and the controls that the env has left in its data, shapes (k, nu).
+    """
     twin: Any = EnvCopier(raw).copy()
     at = source.on(twin) if isinstance(source, Accessed) else twin
     space = copy.deepcopy(space)
     space.seed(0)
-    low, high = (
-        np.where(np.isfinite(space.low), space.low, -1.0),
-        np.where(np.isfinite(space.high), space.high, 1.0),
-    )
+    low = np.where(np.isfinite(space.low), space.low, -1.0)
+    high = np.where(np.isfinite(space.high), space.high, 1.0)
     actions = [(low + high) / 2.0, high, *(space.sample() for _ in range(_TRIALS))]
     twin.reset(seed=0)
-    probe, taken, controls, departure = mujoco.MjData(at.model), [], [], 0.0
+    taken, controls = [], []
     at.data.warning.number[RESETS] = 0
     for action in actions:
-        mujoco.mj_copyData(probe, at.model, at.data)
         twin.step(np.array(action, dtype=space.dtype))
         if at.data.warning.number[RESETS].any():  # MuJoCo has reset the state, and the control with it
             twin.reset()
@@ -210,11 +195,6 @@ def _tried(raw: Any, source: Any, space: gym.spaces.Box, substeps: int) -> _Trie
             continue
         taken.append(action)
         controls.append(at.data.ctrl.copy())
-        probe.ctrl[:] = at.data.ctrl
-        mujoco.mj_step(at.model, probe, nstep=substeps)
-        for held, found in ((probe.qpos, at.data.qpos), (probe.qvel, at.data.qvel)):
-            missed = np.abs(held - found) / (1.0 + np.abs(found))
-            departure = max(departure, float(np.nan_to_num(missed, nan=np.inf).max(initial=0.0)))
     if len(taken) < _FEWEST:
         raise RuntimeError(f"in {len(actions) - len(taken)} of {len(actions)} steps its simulation diverged")
-    return _Tried(np.array(taken, dtype=space.dtype).astype(np.float64), np.array(controls), departure)
+    return np.array(taken, dtype=space.dtype).astype(np.float64), np.array(controls)

@@ -41,7 +41,8 @@ class Accessed:
         return self._found("data", self._functions[1], mujoco.MjData)
 
     def _found(self, name: str, function: Callable[[Any], Any] | None, kind: type) -> Any:
-        found = getattr(self._raw, name, None) if function is None else function(self._raw)
+        found = getattr(self._raw, name, None) if function is None else function
+        found = found(self._raw) if callable(found) else found
         if not isinstance(found, kind):
             raise ConfigurationError(
                 f"MujocoPlant({name}=...) is a function of the unwrapped env that returns its "
@@ -49,24 +50,6 @@ class Accessed:
                 f"(what wraps MuJoCo's own often has it inside: env.physics.{name}.ptr, env.sim.{name}._{name})"
             )
         return found
-
-
-def given_and_functions(model: Any, data: Any) -> tuple[Any, tuple[Any, Any]]:
-    """A plant's arguments told apart: its own model, or None, and the functions that find the env's model and data.
-
-    Raises:
-        ConfigurationError: Neither.
-    """
-    own = model if isinstance(model, mujoco.MjModel) else None
-    if own is None and model is not None and not callable(model):
-        raise ConfigurationError(
-            f"model is a mujoco.MjModel or a function of the env that returns one, got {model!r}"
-        )
-    if data is not None and not callable(data):
-        raise ConfigurationError(
-            f"data is a function of the env that returns its mujoco.MjData, got {data!r}"
-        )
-    return own, (None if own is not None else model, data)
 
 
 def checked_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:

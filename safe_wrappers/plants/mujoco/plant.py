@@ -76,7 +76,8 @@ class MujocoPlant(Plant):
         control_dt: float | None = None,
         loop: ControlLoop | None = None,
     ) -> None:
-        self._given, self._functions = binding.given_and_functions(model, data)
+        self._given = model if isinstance(model, mujoco.MjModel) else None
+        self._functions: tuple[Any, Any] = (None if self._given is not None else model, data)
         if not isinstance(loop, ControlLoop | None):
             example = "sw.plants.ControlLoop(crossover=4.0, phase_margin_deg=60.0)"
             raise ConfigurationError(f"loop is a ControlLoop, such as {example}, or None; got {loop!r}")
@@ -161,7 +162,7 @@ class MujocoPlant(Plant):
         if are_controls and np.isfinite(self.lower).all():
             return
         binding.refuse_other_actions(env, self.lower, self.upper)
-        found = find_action_map(env, self._source, self.substeps, are_controls)
+        found = find_action_map(env, self._source, are_controls)
         if are_controls and found.is_identity:
             return
         self.action_map = found
