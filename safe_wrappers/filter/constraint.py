@@ -42,8 +42,8 @@ class HalfSpaces:
 class Constraint:
     """One safety requirement, as a specification: plain data, bound to no env.
 
-    A subclass is a dataclass that checks its fields. On a plant it becomes the `BoundConstraint` that is declared `of`
-    it, or what its own `bind` returns.
+    A subclass is a dataclass that checks its fields. On a plant it becomes the `BoundConstraint` that is declared
+    `of` it, or what its own `bind` returns.
 
     Attributes:
         promise: What holds for an executed control that is not flagged: "proved" or "best effort".
