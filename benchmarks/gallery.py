@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 import safe_wrappers as sw
 from benchmarks.cases import PROTECTED, Case
 from benchmarks.drivers import Maker
-from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, encode, font
+from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, Count, encode, font
 from benchmarks.tables import options
 from safe_wrappers.drawing.scene import find_renderer, set_size
 
@@ -89,15 +89,6 @@ SCENES = {
 }  # fmt: skip
 
 
-@dataclass
-class Count:
-    """What happened on one side while it was filmed."""
-
-    steps: int = 0
-    violations: int = 0
-    changed: int = 0
-
-
 class Judged(gym.Wrapper[Any, Any, Any, Any]):
     """Writes what the case's judge says of every step into info, in place of the task's own cost."""
 
@@ -147,10 +138,8 @@ class Side:
     def step(self) -> None:
         """One control step; a new episode where this one ends."""
         action = np.asarray(self._scene.strength * self._act(), dtype=self.env.action_space.dtype)
-        _, _, terminated, truncated, info = self.env.step(action)
-        self.count.steps += 1
-        self.count.violations += bool(info["cost_substep"])
-        self.count.changed += bool(info.get("cbf/intervened", False))
+        _, reward, terminated, truncated, info = self.env.step(action)
+        self.count.add(reward, info)
         if terminated or truncated:
             self.reset()
 
