@@ -16,7 +16,6 @@ from PIL import Image, ImageDraw
 
 import safe_wrappers as sw
 from benchmarks.cases import PROTECTED, Case
-from benchmarks.drivers import Maker
 from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, Count, encode, font
 from benchmarks.tables import options
 from safe_wrappers.drawing.scene import find_renderer, set_size
@@ -51,11 +50,6 @@ class Scene:
     strength: float = 1.0
     camera: dict[str, Any] = field(default_factory=dict)
     follows: str = ""
-
-    @property
-    def maker(self) -> Maker:
-        """Makes the driver."""
-        return PROTECTED[self.case].drivers[self.driver]
 
 
 _FIELD = {"distance": 4.3, "elevation": -68.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.3, 0.0])}
@@ -132,7 +126,8 @@ class Side:
     def reset(self) -> None:
         """Begin the next episode."""
         self.env.reset(seed=self._seed)
-        self._act = self._scene.maker(self.env.unwrapped, np.random.default_rng(self._seed))
+        driver = PROTECTED[self._scene.case].drivers[self._scene.driver]
+        self._act = driver(self.env.unwrapped, np.random.default_rng(self._seed))
         self._seed += 1
 
     def step(self) -> None:
