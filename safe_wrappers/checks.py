@@ -141,6 +141,14 @@ def finite_array(name: str, value: ArrayLike) -> Array:
     return array
 
 
+def one_number(name: str, value: Any) -> float:
+    """What a function of the user's returned, as a float, finite or not."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.size != 1:
+        raise ConfigurationError(f"{name} must return one number, got an array of shape {array.shape}")
+    return float(array.reshape(()))
+
+
 def finite_arrays(**values: ArrayLike) -> list[Array]:
     """The values as finite float64, broadcast together, in the given order."""
     arrays = [finite_array(name, value) for name, value in values.items()]

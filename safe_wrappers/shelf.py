@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers.constraints.clearance import Clearance
-from safe_wrappers.constraints.limits.speed_limit import SpeedLimit
+from safe_wrappers.constraints.limits.points import SpeedLimit
 from safe_wrappers.constraints.obstacles import Plane
 from safe_wrappers.constraints.predictive_shield import PredictiveShield
 from safe_wrappers.filter.constraint import Constraint

@@ -6,18 +6,15 @@ from safe_wrappers.constraints.backup.escape_clearance import EscapeClearance
 from safe_wrappers.constraints.backup.heading_drive_clearance import HeadingDriveClearance
 from safe_wrappers.constraints.backup.wall_clearance import WallClearance
 from safe_wrappers.constraints.barrier import Barrier
-from safe_wrappers.constraints.clearance import Clearance
-from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility
+from safe_wrappers.constraints.clearance import Clearance, TrackPermission
+from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility, SupportMargin
 from safe_wrappers.constraints.contact.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.contact.stance import Stance
-from safe_wrappers.constraints.contact.support_margin import SupportMargin
 from safe_wrappers.constraints.limits.joints import JointPositionLimit, JointSpeedLimit
+from safe_wrappers.constraints.limits.points import SpeedLimit, Workspace
 from safe_wrappers.constraints.limits.singularity_margin import SingularityMargin
-from safe_wrappers.constraints.limits.speed_limit import SpeedLimit
-from safe_wrappers.constraints.limits.workspace import Workspace
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
 from safe_wrappers.constraints.predictive_shield import PredictiveShield
-from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
 
 __all__ = [

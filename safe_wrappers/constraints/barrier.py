@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_wrappers.checks import Array, non_negative, positive
+from safe_wrappers.checks import Array, non_negative, one_number, positive
 from safe_wrappers.control.filtering import cbf
 from safe_wrappers.control.numerics.projection import keeps_rows
 from safe_wrappers.errors import ConfigurationError
@@ -71,13 +71,7 @@ class BoundBarrier(BoundConstraint):
         return np.array([self._now])
 
     def _height(self, x: Array) -> float:
-        value = self.spec.h(x)
-        if isinstance(value, float):  # np.float64 is one: the common case
-            return float(value)
-        h = np.asarray(value, dtype=np.float64)
-        if h.size != 1:
-            raise ConfigurationError(f"h must return one number, got an array of shape {h.shape}")
-        return float(h.reshape(()))
+        return one_number("h", self.spec.h(x))
 
     def rows(self) -> HalfSpaces:
         if self._row is None:

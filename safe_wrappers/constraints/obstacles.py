@@ -7,9 +7,16 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from safe_wrappers.checks import Array, non_negative, positive, settings_from
+from safe_wrappers.checks import Array, finite_array, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.tracks import Tracks
-from safe_wrappers.control.numerics.shapes import BLOCK, PLANE, ROUND, SURFACE_NUMBERS, nearest_points
+from safe_wrappers.control.numerics.shapes import (
+    BLOCK,
+    PLANE,
+    ROUND,
+    SURFACE_NUMBERS,
+    nearest_points,
+    surface_distances,
+)
 from safe_wrappers.drawing.marks import Mark, ball, block, pad, ring, spatial
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
@@ -49,15 +56,13 @@ def refuse_more_dimensions(obstacle: int, point: int, kind: str = "obstacles") -
 
 
 def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
-    try:
-        vector = [float(v) for v in values]
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} must be a list of numbers, got {values!r}") from None
-    if len(vector) not in sizes or not np.isfinite(vector).all():
+    vector = finite_array(name, values)
+    if vector.ndim != 1 or vector.size not in sizes:
         raise ConfigurationError(
             f"{name} must be {' or '.join(map(str, sizes))} finite numbers, got {values!r}"
         )
-    return vector
+    found: list[float] = vector.tolist()
+    return found
 
 
 class Plain(ABC):
@@ -74,11 +79,19 @@ class Plain(ABC):
         """Of the surfaces, m/s, shape (k, coordinates), or None: they stand still."""
         return None
 
-    def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """What is nearest of every surface."""
+    def _seen_from(self, coordinates: int, plant: Plant) -> Array:
         surfaces = self.surfaces(plant)
         if len(surfaces):
-            refuse_more_dimensions(int(surfaces[0, 1]), point.size)
+            refuse_more_dimensions(int(surfaces[0, 1]), coordinates)
+        return surfaces
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Signed distances of points of shape (k, d), shape (k, surfaces), m."""
+        return surface_distances(self._seen_from(points.shape[1], plant), points)
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """What is nearest of every surface."""
+        surfaces = self._seen_from(point.size, plant)
         distance, normal, curvature = nearest_points(surfaces, point)
         velocities, moving = self._velocities(plant), np.zeros_like(normal)
         if velocities is not None:
@@ -109,13 +122,6 @@ class _Round(Plain):
         found[:, 0], found[:, 1], found[:, 5] = ROUND, centers.shape[1], self.radius
         found[:, 2 : 2 + centers.shape[1]] = centers
         return found
-
-    def distances(self, points: Array, plant: Plant) -> Array:
-        centers = self.centers(plant)
-        d = centers.shape[1]
-        refuse_more_dimensions(d, points.shape[1])
-        offsets = points[:, None, :d] - centers
-        return np.asarray(np.sqrt(np.einsum("kni,kni->kn", offsets, offsets)) - self.radius)
 
 
 @dataclass
@@ -164,10 +170,6 @@ class Plane(Plain):
     def surfaces(self, plant: Plant) -> Array:
         return _surface(PLANE, self.point, self.normal)
 
-    def distances(self, points: Array, plant: Plant) -> Array:
-        offsets = points[:, : len(self.point)] - np.asarray(self.point)
-        return np.asarray((offsets @ np.asarray(self.normal))[:, None])
-
 
 @dataclass
 class Box(Plain):
@@ -184,12 +186,6 @@ class Box(Plain):
 
     def surfaces(self, plant: Plant) -> Array:
         return _surface(BLOCK, self.center, self.half_size)
-
-    def distances(self, points: Array, plant: Plant) -> Array:
-        offsets = points[:, : len(self.center)] - np.asarray(self.center)
-        beyond = np.abs(offsets) - np.asarray(self.half_size)
-        outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=1))
-        return np.asarray((outside + np.minimum(beyond.max(axis=1), 0.0))[:, None])
 
 
 @dataclass

@@ -4,14 +4,14 @@ import contextlib
 import functools
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, non_negative, whole_number
+from safe_wrappers.checks import Array, non_negative, one_number, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.plant import Plant
@@ -51,8 +51,7 @@ class PredictiveShield(Constraint):
         horizon: Steps that are simulated, the proposed action among them.
         backup: "zero" (not with discrete actions), "hold" (the action goes on), an action, a function of what it
             `sees` that returns one, anything with `predict(observation, deterministic=True)` such as an SB3 model; or
-            a list of these: any that survives admits. A list of numbers is one action, if there are as many as the
-            action has, or if they are not all whole.
+            a list of these: any that survives admits. An action is a whole number or an array.
         terminal: A function of what it `sees`: whether the state lies in a set that the backups never leave, with
             h >= margin. None: there is none.
         sees: Whether `h`, `terminal` and `backup` take the "observation", as the env inside the filter returns it,
@@ -87,20 +86,13 @@ class PredictiveShield(Constraint):
         self.candidates = whole_number("candidates", self.candidates, 0, "actions")
         self.margin = non_negative("margin", self.margin, "the unit of h")
         self.promise = "best effort" if self.terminal is None else "proved"
-        several = isinstance(self.backup, list | tuple) and not _is_action(self.backup)
-        backups = self.backup if several else [self.backup]
+        backups = self.backup if isinstance(self.backup, list | tuple) else [self.backup]
         if not backups:
             raise ConfigurationError("backup is a backup, or a list with at least one")
         self.backup = [_checked(one) for one in backups]
 
     def bind(self, plant: Plant) -> "BoundPredictiveShield":
         return BoundPredictiveShield(self, plant)
-
-
-def _is_action(backup: Sequence[Any]) -> bool:
-    """Whether a list is one action, of numbers that are not all whole. Whole ones may be discrete actions, too."""
-    numbers = all(isinstance(one, int | float | np.number) for one in backup)
-    return numbers and any(isinstance(one, float | np.floating) for one in backup)
 
 
 def _checked(backup: Any) -> Any:
@@ -171,10 +163,7 @@ class BoundPredictiveShield(BoundConstraint):
             raise ConfigurationError(
                 "a discrete action has no zero: give as backup the action that is safe, or hold, or a function"
             )
-        given = spec.backup
-        if len(given) == self.plant.lower.size and all(isinstance(one, int) for one in given):
-            given = [given]  # an action that is written in whole numbers
-        self._backups = [self._prepared(one) for one in given]
+        self._backups = [self._prepared(one) for one in spec.backup]
         self._needed = spec.margin + self.plant.margins(self._measure, spec.horizon)
         self._points = np.random.default_rng(0).random((spec.candidates, self.plant.lower.size))
 
@@ -206,10 +195,7 @@ class BoundPredictiveShield(BoundConstraint):
             if spec.h not in view.info:
                 raise ConfigurationError(f"the env reports no info[{spec.h!r}]; it has {sorted(view.info)}")
             return -float(view.info[spec.h])
-        h = np.asarray(spec.h(self._seen(view)), dtype=np.float64)
-        if h.size != 1:
-            raise ConfigurationError(f"h must return one number, got an array of shape {h.shape}")
-        return float(h.reshape(()))
+        return one_number("h", spec.h(self._seen(view)))
 
     def _seen(self, view: View) -> Any:
         return view if self.spec.sees == "view" else getattr(view, self.spec.sees)

@@ -2,23 +2,20 @@
 
 import warnings
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, non_negative, positive, whole_number
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
-from safe_wrappers.filter.linearize import Tangents, differences, linearize, tangent_rows
+from safe_wrappers.filter.linearize import Tangents, differences, linearize
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
-_STEP = 1e-4  # width of the differences about braking, as a share of the control's range
-_INSTANTS = (1, 2, 3, 5, 8, 13, 21, 34, 55)  # of a control interval that get rows, beside its last
-_KEPT = 10  # control steps for which a response is kept: a guess that forecasts check
-_SAME_RESPONSE = 1  # linearisations of one step that use the kept response
-_RESOLUTION = 1e-6  # rounding of controls, as a share of half their range, for which rows are tightened
 RECOVERY_S = 0.1  # time constant of recovery from a violation, s
+Recent = tuple[float, ...]
+"""What was left at the last states, the newest last, at most `horizon` of them."""
 
 
 class RolloutConstraint(Constraint):
@@ -37,9 +34,7 @@ class RolloutConstraint(Constraint):
 
     def _check_shared(self) -> None:
         self.margin = non_negative("margin", self.margin, self.unit)
-        whole = isinstance(self.horizon, float | np.floating) and float(self.horizon).is_integer()
-        horizon = int(self.horizon) if whole else self.horizon
-        self.horizon = whole_number("horizon", horizon, 1, "control intervals to look ahead")
+        self.horizon = whole_number("horizon", self.horizon, 1, "control intervals to look ahead")
         check_fields(self, positive, ("max_decrease",), self.unit)
 
 
@@ -67,15 +62,6 @@ class BoundSlacks(BoundConstraint):
         return linearize(self.slacks, control, self.plant.lower, self.plant.upper)
 
 
-class RolloutMemory(NamedTuple):
-    """What a rollout constraint remembers of an episode."""
-
-    # What was left at the last states, the newest last, at most `horizon` of them.
-    least: tuple[float, ...] = ()
-    # How what is left changes with a control, and the observation until which that is kept; None: not known.
-    response: tuple[Array, int] | None = None
-
-
 class BoundRollout(BoundSlacks):
     """A requirement `room >= margin` along a forecast of the held control, and then of braking.
 
@@ -88,7 +74,6 @@ class BoundRollout(BoundSlacks):
 
     spec: Any
     _value: Array
-    _response: tuple[Array, int] | None
 
     def __init__(self, spec: RolloutConstraint, plant: Plant) -> None:
         hint = "forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h) or Clearance(...)"
@@ -104,16 +89,14 @@ class BoundRollout(BoundSlacks):
         """What is left of the limit at the present state, shape (n,)."""
 
     def start(self) -> Memory:
-        return RolloutMemory()
+        return ()
 
-    def observe(self, memory: RolloutMemory) -> None:
+    def observe(self, memory: Recent) -> None:
         self._value = self.now()
         self._known: dict[bytes, Array] = {}
         self._tangents = Tangents(self.slacks, self._slopes)
-        self._linear: HalfSpaces | None = None
-        self._linearized = 0
         self._least = float(self._value.min(initial=np.inf))
-        self._recent, self._response = memory
+        self._recent = memory
         self._outside = self._violation(self._value)
         most, fallen = self.max_decrease, max(self._recent, default=-np.inf) - self._least
         if most is not None and fallen > most + self.tolerance:
@@ -127,8 +110,7 @@ class BoundRollout(BoundSlacks):
         self._far = most is not None and self._least - most >= self.spec.margin + self.tolerance
 
     def executed(self, control: Array) -> Memory:
-        recent = (*self._recent, self._least)[-self.spec.horizon :] if self.max_decrease is not None else ()
-        return RolloutMemory(recent, self._response)
+        return (*self._recent, self._least)[-self.spec.horizon :] if self.max_decrease is not None else ()
 
     def value(self) -> Array:
         return self._value
@@ -188,47 +170,13 @@ class BoundRollout(BoundSlacks):
         return self._far or super().admits(control)
 
     def linearize(self, control: Array) -> HalfSpaces:
-        if self.plant.has_acceleration:
-            return self._tangents.about(control)
-        self._linearized += 1
-        if self._linearized > _SAME_RESPONSE:
-            self._respond(control)
-        return self._instants(control)
+        return self._tangents.about(control)
 
     def rows(self) -> HalfSpaces:
-        """Where controls are displacements: the forecast linearised about braking, instant by instant; else none.
+        """Where controls are displacements: tangents about braking; else none.
 
         A refused displacement may press the machine against something, and then says little about others.
         """
         if self.plant.has_acceleration or self._far:
             return super().rows()
-        if self._linear is None:
-            braking = self.plant.braking()
-            if self._response is None or self.plant.observation_id >= self._response[1]:
-                self._respond(braking)
-            self._linear = self._instants(braking)
-        return self._linear
-
-    def _respond(self, control: Array) -> None:
-        """How what is left at every instant changes with a control, by differences, shape (instants, n, nu)."""
-        plant, horizon = self.plant, self.spec.horizon
-        room = self.room(plant.forecast(control, horizon))
-        step = np.where(control < 0.0, _STEP, -_STEP) * (plant.upper - plant.lower)
-        changed = [self.room(plant.forecast(control + part, horizon)) for part in np.diag(step)]
-        parts = [(other - room) / width for other, width in zip(changed, step, strict=True)]
-        self._response = np.stack(parts, axis=-1), plant.observation_id + _KEPT
-
-    def _instants(self, control: Array) -> HalfSpaces:
-        """A row for every bound that some control could break, at a few instants of a control's forecast."""
-        assert self._response is not None  # `rows` is asked first
-        plant, horizon = self.plant, self.spec.horizon
-        left = self.room(plant.forecast(control, horizon)) - self.spec.margin - self._outside
-        left[-1] += self._outside - self._closer()
-        each = len(left) // horizon
-        chosen = [i for i in range(len(left)) if i % each + 1 in (*_INSTANTS, each)]
-        left, response = left[chosen], self._response[0][chosen]
-        away = np.where(response > 0.0, plant.lower - control, plant.upper - control)
-        least = left + (response * away).sum(axis=-1)
-        near = ~(least > 0.0)
-        left -= _RESOLUTION * (np.abs(response) * (0.5 * (plant.upper - plant.lower))).sum(axis=-1)
-        return tangent_rows(left[near], control, response[near])
+        return self._tangents.about(self.plant.braking())

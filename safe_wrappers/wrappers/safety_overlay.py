@@ -7,8 +7,7 @@ from gymnasium.spaces import Box
 
 from safe_wrappers import info as keys
 from safe_wrappers.drawing.marks import Mark
-from safe_wrappers.drawing.scene import arrows, find_renderer, put
-from safe_wrappers.drawing.strip import Strip
+from safe_wrappers.drawing.scene import Strip, arrows, find_renderer, put
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.stack import Layer

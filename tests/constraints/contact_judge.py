@@ -51,11 +51,10 @@ class ConeJudge:
     Args:
         env: The filtered one.
         share: Of the friction.
-        bodies: Ids of those that count; None is all.
     """
 
-    def __init__(self, env, share, bodies=None):
-        self.raw, self.share, self.bodies = env.unwrapped, share, bodies
+    def __init__(self, env, share):
+        self.raw, self.share = env.unwrapped, share
         m = self.raw.model
         mass = sum(m.body_mass[b] for b in range(m.nbody) if moves(m, b))
         self.weight = mass * np.linalg.norm(m.opt.gravity)
@@ -70,11 +69,10 @@ class ConeJudge:
         return max((e for at in self.instants for e in self._excesses(at)), default=-np.inf), result
 
     def _excesses(self, contacts):
-        for body, _, normal, force, friction in contacts:
-            if self.bodies is None or body in self.bodies:
-                pressure = force @ normal
-                sideways = np.linalg.norm(force - pressure * normal)
-                yield max(sideways - self.share * friction * pressure, -pressure) / self.weight
+        for _, _, normal, force, friction in contacts:
+            pressure = force @ normal
+            sideways = np.linalg.norm(force - pressure * normal)
+            yield max(sideways - self.share * friction * pressure, -pressure) / self.weight
 
 
 def at_random(space, k, rng):

@@ -8,7 +8,7 @@ from contact_judge import DRIVERS, ConeJudge
 from judged_loops import Scene, flagged
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import weight_n
 
 ROUNDING = 1e-6
@@ -63,23 +63,12 @@ def test_in_the_air_nothing_is_missed_whatever_the_margin():
     assert limit.admits(control) and limit.slacks(control).tolist() == [0.0, 0.0]
 
 
-def test_only_the_named_bodies_count():
-    control = np.array([0.0, 0.3])  # 15 N on 11 N: only the second ball slides
-    for bodies, admitted in ((None, False), (["left"], True), (["right"], False), (("left", "right"), False)):
-        limit = settled(
-            pushed_balls(("left", "right")), sw.constraints.ContactFeasibility(0.7, 0.0, bodies), control, 40
-        )
-        assert limit.admits(control) is admitted
-        assert limit.slacks(control).size == (1 if bodies and len(bodies) == 1 else 2)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ({"friction_share": 0.0}, "friction_share"),
         ({"friction_share": "all"}, "friction_share"),
         ({"margin": np.nan}, "margin"),
-        ({"bodies": 3}, "list of names"),
     ],
 )
 def test_bad_arguments_are_refused_in_words(arguments, words):
@@ -91,16 +80,7 @@ def test_what_it_cannot_watch_is_refused_when_it_is_bound():
     def watched(env, **arguments):
         sw.constraints.ContactFeasibility(**arguments).bind(bound(env))
 
-    still = '<body name="block" pos="3 3 0"><geom type="box" size=".1 .1 .1"/></body>'
-    slick = '<body name="slick" pos="3 -3 1"><freejoint/><geom size=".1" contype="0" conaffinity="0"/></body>'
-    env = pushed_balls(more=still + slick)
-    watched(env)
-    with pytest.raises(UnknownNameError, match="no body 'foot'"):
-        watched(env, bodies=["left", "foot"])
-    with pytest.raises(ConfigurationError, match="'block' does not move"):
-        watched(env, bodies=["block"])
-    with pytest.raises(UnsupportedEnvError, match="'slick' cannot touch"):
-        watched(env, bodies=["left", "slick"])
+    watched(pushed_balls())
     with pytest.raises(UnsupportedEnvError, match="no body of this model"):
         watched(pushed_balls(condim=1))
     with pytest.raises(UnsupportedEnvError, match="no body of this model"):
@@ -128,9 +108,9 @@ def filtered(env_id, plant=None, **arguments):
     return sw.CBFActionFilter(gym.make(env_id), [sw.constraints.ContactFeasibility(**arguments)], plant=plant)
 
 
-def loop(env, driver, steps, share=0.7, tolerance=0.01, bodies=None, seed=1):
+def loop(env, driver, steps, share=0.7, tolerance=0.01, seed=1):
     """Counts of a closed loop: steps outside, flagged, unflagged ones outside, changed; and unflagged excesses."""
-    judge, rng = ConeJudge(env, share, bodies), np.random.default_rng(seed)
+    judge, rng = ConeJudge(env, share), np.random.default_rng(seed)
     seen = {"outside": 0, "flagged": 0, "unflagged": 0, "changed": 0, "worst": -np.inf}
     env.reset(seed=seed)
     for k in range(steps):

@@ -182,14 +182,13 @@ class Settable(gym.Env):
         return np.ravel(action).astype(float)[:2], 0.0, False, False, {}
 
 
-@pytest.mark.parametrize("backup", [[0, 0, 1.0], [0, 0, 1], (0.0, 0.0, 1.0), np.array([0, 0, 1])])
-def test_numbers_as_many_as_the_action_has_are_one_backup(backup):
+def test_an_array_is_one_backup():
     space = gym.spaces.Box(-1.0, 1.0, (3,), np.float64)
-    found = asked(shield(h=lambda o: 1.0, backup=backup, terminal=None), env=Settable(space))
+    found = asked(shield(h=lambda o: 1.0, backup=np.array([0, 0, 1]), terminal=None), env=Settable(space))
     np.testing.assert_array_equal(found.backup(), [0.0, 0.0, 1.0])
 
 
-def test_whole_numbers_are_several_actions_of_one_part():
+def test_whole_numbers_are_several_backups():
     several = shield(h=lambda o: 1.0 if o[0] == 1.0 else -1.0, backup=[0, 1], terminal=None)
     env = sw.ActionShield(Settable(gym.spaces.Discrete(3)), [several])
     env.reset(seed=0)

@@ -1,9 +1,7 @@
 """What constraints on a forecast share: what is asked of it, from inside and from outside, and when it is spared."""
 
 import warnings
-from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from asking import Asked, bound
@@ -12,8 +10,6 @@ from hypothesis import strategies as st
 from judged_loops import Judge, flagged, sliders
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutMemory
-from safe_wrappers.plants.mujoco.forecast import Recorder
 
 HOLD_S = 0.05
 LIMITS = {
@@ -160,112 +156,3 @@ def test_a_reading_that_is_no_number_runs_the_fallback(kind, max_decrease):
         info = filtered.step(np.array([1.0]))[4]
     assert info["cbf/fallback"] and info["cbf/unsafe"] and not info["cbf/refused"].any()
     np.testing.assert_array_equal(info["executed_action"], [0.0])
-
-
-# For how long a rollout constraint keeps the response of its forecasts, on a plant of one line of arithmetic
-
-
-INSTANTS = 8
-"""Of a control interval."""
-
-
-class Approaching(BoundRollout):
-    """What is left of a bound on the first control, which acts the more the later it is."""
-
-    def __init__(self, plant, margin=0.0, horizon=1):
-        self.spec, self.plant, self.max_decrease = (
-            SimpleNamespace(
-                margin=margin, horizon=horizon, look_ahead_below=None, euler_look_ahead=False, unit="m"
-            ),
-            plant,
-            None,
-        )
-
-    def room(self, forecast):
-        share = np.linspace(1.0 / INSTANTS, 1.0, INSTANTS)[:, None]
-        return self.plant.left - forecast[0] * self.plant.gain * share
-
-    def now(self):
-        return np.array([self.plant.left])
-
-
-def still_plant():
-    plant = SimpleNamespace(
-        has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1, observation_id=0
-    )
-    plant.left, plant.gain, plant.asked = 0.5, 1.0, []
-
-    def forecast(control, horizon, euler=False):
-        plant.asked.append(np.array(control))
-        return control
-
-    plant.braking, plant.forecast = lambda: np.zeros(2), forecast
-    return plant
-
-
-def test_a_response_is_kept_for_ten_control_steps():
-    plant = still_plant()
-    limit, memory, asked = Approaching(plant), RolloutMemory(), []
-    for plant.observation_id in range(1, 25):
-        limit.observe(memory)
-        plant.asked.clear()
-        limit.rows()
-        asked.append(len(plant.asked))
-        limit.rows()
-        assert len(plant.asked) == asked[-1]  # once per observation
-        memory = limit.executed(np.zeros(2))
-    # Of braking twice and one difference for each control, every tenth step; of braking alone between.
-    assert asked == [4, *[1] * 9, 4, *[1] * 9, 4, *[1] * 3]
-
-
-# What constraints that forecast do where controls are displacements: rows about braking, and what a search cost
-
-
-gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-
-pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.errors.UnsafeStateWarning")
-
-
-def protected(env_id, steps=1000):
-    env = sw.protect(gym.make(env_id, max_episode_steps=steps))
-    env.reset(seed=0)
-    return env
-
-
-def to_the_corner(env, way, steps=9):
-    for _ in range(steps):
-        env.step(np.array(way, np.float32))
-    env.filter.observe()
-
-
-def room(rows, control):
-    """What the rows say is left of a control."""
-    return float((rows.offsets - rows.normals @ control).min())
-
-
-@pytest.mark.parametrize("way", [[1.0, 0.3, 0.2, 0.0], [-0.8, -1.0, 0.5, 0.0], [0.2, 0.9, 0.4, 0.0]])
-def test_rows_foretell_forecasts(way):
-    env = protected("FetchReach-v4")
-    to_the_corner(env, way)
-    box = env.filter.bound[0]
-    rows = box.rows()
-    rng = np.random.default_rng(0)
-    broken = 0
-    for _ in range(12):
-        control = np.append(rng.uniform(-0.7, 0.7, 3), 0.0)
-        left = float(box.slacks(control).min())
-        # What no control of the action space could break has no row.
-        assert min(room(rows, control), 0.002) == pytest.approx(min(left, 0.002), abs=0.003)
-        broken += left < -0.005
-    assert broken >= 3
-
-
-def counted(monkeypatch):
-    calls, whole = [0], Recorder.record
-
-    def record(self, *arguments):
-        calls[0] += 1
-        return whole(self, *arguments)
-
-    monkeypatch.setattr(Recorder, "record", record)
-    return calls

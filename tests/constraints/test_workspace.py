@@ -162,7 +162,7 @@ FINGER = {"bodies": ["fingertip"]}
             ConfigurationError,
             r"low is \[x, y, z\] in m, None where there is no",
         ),
-        ({**FINGER, "high": [np.nan, 0.0, 0.0]}, ConfigurationError, r"high is \[x, y, z\] in m"),
+        ({**FINGER, "high": [np.nan, 0.0, 0.0]}, ConfigurationError, "high must be finite"),
         (
             {**FINGER, "low": [0.0] * 3, "margin": np.nan},
             ConfigurationError,

@@ -28,7 +28,7 @@ CONSTRAINTS = [
     of.Clearance(OBSTACLES[3:4], 24.0, sites=["tip"], geoms=["link0"]),
     of.Clearance([DISC], 2.0, position=[0, 1], velocity=[2, 3]),
     of.CoastingClearance([DISC], [of.Discs("vases", 0.1)], SQUARE, "car", "model", 0.01, 20, 0.1, 0.5, True),
-    of.ContactFeasibility(0.6, 0.02, ["torso"], 0.01),
+    of.ContactFeasibility(0.6, 0.02, 0.01),
     of.EscapeClearance("robot", [OBSTACLES[5], DISCS, OBSTACLES[3]], 0.2, 0.1, 2.0),
     of.HeadingDriveClearance([of.Discs("hazards", 0.2)], "robot", 0.004, 0.01, 0.1, True),
     of.ImpactSpeedLimit(["body1"], ["sideE"], 100.0, 1e4, 1.0, 4),

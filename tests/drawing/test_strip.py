@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers import info as keys
-from safe_wrappers.drawing import strip
-from safe_wrappers.drawing.strip import STATES, Strip, state_of
+from safe_wrappers.drawing import scene as strip
+from safe_wrappers.drawing.scene import STATES, Strip, state_of
 
 
 def colours(frame, name):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, finite_array, non_negative, positive, whole_number
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
 from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline, nearest_discs
@@ -21,7 +21,6 @@ from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.coasting import Coasting, Course
 
 _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
-_STILL = 1e-9  # states (m, rad, m/s, rad/s) and places of discs that differ by less are the same
 _WAY_OUT_M = 1e-3  # gain of clearance that is asked for where zero control leaves less than the margin
 _RECOVERED = 0.5  # share of the best gain of clearance that a control has to reach from inside an obstacle
 # Shares of the drive for the outer and the inner actuator of a detour, as they are tried.
@@ -80,16 +79,17 @@ class CoastingClearance(Constraint):
             setattr(self, name, found)
         if not (self.keep_out or self.untouched):
             raise ConfigurationError("give obstacles in keep_out (for the origin) or untouched (the outline)")
-        self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
+        self.outline = _checked_outline(self.outline)
+        if self.untouched and not self.outline:
+            raise ConfigurationError(
+                "untouched needs the machine's outline: [[x, y], ...] in its body's frame"
+            )
         if self.outline and not self.untouched and self.max_decrease is None:
             raise ConfigurationError(
                 "outline is kept out of untouched, and keep_out is for the body's origin alone: give the obstacles "
                 "that the outline must not meet in untouched, or leave outline out"
             )
-        if isinstance(self.horizon, bool) or self.horizon != int(self.horizon) or self.horizon < 2:
-            wanted = "horizon is a whole number of control intervals >= 2"
-            raise ConfigurationError(f"{wanted}, got {self.horizon!r}")
-        self.horizon = int(self.horizon)
+        self.horizon = whole_number("horizon", self.horizon, 2, "control intervals")
         check_fields(self, non_negative, ("margin",), "m")
         check_fields(self, positive, ("max_decrease",), "m")
         check_fields(self, non_negative, ("max_decrease_per_speed",), "m per m/s")
@@ -123,12 +123,6 @@ class BoundCoastingClearance(BoundDetourClearance):
         self._body = _Group(spec.untouched, self._corners)
         self.max_decrease = spec.max_decrease
         self._first_turns_left: bool | None = None
-        self._seen = np.zeros(0)
-        self._known: dict[bytes, _Outcome] = {}
-
-    def start(self) -> Detour:
-        self._seen = np.zeros(0)
-        return Detour()
 
     def clearance(self) -> Array:
         """On the way to rest without control, margin not taken off, m, shape (1,); minus infinity without rest.
@@ -145,14 +139,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         room = self.spec.margin + way
         self._least = min(group.keep(self.plant, here, room) for group in (self._origin, self._body))
         self._within = way
-        seen = np.zeros(0)
-        if self._origin.near or self._body.near:
-            discs = np.concatenate([self._origin.discs, self._body.discs])[:, :2].ravel()
-            seen = np.concatenate([self.coasting.state(), discs])
-        # Rollouts are kept while nothing moves.
-        still = seen.size and seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()
-        if not still:
-            self._seen, self._known = seen, {}
+        self._known: dict[bytes, _Outcome] = {}
         if self._origin.near or self._body.near:
             return np.array([min(self._least, self._after(self._still).least)])
         return np.array([self._least - rolls])
@@ -180,7 +167,7 @@ class BoundCoastingClearance(BoundDetourClearance):
                     f"max_decrease of {self._within:.3g} m; from now on every control is forecast",
                     stacklevel=2,
                 )
-                self.max_decrease, self._memory, self._seen = None, Detour(), np.zeros(0)
+                self.max_decrease, self._memory = None, Detour()
                 self.clearance()
                 outcome, _ = self._outcome(course)
             self._known[key] = outcome
@@ -320,19 +307,11 @@ class _Group:
         return np.asarray(self._close[self.now.argmin(), :2])
 
 
-def _checked_outline(given: Any, needed: bool) -> list[list[float]]:
-    if needed and not len(given):
-        raise ConfigurationError("untouched needs the machine's outline: [[x, y], ...] in its body's frame")
-    try:
-        points = np.array(given, dtype=np.float64).reshape(-1, 2)
-    except (TypeError, ValueError):
-        points = np.full((1, 2), np.nan)
-    if not np.isfinite(points).all():
+def _checked_outline(given: Any) -> list[list[float]]:
+    points = finite_array("outline", given)
+    if points.size and (points.ndim != 2 or points.shape[1] != 2):
         raise ConfigurationError(f"outline is a list of points [x, y] in m, got {given!r}")
-    try:
-        if len(points):
-            convex_outline(points)
-    except ValueError as error:
-        raise ConfigurationError(f"outline: {error}") from None
+    if points.size:
+        convex_outline(points)  # refuses points on one line
     found: list[list[float]] = points.tolist()
     return found

@@ -1,6 +1,5 @@
-"""ContactFeasibility: the ground's forces on the robot stay inside their friction cones."""
+"""ContactFeasibility and SupportMargin: what the forces of the ground on the robot have to keep."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
+from safe_wrappers.control.legged.support import support_distances
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
-from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
+from safe_wrappers.filter.constraint import Constraint, Memory
+from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
+from safe_wrappers.plants.mujoco.model import weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
@@ -32,7 +32,6 @@ class ContactFeasibility(Constraint):
         friction_share: Of the model's friction coefficient, in (0, 1]. MuJoCo's default cones are pyramids: above
             0.71 a foot may slide within its share.
         tolerance: By how much a force may miss its cone, as a share of the robot's weight: light touches scrape.
-        bodies: Names of the bodies whose contacts count; None is every moving body.
         margin: Kept free inside the cone, as a share of the weight. More than the tolerance refuses light touches.
 
     Source: appendix "Physical contact feasibility constraints".
@@ -40,14 +39,11 @@ class ContactFeasibility(Constraint):
 
     friction_share: float = 0.7
     tolerance: float = 0.01
-    bodies: Sequence[str] | None = None
     margin: float = 0.0
 
     def __post_init__(self) -> None:
         self.friction_share = checked_friction_share(self.friction_share)
         check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
-        if self.bodies is not None:
-            self.bodies = name_list("bodies", self.bodies, also="None for every body")
 
     def bind(self, plant: Plant) -> "BoundContactFeasibility":
         return BoundContactFeasibility(self, plant)
@@ -61,18 +57,7 @@ class BoundContactFeasibility(BoundSlacks):
 
     def __init__(self, spec: ContactFeasibility, plant: Plant) -> None:
         super().__init__(spec, require_contacts(plant, "ContactFeasibility"))
-        touching = touching_bodies(self.plant, "there is no cone to stay in")
-        self._chosen = np.flatnonzero(touching)
-        if self.spec.bodies is not None:
-            self._chosen = np.array([self._resting(name, touching) for name in self.spec.bodies])
-
-    def _resting(self, name: str, touching: NDArray[np.bool_]) -> int:
-        i = self.plant.named("body", name)
-        if fixed_bodies(self.plant.model)[i]:
-            raise ConfigurationError(f"the body {name!r} does not move, so the ground is part of it")
-        if not touching[i]:
-            raise UnsupportedEnvError(f"the body {name!r} cannot touch the fixed world with friction")
-        return i
+        self._chosen = np.flatnonzero(touching_bodies(self.plant, "there is no cone to stay in"))
 
     def insides(self, control: Array) -> Array:
         """By how much each body's contact forces stay inside the cone, at worst, shape (k,), shares of the weight.
@@ -121,3 +106,70 @@ def touching_bodies(plant: MujocoPlant, lacking: str) -> NDArray[np.bool_]:
     if not touching.any():
         raise UnsupportedEnvError(f"no body of this model can touch the fixed world with friction: {lacking}")
     return touching
+
+
+@dataclass
+class SupportMargin(Constraint):
+    """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
+
+    Without at least three contact points in one plane that are not on a line there is no polygon and no requirement.
+
+    Best effort: an executed control that is not flagged keeps the inset at every evaluation of the physics of its
+    control step at which there is a polygon, for a plant that is right. Such a control need not exist.
+
+    Args:
+        inset: m, positive: pushing forces alone keep the point inside the hull. An inset of millimetres can be
+            crossed between two evaluations.
+        margin: Kept free inside the inset, m.
+
+    Source: appendix "Physical contact feasibility constraints", third condition and footnote 8.
+    """
+
+    inset: float
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
+        self.margin = non_negative("margin", self.margin, "m")
+
+    def bind(self, plant: Plant) -> "BoundSupportMargin":
+        return BoundSupportMargin(self, plant)
+
+
+class BoundSupportMargin(BoundSlacks):
+    """SupportMargin on a plant."""
+
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_ZMP_MARGIN,)
+    spec: SupportMargin
+
+    def __init__(self, spec: SupportMargin, plant: Plant) -> None:
+        super().__init__(spec, require_contacts(plant, "SupportMargin"))
+
+    def observe(self, memory: Memory) -> None:
+        self._known: list[tuple[ContactForecast, list[float]]] = []
+
+    def _distances(self, found: ContactForecast) -> list[float]:
+        """Of a forecast, computed once."""
+        for other, distances in self._known:
+            if other is found:
+                return distances
+        of = found.step, found.point, found.normal, found.force
+        distances = [float(distance) for distance in support_distances(*of)]
+        self._known.append((found, distances))
+        return distances
+
+    def slacks(self, control: Array) -> Array:
+        """Distance to the edge minus inset and margin where it is least, shape (1,), m; 0 where there is none."""
+        found = self.plant.contact_forecast(control)
+        if not found.finite:
+            return np.array([np.nan])
+        left = (d - self.spec.inset - self.spec.margin for d in self._distances(found))
+        return np.array([min(left, default=0.0)])
+
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
+        """The info key `whole_body/zmp_margin`: forecast for the executed control."""
+        least = 0.0
+        if executed is not None:
+            found = self.plant.contact_forecast(executed)
+            least = min(self._distances(found), default=0.0) if found.finite else 0.0
+        return {keys.WHOLE_BODY_ZMP_MARGIN: least}

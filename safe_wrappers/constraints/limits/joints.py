@@ -2,15 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, name_list, positive
+from safe_wrappers.checks import Array, float_array, name_list, positive
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
-from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -181,10 +179,7 @@ class BoundJointPositionLimit(BoundRollout):
 def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
     if given is None:
         return None
-    try:
-        found = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        found = np.array(np.nan)
+    found = float_array(name, given)
     if found.ndim > 1 or not found.size or np.isnan(found).any():
         raise ConfigurationError(f"{name} is a position in rad or m, or one per joint; got {given!r}")
     listed: float | list[float] = found.tolist()
@@ -259,47 +254,12 @@ class BoundJointSpeedLimit(BoundRollout):
         """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""
         if not self.plant.has_acceleration:
             return super().rows()
-        bounds = self.plant.lower, self.plant.upper, self._bound
-        rows = _speed_rows(
-            self._dofs, self.plant.qvel, *self.plant.acceleration, *bounds, self.plant.control_dt
-        )
-        return HalfSpaces(*rows)
-
-    def load(self) -> None:
-        super().load()
-        if self.plant.has_acceleration:
-            self.rows()
-
-
-@compiled
-def _speed_rows(
-    dofs: NDArray[Any],
-    qvel: Array,
-    drift: Array,
-    effect: Array,
-    low: Array,
-    high: Array,
-    bound: Array,
-    control_dt: float,
-) -> tuple[Array, Array]:
-    """The rows of `BoundJointSpeedLimit`, `qacc = drift + effect @ u`: all upper ones, then all lower ones."""
-    near = np.zeros(len(dofs), np.bool_)
-    for i in range(len(dofs)):
-        dof, pushes = dofs[i], 0.0
-        for k in range(len(low)):
-            # No push, not NaN, where an actuator without effect is infinitely strong.
-            if effect[dof, k] != 0.0:
-                pushes += abs(effect[dof, k]) * max(abs(low[k]), abs(high[k]))
-        near[i] = abs(qvel[dof]) + control_dt * (abs(drift[dof]) + pushes) > bound[i]
-    count, row = 0, 0
-    for i in range(len(dofs)):
-        count += near[i]
-    normals, offsets = np.empty((2 * count, len(low))), np.empty(2 * count)
-    for i in range(len(dofs)):
-        if near[i]:
-            dof, room, rate = dofs[i], bound[i] / control_dt, qvel[dofs[i]] / control_dt
-            for k in range(len(low)):
-                normals[row, k], normals[count + row, k] = effect[dof, k], -effect[dof, k]
-            offsets[row], offsets[count + row] = room - rate - drift[dof], room + rate + drift[dof]
-            row += 1
-    return normals, offsets
+        plant, hold = self.plant, self.plant.control_dt
+        drift, effect = (of_dof[self._dofs] for of_dof in plant.acceleration)
+        speed, strongest = plant.qvel[self._dofs], np.maximum(np.abs(plant.lower), np.abs(plant.upper))
+        # No push, not NaN, where an actuator without effect is infinitely strong.
+        pushes = (np.abs(effect) * np.where(effect != 0.0, strongest, 0.0)).sum(axis=1)
+        near = np.abs(speed) + hold * (np.abs(drift) + pushes) > self._bound
+        drift, effect, room, rate = drift[near], effect[near], self._bound[near] / hold, speed[near] / hold
+        normals = np.concatenate([effect, -effect])
+        return HalfSpaces(normals, np.concatenate([room - rate - drift, room + rate + drift]))

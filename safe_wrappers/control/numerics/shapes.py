@@ -16,6 +16,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled, hypot
+from safe_wrappers.errors import ConfigurationError
 
 Rectangle = tuple[float, float, float, float]
 """x from, x to, y from, y to, m."""
@@ -78,7 +79,7 @@ def convex_outline(points: Array) -> Array:
     """Corners of the smallest convex outline around points (n, 2), m: counter-clockwise, shape (c, 2), none on edges.
 
     Raises:
-        ValueError: All points lie on one line.
+        ConfigurationError: All points lie on one line.
     """
     from scipy.spatial import ConvexHull, QhullError  # here: SciPy takes a while to import
 
@@ -86,7 +87,7 @@ def convex_outline(points: Array) -> Array:
         return np.asarray(points[ConvexHull(points).vertices], dtype=np.float64)
     except (QhullError, ValueError):
         wanted = "an outline needs three points that are not on one line"
-        raise ValueError(f"{wanted}, got {points.tolist()}") from None
+        raise ConfigurationError(f"{wanted}, got {points.tolist()}") from None
 
 
 @compiled
@@ -263,3 +264,12 @@ def nearest_points(surfaces: Array, point: Array) -> tuple[Array, Array, Array]:
                 normal[i, j] = 0.0
             normal[i, face] = -1.0 if point[face] < surfaces[i, 2 + face] else 1.0
     return distance, normal, curvature
+
+
+@compiled
+def surface_distances(surfaces: Array, points: Array) -> Array:
+    """Signed distances of points, shape (n, d), as of `nearest_points`, shape (n, k), m."""
+    found = np.empty((len(points), len(surfaces)))
+    for i in range(len(points)):
+        found[i] = nearest_points(surfaces, points[i])[0]
+    return found

@@ -85,10 +85,6 @@ class Coasting:
         """The present pose, as a course of one instant."""
         return _course(self._plant.qpos[self._pose][None], False)
 
-    def state(self) -> Array:
-        """The machine's present positions and velocities: m, rad, quaternions, m/s, rad/s."""
-        return np.concatenate([self._plant.qpos[self._qpos], self._plant.qvel[self._qvel]])
-
     def velocity(self) -> Array:
         """Of the body's origin along world x and y, m/s, shape (2,)."""
         velocity: Array = self._plant.qvel[self._motion[:2]]

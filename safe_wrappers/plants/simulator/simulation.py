@@ -153,7 +153,8 @@ def check_replay(simulation: Simulation, steps: int, limit_s: float, seed: int =
         ahead = checked.run(lambda other, actions=actions: stretch(other, actions))  # type: ignore[misc]
         behind = stretch(env, actions)
         for number, (simulated, real) in enumerate(zip(ahead, behind, strict=False), 1):
-            found = difference(simulated, real)
+            parts = (differing(*each) for each in zip(_PARTS, simulated, real, strict=True))
+            found = next((part for part in parts if part is not None), None)
             if found is not None:
                 raise UnsupportedEnvError(
                     f"the simulation of {name_of(env)} is not the env: at step {number} after its state was restored "
@@ -168,8 +169,8 @@ def check_replay(simulation: Simulation, steps: int, limit_s: float, seed: int =
     return made
 
 
+_PARTS = ("observation", "reward", "terminated", "truncated")
 Answer = tuple[Any, float, bool, bool]
-"""Observation, reward, terminated and truncated."""
 
 
 def stretch(env: Env, actions: list[Any]) -> list[Answer]:
@@ -181,13 +182,6 @@ def stretch(env: Env, actions: list[Any]) -> list[Answer]:
         if terminated or truncated:
             break
     return answers
-
-
-def difference(simulated: Answer, real: Answer) -> str | None:
-    """Where two answers differ, in words; None: nowhere."""
-    names = ("observation", "reward", "terminated", "truncated")
-    parts = (differing(*each) for each in zip(names, simulated, real, strict=True))
-    return next((part for part in parts if part is not None), None)
 
 
 def differing(name: str, one: Any, other: Any, tolerance: float = 0.0) -> str | None:
