@@ -118,17 +118,18 @@ def crossing_bang_bang(env: Any, rng: np.random.Generator) -> Driver:
 
 def into_traffic(env: Any, rng: np.random.Generator) -> Driver:
     """To the middle of a lane and into its traffic: rests, then full force along or across it, by turns."""
-    state: dict[str, Any] = {"left": 0, "lane": 0.0, "force": np.zeros(2), "turn": 0.0}
+
+    def draw() -> tuple[int, tuple[float, float, float, float]]:
+        (along, across), left = rng.choice([-1.0, 0.0, 1.0], 2), int(rng.integers(5, 40))
+        turn = float(rng.choice([-1.0, 0.0, 1.0]))
+        return left, (along, across, turn, float(rng.choice(env.lane_centres)))
+
+    current = held(draw)
 
     def act() -> Action:
-        if state["left"] == 0:
-            force = rng.choice([-1.0, 0.0, 1.0], 2)
-            state.update(left=int(rng.integers(5, 40)), force=force, turn=float(rng.choice([-1.0, 0.0, 1.0])))
-            state["lane"] = float(rng.choice(env.lane_centres))
-        state["left"] -= 1
-        back = state["lane"] - env.agent_position[1]
-        along, across = state["force"]
-        return np.clip([along, across if abs(back) < 1.0 else 2.0 * back, state["turn"]], -1.0, 1.0)
+        along, across, turn, lane = current()
+        back = lane - env.agent_position[1]
+        return np.clip([along, across if abs(back) < 1.0 else 2.0 * back, turn], -1.0, 1.0)
 
     return act
 

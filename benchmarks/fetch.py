@@ -11,7 +11,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import mujoco_drivers
-from benchmarks.drivers import Action, Driver, Maker
+from benchmarks.drivers import Action, Driver, Maker, held
 from safe_wrappers.recipes import RECIPES
 
 Array = np.ndarray
@@ -165,20 +165,18 @@ def seeking(points: Any, hold: int) -> Maker:
     def make(env: Any, rng: np.random.Generator) -> Driver:
         model: mujoco.MjModel = env.model
         data, site = mujoco.MjData(model), model.site("robot0:grip").id
-        state: dict[str, Any] = {"left": 0, "point": np.zeros(3), "fingers": 1.0}
+
+        def draw() -> tuple[int, Any]:
+            return int(rng.integers(hold // 2, hold + 1)), (points(env, rng), rng.choice([-1.0, 1.0]))
+
+        aim = held(draw)
 
         def act() -> Action:
-            if state["left"] == 0:
-                state.update(
-                    left=int(rng.integers(hold // 2, hold + 1)),
-                    point=np.asarray(points(env, rng)),
-                    fingers=float(rng.choice([-1.0, 1.0])),
-                )
-            state["left"] -= 1
+            point, fingers = aim()
             data.qpos[:] = env.data.qpos
             mujoco.mj_kinematics(model, data)
-            wanted = (state["point"] - data.site_xpos[site]) / DISPLACEMENT_M
-            return np.append(np.clip(wanted, -1.0, 1.0), state["fingers"])
+            wanted = (point - data.site_xpos[site]) / DISPLACEMENT_M
+            return np.append(np.clip(wanted, -1.0, 1.0), fingers)
 
         return act
 

@@ -16,8 +16,7 @@ from PIL import Image, ImageDraw
 
 import safe_wrappers as sw
 from benchmarks.cases import PROTECTED, Case
-from benchmarks.drivers import Maker
-from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, encode, font
+from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, Count, encode, font
 from benchmarks.tables import options
 from safe_wrappers.drawing.scene import find_renderer, set_size
 
@@ -52,11 +51,6 @@ class Scene:
     camera: dict[str, Any] = field(default_factory=dict)
     follows: str = ""
 
-    @property
-    def maker(self) -> Maker:
-        """Makes the driver."""
-        return PROTECTED[self.case].drivers[self.driver]
-
 
 _FIELD = {"distance": 4.3, "elevation": -68.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.3, 0.0])}
 _RUNNER = {"distance": 4.4, "elevation": -42.0, "azimuth": 90.0}
@@ -87,15 +81,6 @@ SCENES = {
         camera={"distance": 0.8, "elevation": -70.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.04, 0.0])},
     ),
 }  # fmt: skip
-
-
-@dataclass
-class Count:
-    """What happened on one side while it was filmed."""
-
-    steps: int = 0
-    violations: int = 0
-    changed: int = 0
 
 
 class Judged(gym.Wrapper[Any, Any, Any, Any]):
@@ -141,16 +126,15 @@ class Side:
     def reset(self) -> None:
         """Begin the next episode."""
         self.env.reset(seed=self._seed)
-        self._act = self._scene.maker(self.env.unwrapped, np.random.default_rng(self._seed))
+        driver = PROTECTED[self._scene.case].drivers[self._scene.driver]
+        self._act = driver(self.env.unwrapped, np.random.default_rng(self._seed))
         self._seed += 1
 
     def step(self) -> None:
         """One control step; a new episode where this one ends."""
         action = np.asarray(self._scene.strength * self._act(), dtype=self.env.action_space.dtype)
-        _, _, terminated, truncated, info = self.env.step(action)
-        self.count.steps += 1
-        self.count.violations += bool(info["cost_substep"])
-        self.count.changed += bool(info.get("cbf/intervened", False))
+        _, reward, terminated, truncated, info = self.env.step(action)
+        self.count.add(reward, info)
         if terminated or truncated:
             self.reset()
 

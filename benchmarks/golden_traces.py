@@ -17,7 +17,7 @@ the arithmetic; where they are others than recorded, nothing is compared, and it
 Behaviour is for changes of numerics, after which no bit stays: of each run the shares of changed, infeasible,
 fallback and unsafe steps, the violations by the env's judge, the mean correction and the return. A run behaves as
 before where each of them is within `TOLERANCES` (relative, absolute) plus the difference between the recorded runs
-of the same driver with other seeds, which is what chance alone changes. What is beyond is listed, with the totals.
+of the same driver with other seeds, which is what chance alone changes. What is beyond is listed.
 """
 
 import argparse
@@ -298,22 +298,6 @@ def misbehaviour(recorded: Mapping[str, Any], today: Mapping[str, Any]) -> list[
     return found
 
 
-def totals(recorded: Mapping[str, Any], today: Mapping[str, Any]) -> str:
-    """The means over all runs that both have, before and now."""
-    words = []
-    for figure in TOLERANCES:
-        both = [
-            (recorded[run]["behaviour"][figure], now["behaviour"][figure])
-            for run, now in today.items()
-            if run in recorded
-        ]
-        old, new = (
-            np.array([pair for pair in both if None not in pair], dtype=float).reshape(-1, 2).mean(axis=0)
-        )
-        words.append(f"{figure} {old:.5g} -> {new:.5g}")
-    return "means per step: " + ", ".join(words)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(prog="golden_traces", description=__doc__.splitlines()[0])
     parser.add_argument("--write", action="store_true", help="record instead of comparing")
@@ -357,7 +341,6 @@ def main() -> None:
         print(f"{len(today)} runs of {STEPS} steps recorded in {arguments.recorded}")
         return
     if arguments.behaviour:
-        print(totals(kept["runs"], today))
         found, equal = misbehaviour(kept["runs"], today), "behave as recorded, within the tolerance"
     else:
         found, equal = differences(kept["runs"], today), "are equal bit for bit"

@@ -63,7 +63,7 @@ class Count:
         self.steps += 1
         self.violations += info["cost_substep"] > 0
         self.changed += bool(info.get("cbf/intervened", False))
-        self.goals += bool(info["goal_met"])
+        self.goals += bool(info.get("goal_met", False))
         self.reward += float(reward)
 
 

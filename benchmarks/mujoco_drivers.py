@@ -74,13 +74,8 @@ def carrying(env: Any, rng: np.random.Generator) -> Driver:
     return act
 
 
-def balancing_gain(env: Any, effort: float = 1.0) -> np.ndarray:
-    """Of u = -gain @ (qpos, qvel), shape (nu, 2 nv), from differences of one held control step at rest.
-
-    Args:
-        env: With as many positions as speeds.
-        effort: Its price in the quadratic cost, where a state's is 1.
-    """
+def balancing_gain(env: Any) -> np.ndarray:
+    """Of u = -gain @ (qpos, qvel), shape (nu, 2 nv), from differences of one held control step at rest."""
     model: mujoco.MjModel = env.model
     data, n, nudge = mujoco.MjData(model), model.nv, 1e-5
 
@@ -93,7 +88,7 @@ def balancing_gain(env: Any, effort: float = 1.0) -> np.ndarray:
     steps = nudge * np.eye(2 * n + model.nu)
     slopes = np.array([(after(step) - after(-step)) / (2.0 * nudge) for step in steps]).T
     a, b = slopes[:, : 2 * n], slopes[:, 2 * n :]
-    cost = effort * np.eye(model.nu)
+    cost = np.eye(model.nu)
     value = solve_discrete_are(a, b, np.eye(2 * n), cost)
     return np.asarray(np.linalg.solve(cost + b.T @ value @ b, b.T @ value @ a))
 
