@@ -67,7 +67,7 @@ _MATTER = {
     "control/backup/drive_among_discs.py": "admits not; _to_disc not",
     "constraints/backup/coasting_clearance.py": "BoundCoastingClearance.admits not;"
     " BoundCoastingClearance._after min/max; BoundCoastingClearance.slack not",
-    "constraints/backup/escape_clearance.py": "BoundEscapeClearance.clearance not;"
+    "constraints/backup/point_clearance.py": "BoundEscapeClearance.clearance not;"
     " BoundEscapeClearance.backup min/max",
     "control/backup/point_decision.py": "backup not; _stopped_at not",
     "constraints/predictive_shield.py": "BoundPredictiveShield.plan not; BoundPredictiveShield._after not",

@@ -24,11 +24,6 @@ class StopBefore(sw.Constraint):
 
 
 class BoundStopBefore(BoundBackupClearance):
-    constants = 0
-
-    def read_constants(self):
-        self.constants += 1
-
     def clearance(self):
         return np.array([self._left(*self.plant.state)])
 

@@ -2,14 +2,13 @@
 
 import math
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.shapes import NUMBERS
 from safe_wrappers.filter.constraint import BoundConstraint, Memory
-from safe_wrappers.plants.plant import Plant
 
 
 class BoundBackupClearance(BoundConstraint):
@@ -19,18 +18,12 @@ class BoundBackupClearance(BoundConstraint):
     held control, and the manoeuvre after it, keep the clearance. So from a safe state the first control of the
     manoeuvre is always admitted, for any number of obstacles at once.
 
-    A subclass overrides `clearance`, `admits` and `backup`. It may override `read_constants`, `candidates` and
-    `rows`, and `slack` where it can measure it. The specification has a `margin`, m.
+    A subclass overrides `clearance`, `admits` and `backup`. It may override `candidates` and `rows`, and `slack`
+    where it can measure it. Constants of the model are read in `__init__`: a filter binds anew when the model has
+    changed. The specification has a `margin`, m.
     """
 
     predicts: bool = True
-
-    def __init__(self, spec: Any, plant: Plant) -> None:
-        super().__init__(spec, plant)
-        self.read_constants()
-
-    def read_constants(self) -> None:
-        """Read the constants of the plant's model; a filter binds anew when the model has changed."""
 
     @abstractmethod
     def clearance(self) -> Array:

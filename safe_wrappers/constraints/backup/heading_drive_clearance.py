@@ -77,9 +77,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance, of=HeadingDriveClearance)
         self._discs = np.zeros((0, 3))
         self.turns_first = self.frame.turn_index == 0
         super().__init__(spec, machine)
-
-    def read_constants(self) -> None:
-        """The drive, and the bodies at the corners of its uncertainty: each must keep what is needed."""
+        # The drive, and the bodies at the corners of its uncertainty: each must keep what is needed.
         self.drive = heading_drive(self.plant, self.spec.body, self.spec.uncertainty)
         self.models = np.array([self.drive, *self.drive.corners()], dtype=np.float64)
 
