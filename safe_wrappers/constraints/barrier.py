@@ -43,11 +43,8 @@ class Barrier(Constraint):
         self.alpha = positive("alpha", self.alpha, "1/s")
         self.margin = non_negative("margin", self.margin, "units of h")
 
-    def bind(self, plant: Plant) -> "BoundBarrier":
-        return BoundBarrier(self, plant)
 
-
-class BoundBarrier(BoundConstraint):
+class BoundBarrier(BoundConstraint, of=Barrier):
     """Barrier on a plant."""
 
     predicts: bool = True

@@ -75,11 +75,8 @@ class Clearance(Constraint):
             wanted = "position and velocity are up to three state indices each, in the same order"
             raise ConfigurationError(f"{wanted}; got {self.position} and {self.velocity}")
 
-    def bind(self, plant: Plant) -> "BoundClearance":
-        return BoundClearance(self, plant)
 
-
-class BoundClearance(BoundConstraint):
+class BoundClearance(BoundConstraint, of=Clearance):
     """Clearance on a plant."""
 
     spec: Clearance
@@ -177,11 +174,8 @@ class TrackPermission(Constraint):
         if self.tracks is not None:
             self.tracks = name_list("tracks", self.tracks, also="None for all")
 
-    def bind(self, plant: Plant) -> "BoundTrackPermission":
-        return BoundTrackPermission(self, plant)
 
-
-class BoundTrackPermission(BoundConstraint):
+class BoundTrackPermission(BoundConstraint, of=TrackPermission):
     """TrackPermission on a plant."""
 
     spec: TrackPermission

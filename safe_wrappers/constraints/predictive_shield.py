@@ -91,9 +91,6 @@ class PredictiveShield(Constraint):
             raise ConfigurationError("backup is a backup, or a list with at least one")
         self.backup = [_checked(one) for one in backups]
 
-    def bind(self, plant: Plant) -> "BoundPredictiveShield":
-        return BoundPredictiveShield(self, plant)
-
 
 def _checked(backup: Any) -> Any:
     """A backup; of a model its `predict`, which is not copied with the constraint; of an array a list."""
@@ -132,7 +129,7 @@ class Plan(NamedTuple):
     backup: int
 
 
-class BoundPredictiveShield(BoundConstraint):
+class BoundPredictiveShield(BoundConstraint, of=PredictiveShield):
     """PredictiveShield on a plant that simulates."""
 
     predicts = True

@@ -73,9 +73,6 @@ class Traction(Constraint):
         if self.margin >= self.max_slip:
             raise ConfigurationError(f"margin must be below max_slip = {self.max_slip}, got {self.margin}")
 
-    def bind(self, plant: Plant) -> "BoundTraction":
-        return BoundTraction(self, plant)
-
 
 @dataclass
 class TractionMemory:
@@ -96,7 +93,7 @@ class TractionMemory:
     present: Array  # of the ground at its end, N
 
 
-class BoundTraction(BoundConstraint):
+class BoundTraction(BoundConstraint, of=Traction):
     """Traction on a plant."""
 
     info_keys: tuple[str, ...] = (keys.SLIP_RATIO, keys.SLIP_MU_ESTIMATE)

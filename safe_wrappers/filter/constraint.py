@@ -39,10 +39,11 @@ class HalfSpaces:
         return HalfSpaces(np.zeros((0, controls)), np.zeros(0))
 
 
-class Constraint(ABC):
+class Constraint:
     """One safety requirement, as a specification: plain data, bound to no env.
 
-    A subclass is a dataclass that checks its fields and says in `bind` which `BoundConstraint` it becomes.
+    A subclass is a dataclass that checks its fields. On a plant it becomes the `BoundConstraint` that is declared
+    `of` it, or what its own `bind` returns.
 
     Attributes:
         promise: What holds for an executed control that is not flagged: "proved" or "best effort".
@@ -58,7 +59,8 @@ class Constraint(ABC):
     state_error = 0.0
     """Bound on the error of what is measured, in the same unit."""
 
-    @abstractmethod
+    _becomes: ClassVar[type["BoundConstraint"]]
+
     def bind(self, plant: Plant) -> "BoundConstraint":
         """The constraint on a plant that is bound to its env.
 
@@ -66,6 +68,7 @@ class Constraint(ABC):
             UnsupportedEnvError: The plant does not have what the constraint needs.
             ConfigurationError: Names or numbers that do not fit the plant.
         """
+        return self._becomes(self, plant)
 
     def widened(self, margin: float) -> Self:
         """A copy whose margin is wider by this much, in the unit of its margin."""
@@ -88,6 +91,8 @@ class BoundConstraint:
     A constraint that says its requirement as rows overrides `rows` alone. One that predicts a held control sets
     `predicts` and overrides `slack`, or `admits`; its rows are then a guess.
 
+    `class BoundThis(BoundConstraint, of=This)` is what `This.bind` returns.
+
     Args:
         spec: The specification.
         plant: Bound to its env.
@@ -104,8 +109,10 @@ class BoundConstraint:
     info_keys: tuple[str, ...] = ()
     """The keys that `info` writes."""
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, of: type[Constraint] | None = None, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        if of is not None:
+            of._becomes = cls
         cls.has_value = cls.value is not BoundConstraint.value
         cls.has_backup = cls.backup is not BoundConstraint.backup
 

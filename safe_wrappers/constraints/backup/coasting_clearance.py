@@ -94,11 +94,8 @@ class CoastingClearance(Constraint):
         check_fields(self, positive, ("max_decrease",), "m")
         check_fields(self, non_negative, ("max_decrease_per_speed",), "m per m/s")
 
-    def bind(self, plant: Plant) -> "BoundCoastingClearance":
-        return BoundCoastingClearance(self, plant)
 
-
-class BoundCoastingClearance(BoundDetourClearance):
+class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
     """CoastingClearance on a plant."""
 
     detour_steps = 25

@@ -81,11 +81,8 @@ class EscapeClearance(Constraint):
             if isinstance(obstacle, Plane) and len(obstacle.point) > 2:
                 raise ConfigurationError(f"obstacles are seen from above: give {obstacle!r} x and y alone")
 
-    def bind(self, plant: Plant) -> "BoundEscapeClearance":
-        return BoundEscapeClearance(self, plant)
 
-
-class BoundEscapeClearance(BoundBackupClearance):
+class BoundEscapeClearance(BoundBackupClearance, of=EscapeClearance):
     """EscapeClearance on a plant."""
 
     tolerance: float = 1e-9

@@ -61,11 +61,8 @@ class HeadingDriveClearance(Constraint):
         if self.uncertainty >= 1.0:
             raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
 
-    def bind(self, plant: Plant) -> "BoundHeadingDriveClearance":
-        return BoundHeadingDriveClearance(self, plant)
 
-
-class BoundHeadingDriveClearance(BoundDetourClearance):
+class BoundHeadingDriveClearance(BoundDetourClearance, of=HeadingDriveClearance):
     """HeadingDriveClearance on a plant: the rules are in `control/backup/drive_among_discs.py`."""
 
     detour_steps = 50

@@ -53,11 +53,8 @@ class WallClearance(Constraint):
         self.margin = non_negative("margin", self.margin, "m")
         check_fields(self, positive, ("velocity_clip",), "m/s")
 
-    def bind(self, plant: Plant) -> "BoundWallClearance":
-        return BoundWallClearance(self, plant)
 
-
-class BoundWallClearance(BoundBackupClearance):
+class BoundWallClearance(BoundBackupClearance, of=WallClearance):
     """WallClearance on a plant: the rules are in `control/backup/point_decision.py`."""
 
     spec: WallClearance

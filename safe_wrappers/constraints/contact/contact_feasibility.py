@@ -45,11 +45,8 @@ class ContactFeasibility(Constraint):
         self.friction_share = checked_friction_share(self.friction_share)
         check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
 
-    def bind(self, plant: Plant) -> "BoundContactFeasibility":
-        return BoundContactFeasibility(self, plant)
 
-
-class BoundContactFeasibility(BoundSlacks):
+class BoundContactFeasibility(BoundSlacks, of=ContactFeasibility):
     """ContactFeasibility on a plant."""
 
     info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONE_MARGIN,)
@@ -132,11 +129,8 @@ class SupportMargin(Constraint):
         self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
         self.margin = non_negative("margin", self.margin, "m")
 
-    def bind(self, plant: Plant) -> "BoundSupportMargin":
-        return BoundSupportMargin(self, plant)
 
-
-class BoundSupportMargin(BoundSlacks):
+class BoundSupportMargin(BoundSlacks, of=SupportMargin):
     """SupportMargin on a plant."""
 
     info_keys: tuple[str, ...] = (keys.WHOLE_BODY_ZMP_MARGIN,)

@@ -60,9 +60,6 @@ class ImpactSpeedLimit(RolloutConstraint):
             nothing = f"the margin {self.margin} N leaves nothing"
             raise ConfigurationError(f"{nothing} of the limit {self.force_limit} N")
 
-    def bind(self, plant: Plant) -> "BoundImpactSpeedLimit":
-        return BoundImpactSpeedLimit(self, plant)
-
 
 class Contact(NamedTuple):
     """Contacts, now or at the present speed, each field a number or shape (...)."""
@@ -89,7 +86,7 @@ class Contact(NamedTuple):
         return np.asarray(square / (2.0 * limit) - 0.5 * limit * share**2)
 
 
-class BoundImpactSpeedLimit(BoundRollout):
+class BoundImpactSpeedLimit(BoundRollout, of=ImpactSpeedLimit):
     """ImpactSpeedLimit on a plant."""
 
     spec: ImpactSpeedLimit

@@ -57,11 +57,8 @@ class Stance(Constraint):
         if self.joint_tolerance is not None:
             self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
 
-    def bind(self, plant: Plant) -> "BoundStance":
-        return BoundStance(self, plant)
 
-
-class BoundStance(BoundConstraint):
+class BoundStance(BoundConstraint, of=Stance):
     """Stance on a plant."""
 
     predicts: bool = True

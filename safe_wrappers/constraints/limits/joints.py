@@ -130,11 +130,8 @@ class JointPositionLimit(RolloutConstraint):
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
 
-    def bind(self, plant: Plant) -> "BoundJointPositionLimit":
-        return BoundJointPositionLimit(self, plant)
 
-
-class BoundJointPositionLimit(BoundRollout):
+class BoundJointPositionLimit(BoundRollout, of=JointPositionLimit):
     """JointPositionLimit on a plant."""
 
     spec: JointPositionLimit
@@ -221,11 +218,8 @@ class JointSpeedLimit(RolloutConstraint):
         if min(checked) <= self.margin:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
 
-    def bind(self, plant: Plant) -> "BoundJointSpeedLimit":
-        return BoundJointSpeedLimit(self, plant)
 
-
-class BoundJointSpeedLimit(BoundRollout):
+class BoundJointSpeedLimit(BoundRollout, of=JointSpeedLimit):
     """JointSpeedLimit on a plant."""
 
     spec: JointSpeedLimit

@@ -75,9 +75,6 @@ class SpeedLimit(RolloutConstraint):
         if self.average not in ("step", "substep"):
             raise UnknownNameError(f"no average {self.average!r}; choose step or substep")
 
-    def bind(self, plant: Plant) -> "BoundSpeedLimit":
-        return BoundSpeedLimit(self, plant)
-
 
 class SpeedMemory(NamedTuple):
     """The memory of every rollout, and the point at the last control step, m (None: there was none)."""
@@ -86,7 +83,7 @@ class SpeedMemory(NamedTuple):
     here: Array | None = None
 
 
-class BoundSpeedLimit(BoundRollout):
+class BoundSpeedLimit(BoundRollout, of=SpeedLimit):
     """SpeedLimit on a plant."""
 
     spec: SpeedLimit
@@ -210,11 +207,8 @@ class Workspace(RolloutConstraint):
                 f"and a margin of {self.margin} m on each side"
             )
 
-    def bind(self, plant: Plant) -> "BoundWorkspace":
-        return BoundWorkspace(self, plant)
 
-
-class BoundWorkspace(BoundRollout):
+class BoundWorkspace(BoundRollout, of=Workspace):
     """Workspace on a plant."""
 
     spec: Workspace

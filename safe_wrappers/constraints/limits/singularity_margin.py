@@ -92,11 +92,8 @@ class SingularityMargin(RolloutConstraint):
             raise ConfigurationError(f'directions is some of "xyz", each once; got {given!r}')
         self._rows = ["xyz".index(direction) for direction in given]
 
-    def bind(self, plant: Plant) -> "BoundSingularityMargin":
-        return BoundSingularityMargin(self, plant)
 
-
-class BoundSingularityMargin(BoundRollout):
+class BoundSingularityMargin(BoundRollout, of=SingularityMargin):
     """SingularityMargin on a plant."""
 
     spec: SingularityMargin
