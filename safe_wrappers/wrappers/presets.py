@@ -6,8 +6,7 @@ from typing import Any
 import mujoco
 
 from safe_wrappers.checks import non_negative
-from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility, SupportMargin
-from safe_wrappers.constraints.contact.stance import Stance
+from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility, Stance, SupportMargin
 from safe_wrappers.constraints.limits.joints import JointPositionLimit, refuse_uncovered_stops, stops
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError

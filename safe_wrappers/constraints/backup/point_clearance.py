@@ -177,9 +177,6 @@ class EscapeClearance(Constraint):
         self.obstacles = obstacles_from(self.obstacles, kinds=(TrackedDiscs, Discs, Disc, Plane))
         check_fields(self, non_negative, ("radius", "margin"), "m")
         self.horizon_s = positive("horizon_s", self.horizon_s, "s")
-        if self.horizon_s <= max(_GOING_S):
-            longest = f"the manoeuvres, which go for {max(_GOING_S):g} s before they brake"
-            raise ConfigurationError(f"horizon_s must be longer than {longest}; got {self.horizon_s:g}")
         for obstacle in self.obstacles:
             if isinstance(obstacle, Plane) and len(obstacle.point) > 2:
                 raise ConfigurationError(f"obstacles are seen from above: give {obstacle!r} x and y alone")

@@ -1,21 +1,34 @@
-"""ContactFeasibility and SupportMargin: what the forces of the ground on the robot have to keep."""
+"""ContactFeasibility, SupportMargin and Stance: what the forces between ground and robot have to keep."""
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
+from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.constraints.rollout import BoundSlacks
+from safe_wrappers.control.contact.friction_cone import cone_excess
+from safe_wrappers.control.legged import whole_body
 from safe_wrappers.control.legged.support import support_distances
+from safe_wrappers.control.legged.whole_body import WholeBodySolution, WholeBodyStatus
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem, predicted_position_rows
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Constraint, Memory
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
+from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
-from safe_wrappers.plants.mujoco.model import weight_n
+from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.floating_base import equations_of_motion
+
+_EDGES = 8  # of the pyramids inside the friction cones
+_SETTLE_S = 0.05  # time constant in which what still moves at a contact is to come to rest, s
+_SAME = 1e-9  # distance from the program's answer that is rounding, control units
 
 
 @dataclass
@@ -167,3 +180,144 @@ class BoundSupportMargin(BoundSlacks, of=SupportMargin):
             found = self.plant.contact_forecast(executed)
             least = min(self._distances(found), default=0.0) if found.finite else 0.0
         return {keys.WHOLE_BODY_ZMP_MARGIN: least}
+
+
+@dataclass
+class Stance(Constraint):
+    """Keep to torques under which standing feet could stay: the whole-body program at one instant.
+
+    Contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; the others
+    open. A control is admitted if forces inside the narrowed friction cones can hold them.
+
+    Best effort: at this instant, for rigid contacts and a plant that is right, such forces exist. Changes within the
+    control step are not in it (`ContactFeasibility` forecasts them).
+
+    Args:
+        friction_share: Of the model's friction coefficient, in (0, 1].
+        cone: "pyramid" is conservative and quick, "exact" is the cone itself.
+        joint_tolerance: How far driven joints may press their stops, rad or m; None leaves them alone.
+
+    Source: appendix "Hierarchical whole-body control quadratic program".
+    """
+
+    friction_share: float = 0.7
+    cone: Literal["pyramid", "exact"] = "pyramid"
+    joint_tolerance: float | None = 0.1
+
+    def __post_init__(self) -> None:
+        self.friction_share = checked_friction_share(self.friction_share)
+        if self.cone not in ("pyramid", "exact"):
+            raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
+        if self.joint_tolerance is not None:
+            self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
+
+
+class BoundStance(BoundConstraint, of=Stance):
+    """Stance on a plant."""
+
+    predicts: bool = True
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONE_MARGIN,)
+    spec: Stance
+    plant: MujocoPlant
+
+    def __init__(self, spec: Stance, plant: Plant) -> None:
+        hint = "Stance reads inertia and contacts from a MujocoPlant whose controls are forces"
+        super().__init__(spec, require_mujoco(plant, hint))
+        if not plant.has_acceleration:
+            raise UnsupportedEnvError(hint)
+        refuse_mapped(self.plant.action_map, "Stance")
+        touching_bodies(self.plant, "there is nothing to stand on")
+        if self.spec.joint_tolerance is not None:
+            refuse_uncovered_stops(self.plant.model)
+        joints, low, high = stops(self.plant.model)
+        wider = self.spec.joint_tolerance or 0.0
+        self._low, self._high = low - wider, high + wider
+        self._qpos, self._dofs = self.plant.model.jnt_qposadr[joints], self.plant.model.jnt_dofadr[joints]
+
+    def observe(self, memory: Memory) -> None:
+        self._known = False
+        self._problem: WholeBodyProblem | None = None
+        self._answer: WholeBodySolution | None = None
+
+    def problem(self, control: Array) -> WholeBodyProblem | None:
+        """The observed state's program; the first control, shape (m,), says which contacts open. None: not finite."""
+        if not self._known:
+            self._known, self._problem = True, self._write_down(control)
+        return self._problem
+
+    def _write_down(self, control: Array) -> WholeBodyProblem | None:
+        data = self.plant.under(control)
+        motion = equations_of_motion(self.plant.model, data, self.plant.actuators)
+        found = motion.contacts
+        # Beyond this MuJoCo resets the state in its step.
+        within = bool((np.abs(self.plant.state) < mujoco.mjMAXVAL).all())
+        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
+            return None  # nothing can be said
+        ground = fixed_bodies(self.plant.model)[found.pushed_by]
+        # What the robot's bodies do to each other, and other things to it, stays as it is.
+        bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
+        jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
+        pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
+        acceleration = -(jacobians @ self.plant.qvel) / _SETTLE_S
+        limits: dict[str, Any] = {}
+        if self.spec.joint_tolerance is not None:
+            position, speed = self.plant.qpos[self._qpos], self.plant.qvel[self._dofs]
+            joints = self._dofs, position, speed, self._low, self._high
+            limits["acceleration_rows"], limits["acceleration_limits"] = predicted_position_rows(
+                *joints, self.plant.control_dt, self.plant.model.nv
+            )
+        limits |= {"contact_acceleration": acceleration, "breaking": ~pressing}
+        limits["first_tangents"] = found.first_tangents[ground]
+        contacts = jacobians, drift, normals, self.spec.friction_share * found.friction[ground]
+        controls = self.plant.lower, self.plant.upper, control
+        problem = WholeBodyProblem(motion.inertia, bias, motion.actuation, *contacts, *controls, **limits)
+        # Two points of one rigid foot cannot come to rest each as it likes.
+        attainable = whole_body.attainable_contact_acceleration(problem)
+        return replace(problem, contact_acceleration=attainable)
+
+    def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
+        exact = self.spec.cone == "exact"
+        return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, _EDGES)
+
+    def admits(self, control: Array) -> bool:
+        """Whether the standing contacts could answer this control with forces inside their cones."""
+        # An action space of another precision than the model's range may be a rounding wider.
+        control = np.clip(control, self.plant.lower, self.plant.upper)
+        problem = self.problem(control)
+        if problem is None:
+            return False
+        answer = self._answer or self._ask(problem, control)
+        if np.array_equal(control, self._asked):
+            return answer.status is WholeBodyStatus.INACTIVE
+        if answer.status is WholeBodyStatus.INFEASIBLE:
+            return False  # whatever the control
+        if float(np.abs(control - answer.control).max()) <= _SAME:
+            return answer.status is not WholeBodyStatus.FAILED
+        return self.solve(replace(problem, nominal=control)).status is WholeBodyStatus.INACTIVE
+
+    def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
+        self._asked, self._answer = proposed.copy(), self.solve(replace(problem, nominal=proposed))
+        return self._answer
+
+    def candidates(self, proposed: Array) -> Iterator[Array]:
+        """The program's answer; where there is none, the proposed control, which is refused."""
+        proposed = np.clip(proposed, self.plant.lower, self.plant.upper)
+        problem = self.problem(proposed)
+        if problem is not None:  # another constraint may have refused before this one was asked
+            yield (self._answer or self._ask(problem, proposed)).control
+
+    def slack(self, control: Array) -> float:
+        """What the forces that would hold the contacts leave of their cones, shares of the weight."""
+        control = np.clip(control, self.plant.lower, self.plant.upper)
+        problem = self.problem(control)
+        if problem is None:
+            return -np.inf
+        forces, _ = whole_body.rigid_forces(problem, control)
+        missed = cone_excess(forces, problem.normals, problem.friction)
+        return -float(missed.max()) / weight_n(self.plant.model) if len(forces) else 0.0
+
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
+        """The info key `whole_body/cone_margin`: of the forces that would hold the contacts."""
+        if executed is None or self._problem is None:
+            return {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
+        return {keys.WHOLE_BODY_CONE_MARGIN: 0.0 + self.slack(executed)}
