@@ -21,7 +21,7 @@ LIMITS = {
     ],
     "HalfCheetah-v5": [
         sw.constraints.SpeedLimit(0.5, "torso", "+x"),
-        sw.constraints.Workspace(low=[None, None, -0.2], bodies=["torso"], horizon=3),
+        sw.constraints.Workspace(low=[None, None, 0.5], bodies=["torso"], horizon=3),
         sw.constraints.JointSpeedLimit(12.0),
     ],
 }
