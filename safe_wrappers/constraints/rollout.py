@@ -56,6 +56,7 @@ class BoundSlacks(BoundConstraint):
 
     def load(self) -> None:
         if self.value().size:
+            self.rows()
             self.slacks(np.clip(0.0, self.plant.lower, self.plant.upper))
 
     def linearize(self, control: Array) -> HalfSpaces:

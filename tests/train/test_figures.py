@@ -37,7 +37,7 @@ def test_which_constraint_refused_and_how_much():
     log = steps(refused=refused, constraint_names=names, intervened=sizes > 0, correction=sizes)
     said = refusals({"safe": log}).reading
     assert said.startswith(
-        "“safe”: of 200 actions refused by Clearance<2> 20 %, JointSpeedLimit 10 %. Never acted: Upr"
+        "“safe”: of 200 actions refused by Clearance<2> 20 %, JointSpeedLimit 10 %. Never acted: Work"
     )
     assert (
         f"Half of its 50 corrections were below {np.median(sizes[:50]):.3g}, the largest {sizes[:50].max():.3g}"
