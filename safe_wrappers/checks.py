@@ -143,6 +143,8 @@ def finite_array(name: str, value: ArrayLike) -> Array:
 
 def one_number(name: str, value: Any) -> float:
     """What a function of the user's returned, as a float, finite or not."""
+    if isinstance(value, float):  # np.float64 is one: the common case
+        return float(value)
     array = np.asarray(value, dtype=np.float64)
     if array.size != 1:
         raise ConfigurationError(f"{name} must return one number, got an array of shape {array.shape}")

@@ -2,7 +2,7 @@
 
 import warnings
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
 RECOVERY_S = 0.1  # time constant of recovery from a violation, s
-Recent = tuple[float, ...]
-"""What was left at the last states, the newest last, at most `horizon` of them."""
+_KEPT = 10
+"""Control steps for which slopes are kept where controls are displacements; forecasts check what follows."""
 
 
 class RolloutConstraint(Constraint):
@@ -63,6 +63,16 @@ class BoundSlacks(BoundConstraint):
         return linearize(self.slacks, control, self.plant.lower, self.plant.upper)
 
 
+class RolloutMemory(NamedTuple):
+    """What a rollout constraint remembers of an episode."""
+
+    recent: tuple[
+        float, ...
+    ] = ()  # what was left at the last states, the newest last, at most `horizon` of them
+    slopes: Array | None = None  # of the slacks
+    until: int = 0  # the observation until which they are kept
+
+
 class BoundRollout(BoundSlacks):
     """A requirement `room >= margin` along a forecast of the held control, and then of braking.
 
@@ -90,28 +100,33 @@ class BoundRollout(BoundSlacks):
         """What is left of the limit at the present state, shape (n,)."""
 
     def start(self) -> Memory:
-        return ()
+        return RolloutMemory()
 
-    def observe(self, memory: Recent) -> None:
+    def observe(self, memory: RolloutMemory) -> None:
         self._value = self.now()
         self._known: dict[bytes, Array] = {}
-        self._tangents = Tangents(self.slacks, self._slopes)
         self._least = float(self._value.min(initial=np.inf))
-        self._recent = memory
+        self._memory = memory
         self._outside = self._violation(self._value)
-        most, fallen = self.max_decrease, max(self._recent, default=-np.inf) - self._least
+        keeps = self.plant.observation_id < memory.until and not self._outside.any()
+        self._tangents = Tangents(self.slacks, self._slopes, memory.slopes if keeps else None)
+        most, fallen = self.max_decrease, max(memory.recent, default=-np.inf) - self._least
         if most is not None and fallen > most + self.tolerance:
             warnings.warn(
                 f"{type(self.spec).__name__}: what is left of the limit fell by {fallen:.3g} {self.spec.unit} within "
-                f"{len(self._recent)} control steps, farther than the declared max_decrease of {most:g}; from now on "
-                "every control is forecast",
+                f"{len(memory.recent)} control steps, farther than the declared max_decrease of {most:g}; from now "
+                "on every control is forecast",
                 stacklevel=2,
             )
             self.max_decrease = most = None
         self._far = most is not None and self._least - most >= self.spec.margin + self.tolerance
 
     def executed(self, control: Array) -> Memory:
-        return (*self._recent, self._least)[-self.spec.horizon :] if self.max_decrease is not None else ()
+        recent, slopes, until = self._memory
+        recent = (*recent, self._least)[-self.spec.horizon :] if self.max_decrease is not None else ()
+        if self._tangents.made and not (self.plant.has_acceleration or self._outside.any()):
+            slopes, until = self._tangents.slopes, self.plant.observation_id + _KEPT
+        return RolloutMemory(recent, slopes, until)
 
     def value(self) -> Array:
         return self._value

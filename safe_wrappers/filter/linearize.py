@@ -61,35 +61,45 @@ class Tangents:
     Args:
         slacks: Of a control.
         slopes: How the first of them change with it, shape (k or less, m), by differences.
+        kept: Slopes of a control step before, to begin with.
+
+    Attributes:
+        slopes: The latest; None before the first tangents.
+        made: How often they were made by differences.
     """
 
-    def __init__(self, slacks: Slacks, slopes: Slacks) -> None:
+    def __init__(self, slacks: Slacks, slopes: Slacks, kept: Array | None = None) -> None:
         self._of, self._by_differences = slacks, slopes
         self._control: Array | None = None
-        self._secants = self._made = 0
+        self.slopes = kept
+        self._secants = self.made = 0
 
     def about(self, control: Array) -> HalfSpaces:
         """The tangents about a refused control; no rows: there were enough."""
-        slacks, known, corrected = self._of(control), self._control, None
-        if known is not None and self._secants < _SECANTS:
-            corrected = self._corrected(control - known, slacks)
-        if corrected is None:
+        slacks, known = self._of(control), self._control
+        slopes = self.slopes
+        if slopes is not None and known is not None:
+            corrects = self._secants < _SECANTS
+            slopes = self._corrected(slopes, control - known, slacks) if corrects else None
+        guessed = slopes is not None
+        if slopes is None:
             stuck = known is not None and not self._secants and np.array_equal(control, known)
-            if stuck or self._made == _DIFFERENCES:
+            if stuck or self.made == _DIFFERENCES:
                 return HalfSpaces.none(control.size)
-            self._made, self._secants, self._slopes = self._made + 1, 0, self._by_differences(control)
+            slopes = self._by_differences(control)
+            self.made, self._secants = self.made + 1, 0
         else:
-            self._secants, self._slopes = self._secants + 1, corrected
-        self._control, self._slacks = control, slacks[: len(self._slopes)]
-        if corrected is None:
-            return tangent_rows(self._slacks, control, self._slopes)
-        return replace(tangent_rows(self._slacks, control, self._slopes, _AGAIN), provisional=True)
+            self._secants += known is not None
+        self.slopes, self._control, self._slacks = slopes, control, slacks[: len(slopes)]
+        if not guessed:
+            return tangent_rows(self._slacks, control, slopes)
+        return replace(tangent_rows(self._slacks, control, slopes, _AGAIN), provisional=True)
 
-    def _corrected(self, step: Array, slacks: Array) -> Array | None:
+    def _corrected(self, slopes: Array, step: Array, slacks: Array) -> Array | None:
         """The slopes after a secant update; None: it cannot be made, or they are not those of what is violated."""
-        k = len(self._slopes)
-        unexplained = slacks[:k] - self._slacks - self._slopes @ step
+        k = len(slopes)
+        unexplained = slacks[:k] - self._slacks - slopes @ step
         square = float(step @ step)
         if not (square > 0.0 and np.isfinite(unexplained).all() and slacks[:k].min() < 0.0):
             return None
-        return np.asarray(self._slopes + np.outer(unexplained, step / square))
+        return np.asarray(slopes + np.outer(unexplained, step / square))

@@ -16,7 +16,7 @@ from safe_wrappers.checks import (
     true_or_false,
 )
 from safe_wrappers.constraints.obstacles import distances, obstacle_marks, obstacles_from
-from safe_wrappers.constraints.rollout import BoundRollout, Recent, RolloutConstraint
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.drawing.marks import Mark, ball, edges, pad
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory
@@ -79,7 +79,7 @@ class SpeedLimit(RolloutConstraint):
 class SpeedMemory(NamedTuple):
     """The memory of every rollout, and the point at the last control step, m (None: there was none)."""
 
-    recent: Recent
+    rollout: RolloutMemory
     here: Array | None = None
 
 
@@ -105,7 +105,7 @@ class BoundSpeedLimit(BoundRollout, of=SpeedLimit):
 
     def observe(self, memory: Memory) -> None:
         self._before = memory.here
-        super().observe(memory.recent)
+        super().observe(memory.rollout)
 
     def executed(self, control: Array) -> Memory:
         return SpeedMemory(super().executed(control), self._here)
