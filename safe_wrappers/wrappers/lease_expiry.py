@@ -32,8 +32,8 @@ class LeaseExpiry(CommandGate):
 
     **What it guarantees.** If braking, acceleration, delays and bounds are what they are declared to be and the
     clearance does not shrink by itself, the machine stops inside it whenever commands stop coming, whatever the
-    commands did. While leases last the commands pass bit for bit. **What it does not.** It does not check what a
-    fresh command does; `CBFActionFilter` belongs inside. Close to an obstacle no command gets a lease.
+    commands did. While leases last, commands in the action space pass bit for bit. **What it does not.** It does not
+    check what a fresh command does; `CBFActionFilter` belongs inside. Close to an obstacle no command gets a lease.
 
     Args:
         env: With a one-dimensional Box action space.

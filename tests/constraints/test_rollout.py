@@ -1,6 +1,7 @@
 """What constraints on a forecast share: what is asked of it, from inside and from outside, and when it is spared."""
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from judged_loops import Judge, flagged, sliders
 
 import safe_wrappers as sw
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutMemory
 
 HOLD_S = 0.05
 LIMITS = {
@@ -156,3 +158,44 @@ def test_a_reading_that_is_no_number_runs_the_fallback(kind, max_decrease):
         info = filtered.step(np.array([1.0]))[4]
     assert info["cbf/fallback"] and info["cbf/unsafe"] and not info["cbf/refused"].any()
     np.testing.assert_array_equal(info["executed_action"], [0.0])
+
+
+# Where controls are displacements: how long slopes are kept ----------------------------------------------------
+
+
+class Approaching(BoundRollout):
+    """What is left of a bound on the first control, on a plant of one line of arithmetic."""
+
+    def __init__(self, left):
+        self.spec = SimpleNamespace(
+            margin=0.0, horizon=1, look_ahead_below=None, euler_look_ahead=False, unit="m"
+        )
+        self.left, self.max_decrease, self.sketches = left, None, 0
+        self.plant = SimpleNamespace(
+            has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1,
+            braking=lambda: np.zeros(2), forecast=lambda control, *_: control, sketch=self._sketch,
+        )  # fmt: skip
+
+    def _sketch(self, control, horizon):
+        self.sketches += 1
+        return control
+
+    def room(self, forecast):
+        return self.left - forecast[0] * np.linspace(0.1, 1.0, 8)[:, None]
+
+    def now(self):
+        return np.array([self.left])
+
+
+@pytest.mark.parametrize(("left", "often"), [(0.5, 10), (-0.1, 1)])
+def test_slopes_are_kept_for_ten_control_steps_and_from_outside_for_none(left, often):
+    limit, memory, made = Approaching(left), RolloutMemory(), []
+    for limit.plant.observation_id in range(1, 25):
+        limit.observe(memory)
+        limit.sketches = 0
+        for _ in range(2):  # once per observation
+            limit.rows()
+        made.append(limit.sketches)
+        memory = limit.executed(np.zeros(2))
+    # Of braking and of one difference for each control.
+    assert made == [3 * (k % often == 0) for k in range(24)]

@@ -178,6 +178,21 @@ class Relative(Machine):
         return self.observed(), 0.0, False, False, {}
 
 
+class Ramp(Machine):
+    def act(self, control):
+        before = self.data.ctrl.copy()
+        for part in range(1, 5):
+            self.data.ctrl[:] = before + (control - before) * part / 4
+            mujoco.mj_step(self.model, self.data)
+
+
+def test_a_control_that_is_not_held_is_a_mismatch_at_every_step():
+    env = sw.CBFActionFilter(Ramp(), [sw.constraints.JointSpeedLimit(50.0)])
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="from its forecast"):
+        assert all(env.step(action)[4]["cbf/mismatch"] for action in ([0.5, 0.5], [-0.5, 0.0]))
+
+
 class Squared(Machine):
     def act(self, control):
         super().act(np.sign(control) * control**2)

@@ -352,6 +352,9 @@ def test_commands_pass_bit_for_bit_while_leases_last(dtype):
             assert env.env.sent.tobytes() == before and env.env.sent.dtype == given_as
     assert env.step([0.5, 0.25])[4]["lease/braking"] is False
     assert env.env.sent.tolist() == [0.5, 0.25]
+    with pytest.warns(UserWarning, match="left the action space by 6; it is clipped"):
+        info = env.step([7.0, 0.25])[4]
+    assert env.env.sent.tolist() == [1.0, 0.25] and info["action/clipped"] == 6.0
 
 
 @pytest.mark.parametrize("huge", [1e300, -1e300, 1.7e308])
