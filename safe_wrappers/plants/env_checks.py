@@ -55,7 +55,9 @@ def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
             )
 
 
-def check_timing(env: gym.Env[Any, Any], control_dt: float | None) -> float:
+def check_timing(
+    env: gym.Env[Any, Any], control_dt: float | None, remedy: str = "pass control_dt, in seconds"
+) -> float:
     """How long one action is held, s: the env's `dt`, or `control_dt` where the env has none; both must agree."""
     try:
         dt = float(env.get_wrapper_attr("dt"))
@@ -67,7 +69,7 @@ def check_timing(env: gym.Env[Any, Any], control_dt: float | None) -> float:
         hold = positive("the env's dt", dt, "s")
     else:
         raise ConfigurationError(
-            f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass control_dt, in seconds"
+            f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): {remedy}"
         )
     if dt is not None and not np.isclose(dt, hold, rtol=1e-6):
         raise ConfigurationError(

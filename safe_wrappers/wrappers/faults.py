@@ -71,7 +71,8 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
-        self.control_dt = 0.0 if self._inside is not None else check_timing(env, None)
+        remedy = "give it one, in seconds, such as env.unwrapped.dt = 0.05"
+        self.control_dt = 0.0 if self._inside is not None else check_timing(env, None, remedy)
         self._passes_numbers = not any(
             getattr(inner, "layer", None) in _DECIDING for inner in wrappers_of(env)
         )
