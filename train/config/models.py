@@ -274,7 +274,7 @@ class ArmConfig(Section):
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Torch's. May be changed later."""
     trackers: list[Literal["wandb", "mlflow"]] = Field(default_factory=list)
-    """[Where curves and films go](cli.md#where-everything-lies) beside TensorBoard. May be changed later."""
+    """[Where curves go](cli.md#where-everything-lies) beside TensorBoard. May be changed later."""
 
     def fingerprint(self) -> dict[str, Any]:
         """What a run folder must agree on to be continued: all that changes what is learned."""
