@@ -66,14 +66,14 @@ def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[
 
 
 class Plain(ABC):
-    """Planes, balls, cylinders and blocks: `control/numerics/surfaces.py` knows what is nearest."""
+    """Planes, balls, cylinders and blocks: `control/numerics/shapes.py` knows what is nearest."""
 
     still: ClassVar[bool] = True
     """Whether `surfaces` is always the same, and nothing moves."""
 
     @abstractmethod
     def surfaces(self, plant: Plant) -> Array:
-        """As in `control/numerics/surfaces.py`, shape (k, 8)."""
+        """As in `control/numerics/shapes.py`, shape (k, 8)."""
 
     def _velocities(self, plant: Plant) -> Array | None:
         """Of the surfaces, m/s, shape (k, coordinates), or None: they stand still."""

@@ -72,7 +72,7 @@ class BoundDetourClearance(BoundBackupClearance):
 
     @abstractmethod
     def nearest(self, neighbours: int) -> Array:
-        """The nearest discs in the machine's frame: see `control/numerics/planar.py`."""
+        """The nearest discs in the machine's frame: see `control/numerics/shapes.py`."""
 
     def feature_count(self, neighbours: int) -> int:
         return 2 + NUMBERS * neighbours

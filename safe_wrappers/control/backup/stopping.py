@@ -178,7 +178,7 @@ def approach_rows(
 def approach_rows_of(
     surfaces: Array, point: Array, velocity: Array, drift: Array, effect: Array, machine: Machine
 ) -> tuple[Array, Array, Array]:
-    """`approach_rows` of surfaces that stand still, as in `control/numerics/surfaces.py`, shape (k, 8)."""
+    """`approach_rows` of surfaces that stand still, as in `control/numerics/shapes.py`, shape (k, 8)."""
     distance, normal, curvature = nearest_points(surfaces, point)
     still = np.zeros(normal.shape)
     return approach_rows(distance, normal, still, curvature, velocity, drift, effect, machine)
