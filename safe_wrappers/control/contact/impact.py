@@ -10,7 +10,7 @@ relate force to speed; they do not certify a contact as safe.
 A brake that acts later does not reduce it (`braked_deflection`), so protection needs clearance before contact.
 
 Arguments are numbers or arrays that broadcast; speeds of approach that are negative count as at rest. What is not
-finite, or not positive where it must be, raises `ConfigurationError`.
+finite, or not positive where it must be, raises `ConfigurationError`; the force of `speed_limit` is taken as it is.
 """
 
 from typing import NamedTuple

@@ -26,7 +26,7 @@ def manipulability(jacobian: ArrayLike) -> Array:
     """`w = sqrt(det(J J'))`, shape (...), never below zero; exactly zero where rows depend on each other, or n < m.
 
     By a QR factorisation of J', as accurate as an SVD in a quarter of the time. In (m/s)^m per (rad/s)^m for m
-    translations and hinges.
+    translations and hinges. NaN where the Jacobian has one.
     """
     j = np.asarray(jacobian, dtype=np.float64)
     m, n = j.shape[-2:]
@@ -35,7 +35,7 @@ def manipulability(jacobian: ArrayLike) -> Array:
     diagonal = np.abs(np.diagonal(np.linalg.qr(np.swapaxes(j, -1, -2), mode="r"), axis1=-2, axis2=-1))
     # A dependent row leaves rounding on the diagonal, in proportion to its own length.
     noise = n * EPSILON * np.linalg.norm(j, axis=-1)
-    return np.asarray(np.prod(np.where(diagonal > noise, diagonal, 0.0), axis=-1))
+    return np.asarray(np.prod(np.where(diagonal <= noise, 0.0, diagonal), axis=-1))
 
 
 def worst_joint_rates(jacobian: ArrayLike) -> Array:
