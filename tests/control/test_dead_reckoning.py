@@ -116,7 +116,7 @@ def test_it_takes_the_rate_between_two_readings_for_the_parabola_with_their_mean
 
 
 def test_noise_grows_as_its_closed_form():
-    rng, steps, time_s, std = np.random.default_rng(0), 50, 0.04, 0.3
+    rng, steps, time_s, std = np.random.default_rng(0), 10, 0.2, 0.3
     ends = []
     for _ in range(400):
         reckoning = DeadReckoning(rigid_transform(np.eye(3), np.zeros(3)), np.zeros(3))
