@@ -144,8 +144,9 @@ class VectorCBFActionFilter(_Wrapper):
         # An unsafe or unreadable state (NaN) gets a warning from its own filter.
         usual: Mask = judged & inside & admitted & (margins >= -SAFE_TOLERANCE)
         batch.executed(usual)
-        for i in np.flatnonzero(usual).tolist():
-            self.filters[i].admitted = float(margins[i])
+        for i, single in enumerate(self.filters):
+            # None also where a step that another env has broken off left an admission.
+            single.admitted = float(margins[i]) if usual[i] else None
         return margins, usual
 
     def _report(self, infos: dict[str, Any], quiet: Mask, margins: Array, proposed: Array) -> None:

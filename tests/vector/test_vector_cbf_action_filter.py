@@ -294,3 +294,21 @@ def test_after_a_reset_that_one_env_refuses_no_step_is_made():
         envs.step(actions)
     envs.reset(seed=0)
     envs.step(actions)
+
+
+def test_a_step_that_one_env_breaks_off_admits_nothing_of_the_next():
+    envs = sw.VectorCBFActionFilter(
+        SyncVectorEnv([lambda: gym.make("SafePointGoal1-v0")] * 2), recommended("SafePointGoal1-v0")
+    )
+    envs.reset(seed=0)
+    actions = np.zeros((2, 2), dtype=np.float32)
+    with (
+        mock.patch.object(envs.filters[0].env, "step", side_effect=RuntimeError("the env's own")),
+        pytest.raises(RuntimeError),
+    ):
+        envs.step(actions)
+    actions[1] = np.nan
+    with pytest.warns(UserWarning, match="not finite"):
+        infos = envs.step(actions)[4]
+    assert infos["cbf/nonfinite"][1] and infos["cbf/fallback"][1]
+    assert np.isfinite(infos["executed_action"]).all()
