@@ -28,7 +28,7 @@ def constraint_from(data: Any) -> Constraint:
             f"sw.BoundConstraint) or the dict of one; got {data!r}"
         )
     kind = data.get("kind", "")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise UnknownNameError(f"unknown constraint kind {kind!r}; the kinds are {', '.join(KINDS)}")
     return settings_from(KINDS[kind], {k: v for k, v in data.items() if k != "kind"}, kind)
 

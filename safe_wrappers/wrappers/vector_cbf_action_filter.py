@@ -37,7 +37,8 @@ class VectorCBFActionFilter(_Wrapper):
 
     Args:
         env: A `SyncVectorEnv`, or vector wrappers around one that leave actions as they are. In an `AsyncVectorEnv`
-            the states are in other processes: filter each env there.
+            the states are in other processes: filter each env there. It is changed in place: its envs become
+            `filters`.
         constraints: As for `CBFActionFilter`; so are the other arguments.
         plant: Not bound yet; every env gets a copy. None reads its MuJoCo model.
         fallback: See there.

@@ -21,6 +21,7 @@ from safe_wrappers.plants.simulator.simulation import (
     Simulation,
     check_replay,
     differing,
+    reward_number,
     simulation_of,
 )
 
@@ -192,7 +193,7 @@ class SimulatorPlant(RolloutPlant):
                     observation, reward, terminated, truncated, info = env.step(action)
                     view = View(raw, observation, info)
                     found.observations.append(observation if step else copy.deepcopy(observation))
-                    found.rewards.append(float(reward))
+                    found.rewards.append(reward_number(env, reward))
                     if measure is not None:
                         value = measure(view)
                         first = first if step else value

@@ -173,12 +173,22 @@ _PARTS = ("observation", "reward", "terminated", "truncated")
 Answer = tuple[Any, float, bool, bool]
 
 
+def reward_number(env: Env, reward: Any) -> float:
+    """The reward, also of an array with one entry; a vector of rewards is refused."""
+    if np.size(reward) != 1:
+        raise UnsupportedEnvError(
+            f"the reward of {name_of(env)} is {reward!r}: put a wrapper inside that makes one number of it"
+        )
+    return float(np.asarray(reward).item())
+
+
 def stretch(env: Env, actions: list[Any]) -> list[Answer]:
     """What the env answers to actions, until its episode ends."""
     answers: list[Answer] = []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        answers.append((copy.deepcopy(observation), float(reward), bool(terminated), bool(truncated)))
+        answer = reward_number(env, reward), bool(terminated), bool(truncated)
+        answers.append((copy.deepcopy(observation), *answer))
         if terminated or truncated:
             break
     return answers

@@ -297,3 +297,22 @@ def test_noise_that_begins_after_the_check_is_flagged_at_its_first_step(seen):
         warnings.simplefilter("error")  # said once
         assert env.step(np.array([0.1]))[4]["cbf/mismatch"]
     assert own.promise == "best effort"
+
+
+class Rewards(gym.Wrapper):
+    """Rewards as an array."""
+
+    def __init__(self, env, count):
+        super().__init__(env)
+        self.count = count
+
+    def step(self, action):
+        observation, _, *rest = self.env.step(action)
+        return observation, np.arange(self.count, dtype=np.float64), *rest
+
+
+def test_a_vector_of_rewards_is_refused_with_a_way_out_that_works():
+    with pytest.raises(UnsupportedEnvError, match="wrapper inside that makes one number"):
+        bound(Rewards(Cart(), 2))
+    bound(gym.wrappers.TransformReward(Rewards(Cart(), 2), np.sum))
+    bound(Rewards(Cart(), 1))
