@@ -82,7 +82,8 @@ class AdaptionPenalty(LayerWrapper):
         >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
         >>> env = sw.AdaptionPenalty(env, penalty=0.1)
         >>> _ = env.reset(seed=0)
-        >>> info = env.step(env.action_space.high)[4]
+        >>> _ = env.step(env.action_space.high)
+        >>> info = env.step(env.action_space.high)[4]  # beyond 4 rad/s
         >>> bool(info["cbf/intervened"]), info["adaption/penalty"]
         (True, 0.1)
     """
