@@ -70,7 +70,7 @@ class Count:
 def make(trained: TrainedPolicy, **kwargs: Any) -> gym.Env[Any, Any]:
     """The env that a policy was trained in, with its filter, if it had one."""
     task = replace(trained.arm.env, kwargs={**trained.arm.env.kwargs, **kwargs})
-    return make_stack(task, trained.arm.filter, trained.arm.learner.in_evaluation)
+    return make_stack(task, trained.arm.filter)
 
 
 class Side:

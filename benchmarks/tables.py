@@ -47,10 +47,11 @@ def markdown(head: str, rows: Iterable[Iterable[object]]) -> str:
     return "\n".join([*lines, *(f"| {' | '.join(map(str, cells))} |" for cells in rows)])
 
 
-def keep(name: str, text: str) -> None:
-    """Prints a table, and writes it as `results/NAME.md`."""
+def keep(name: str, text: str, whole: bool = True) -> None:
+    """Prints a table, and writes it as `results/NAME.md` if it is whole."""
     print(text)
-    (RESULTS / f"{name}.md").write_text(text + "\n")
+    if whole:
+        (RESULTS / f"{name}.md").write_text(text + "\n")
 
 
 def total(rows: Iterable[Row], key: str) -> int:

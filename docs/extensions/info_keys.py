@@ -1,5 +1,7 @@
 """The directives `info-keys` and `episode-figures`: tables of the registry in `safe_wrappers.info`."""
 
+from abc import ABC, abstractmethod
+
 from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
@@ -11,14 +13,14 @@ from safe_wrappers import info
 _MODULE = "safe_wrappers.info"
 
 
-class _Table(SphinxDirective):
+class _Table(SphinxDirective, ABC):
     """A table from rows of cells, the first row its head."""
 
     widths: str
 
+    @abstractmethod
     def rows(self) -> list[list[str]]:
         """The cells, reStructuredText."""
-        raise NotImplementedError
 
     def run(self) -> list[nodes.Node]:
         """The table."""
