@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from safe_wrappers.control.contact.friction_cone import cone_excess, tangents
+from safe_wrappers.control.contact import cone_excess, tangents
 from safe_wrappers.control.estimation.covariance import discretise
 
 
