@@ -22,7 +22,7 @@ from .rover_layout import HALF_EXTENT, KEEPOUTS, parse_rover_layout, sample_rove
 WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
 """The wheels' joints, bodies and geoms, in the order of every array of four."""
 SLIP: Final = "slip"
-"""float64, shape (4,): longitudinal slip of each wheel at the end of the step (`control.vehicle.slip.slip_ratio`)."""
+"""float64, shape (4,): longitudinal slip of each wheel at the end of the step (`control.vehicle.slip_ratio`)."""
 SLIP_MAX: Final = "slip_max"
 """float64: largest size of any loaded wheel's longitudinal slip at the ends of this step's physics substeps."""
 YAW_RATE_ERROR: Final = "yaw_rate_error"

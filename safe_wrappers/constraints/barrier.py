@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from safe_wrappers.checks import Array, non_negative, one_number, positive
-from safe_wrappers.control.filtering import cbf
+from safe_wrappers.control import barriers as cbf
 from safe_wrappers.control.numerics.projection import keeps_rows
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory

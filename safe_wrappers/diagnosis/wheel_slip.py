@@ -5,7 +5,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits.joints import driven_joints
-from safe_wrappers.control.vehicle.slip import slip_ratio
+from safe_wrappers.control.vehicle import slip_ratio
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import Env, Recording
 from safe_wrappers.diagnosis.symptom import (
