@@ -12,7 +12,7 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks import mujoco_drivers
 from benchmarks.drivers import Action, Driver, Maker, held
-from safe_wrappers.recipes import RECIPES
+from safe_wrappers.wrappers.recipes import RECIPES
 
 Array = np.ndarray
 

@@ -16,11 +16,11 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants import SimulatorPlant
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.model import HINGE, fixed_bodies, weight_n
-from safe_wrappers.protect import protect
-from safe_wrappers.recipes import recipe_of
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.presets import SlipLimiter, WholeBodyFilter
+from safe_wrappers.wrappers.protect import protect
+from safe_wrappers.wrappers.recipes import recipe_of
 
 PRESSED = 0.02
 """Share of a joint's range by which it is beyond its stop."""
