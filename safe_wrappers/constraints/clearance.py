@@ -156,10 +156,6 @@ class TrackPermission(Constraint):
     braking: float
     tracks: Sequence[str] | None = None
 
-    predicts: ClassVar[bool] = False
-    measures_state: ClassVar[bool] = False
-    rows_decide: ClassVar[bool] = True
-
     def __post_init__(self) -> None:
         self.braking = positive("braking", self.braking, "m/s^2")
         if self.tracks is not None:

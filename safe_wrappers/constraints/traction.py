@@ -81,9 +81,6 @@ class Traction(Constraint):
     regularization: float = 0.5
     margin: float = 0.0
 
-    predicts: ClassVar[bool] = False
-    measures_state: ClassVar[bool] = False
-    rows_decide: ClassVar[bool] = True
     info_keys: ClassVar[tuple[str, ...]] = (keys.SLIP_RATIO, keys.SLIP_MU_ESTIMATE)
 
     def __post_init__(self) -> None:

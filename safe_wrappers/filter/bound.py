@@ -37,6 +37,9 @@ class Bound:
     Attributes:
         spec: The copy.
         memory: What the step has made of the episode's memory so far.
+        predicts: Whether h of the trajectory decides.
+        rows_decide: Whether the rows are the requirement, or a part of it: so where there is no h.
+        measures_state: Whether h says something of the present state.
     """
 
     memory: Memory
@@ -45,7 +48,10 @@ class Bound:
         self.spec, self.plant = copy.copy(constraint), plant
         self.spec.report, self.spec.memory = {}, {}
         self.spec.setup(plant)
-        self.predicts, self.rows_decide = self.spec.predicts, self.spec.rows_decide
+        has_h = type(self.spec).h_along is not Constraint.h_along
+        self.predicts = has_h and self.spec.predicts
+        self.rows_decide = self.spec.rows_decide or not has_h
+        self.measures_state = has_h and self.spec.measures_state
         self.max_decrease = self.spec.max_decrease
         self._blank = dict(self.spec.report)
 
@@ -98,8 +104,9 @@ class Bound:
         return memory
 
     def value(self) -> Array:
-        """What h is at the present state, margin not taken off, shape (k,); empty where nothing is measured or near."""
-        return self._value
+        """h at the present state, margin not taken off, shape (k,); empty where nothing is measured or near."""  # noqa: D403
+        found: Array = self._value
+        return found
 
     def feature_count(self, neighbours: int) -> int:
         """How many `features` there are, at every state."""

@@ -38,8 +38,8 @@ class HalfSpaces:
 class Constraint:
     """One safety requirement: `h >= margin` wherever a control leads.
 
-    A subclass is a dataclass: its fields are checked in `__post_init__`, and it writes `h_along`. Everything else has
-    a default. The filter works with copies, one for every plant.
+    A subclass is a dataclass: its fields are checked in `__post_init__`, and it writes `h_along`, or `rows` alone.
+    Everything else has a default. The filter works with copies, one for every plant.
 
     A control is admitted if `h` of its trajectory keeps the margin (from outside: comes back towards it). The
     trajectory is that of `model`: the control held for one control interval, and braking after it.

@@ -29,8 +29,8 @@ class SafetyOverlay(LayerWrapper):
     In MuJoCo's scene, in frames and in the window: the obstacles of every constraint with what is kept free around
     them, and the way that its trajectory takes from here; the proposed action as an orange arrow and the executed one
     as a blue one, where it is known which way an action pushes. Over the lower edge of a frame a strip: what was done
-    to the last action, margin, lease and slip as far as they are in info, a column per step as high as the margin, and
-    the actions as bars. Envs that are not MuJoCo's get the strip alone; so does an env without a filter.
+    to the last action, margin, lease and slip as far as they are in info, a column per step as high as the margin,
+    and the actions as bars. Envs that are not MuJoCo's get the strip alone; so does an env without a filter.
 
     It only looks: actions, observations, rewards, infos and random numbers are bit for bit those without it.
 

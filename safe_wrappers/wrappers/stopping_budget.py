@@ -129,7 +129,7 @@ class BoundBudget:
         self._bound = bound
         if bound is None and self.constraint is not None and plant is not None:
             self._bound = Bound(self.constraint, plant)
-        if self._bound is not None and not self._bound.spec.measures_state:
+        if self._bound is not None and not self._bound.measures_state:
             name = type(self.constraint).__name__
             raise ConfigurationError(f"{name} has no value that a lease could be worked out from")
 

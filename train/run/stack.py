@@ -198,7 +198,7 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
             )
         its_filter: SafetyFilter = judging.get_wrapper_attr("filter")
         for constraint in its_filter.bound:
-            if not constraint.spec.measures_state:
+            if not constraint.measures_state:
                 raise ConfigurationError(
                     f"env.judge: {type(constraint.spec).__name__} has no h (`value`) and cannot judge; use env.cost: "
                     "module:function"
