@@ -3,7 +3,6 @@
 import difflib
 import inspect
 import textwrap
-from collections.abc import Callable
 from typing import Any, Final, overload
 
 import gymnasium as gym
@@ -11,39 +10,23 @@ import gymnasium as gym
 from safe_wrappers.constraints import JointSpeedLimit, PredictiveShield
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.env_checks import check_actions
 from safe_wrappers.plants.simulator.plant import SimulatorPlant
-from safe_wrappers.recipes import RECIPES
-from safe_wrappers.shelf import PLANTS, SHELF
+from safe_wrappers.recipes import EVERY, PLANTS, family_of, recipe_of
 from safe_wrappers.stack import refuse_order
 from safe_wrappers.wrappers.action_shield import ActionShield
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, by_env, single_envs
 
-_EVERY = {**RECIPES, **SHELF}
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
+_LIMIT: Final = (
+    "These lines protect it",
+    "limit = sw.constraints.JointSpeedLimit(limit=4.0)  # rad/s, m/s; or another constraint",
+)
 _SHIELD: Final = (
     "It can be simulated. Say by h(observation) what must stay positive, by backup(observation) which action keeps "
-    "it so, and by horizon how many steps to look ahead; then these lines protect it"
+    "it so, and by horizon how many steps to look ahead; then these lines protect it",
+    "shield = sw.constraints.PredictiveShield(h, horizon, backup)",
 )
-_LIMIT_LINE: Final = "limit = sw.constraints.JointSpeedLimit(limit=4.0)  # rad/s, m/s; or another constraint"
-_SHIELD_LINE: Final = "shield = sw.constraints.PredictiveShield(h, horizon, backup)"
-
-
-def recipe_of(env_id: str) -> str | None:
-    """The name of the recipe that `protect` has for an id, or None."""
-    family = _family(env_id)
-    robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
-    return next((known for known in (robot, robot.partition("_")[0]) if known in _EVERY), None)
-
-
-def recipe_names() -> list[str]:
-    """Every recipe that `protect` has, by the env's id without its version."""
-    return sorted(_EVERY)
-
-
-def _options(takes: Callable[..., Any]) -> list[str]:
-    return [name for name in inspect.signature(takes).parameters if name not in ("env", "constraints")]
 
 
 @overload
@@ -69,107 +52,70 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
         >>> import gymnasium as gym, safe_wrappers as sw
         >>> env = sw.protect(gym.make("SafePointGoal1-v0"))
     """
+    kind: Any = CBFActionFilter
     if isinstance(env, gym.vector.VectorEnv):
-        envs = single_envs(env)
-        ids = sorted({_env_id(single) for single in envs})
+        kind, (single, *others) = VectorCBFActionFilter, single_envs(env)
+        ids = sorted({one.spec.id if one.spec is not None else "" for one in (single, *others)})
         if len(ids) > 1:
             raise UnsupportedEnvError(f"expected a vector env of one id, got {ids}; protect each env of it")
         if isinstance(env.single_action_space, gym.spaces.Discrete):
             raise UnsupportedEnvError(
                 f"discrete actions are shielded env by env, got {env!r}; protect each env of it: {by_env(env)}"
             )
-        constraints = _recommended(envs[0], options, env)
-        return VectorCBFActionFilter(env, constraints, **_with_plant(envs[0], options))
-    if not isinstance(env, gym.Env):
+    elif isinstance(env, gym.Env):
+        refuse_order(env, CBFActionFilter.layer, "protect")
+        kind, single = ActionShield if isinstance(env.action_space, gym.spaces.Discrete) else kind, env
+    else:
         raise UnsupportedEnvError(f"expected one env, or a vector env, got {env!r}; {_of_no_env(env)}")
-    refuse_order(env, CBFActionFilter.layer, "protect")
-    constraints = _recommended(env, options)
-    discrete = isinstance(env.action_space, gym.spaces.Discrete)
-    return (ActionShield if discrete else CBFActionFilter)(env, constraints, **_with_plant(env, options))
-
-
-def _with_plant(env: gym.Env[Any, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """The options, with the plant that the env needs, if it is not the default one."""
-    of_env = PLANTS.get(_family(_env_id(env)))
-    return options if of_env is None else {"plant": of_env(env)} | options
-
-
-def _env_id(env: gym.Env[Any, Any]) -> str:
-    return env.spec.id if env.spec is not None else ""
-
-
-def _family(env_id: str) -> str:
-    namespace, _, name = env_id.rpartition("/")
-    if namespace == "dm_control":
-        return f"{namespace}/{name.partition('-')[0]}"
-    return name.rpartition("-v")[0].removesuffix("Dense").removesuffix("Sparse")
-
-
-def _recommended(
-    env: gym.Env[Any, Any], options: dict[str, Any], vector: VectorEnv | None = None
-) -> list[Constraint]:
-    """The recipe's constraints; takes its options out of all. `vector` is what the env is one of, if it is."""
-    env_id = _env_id(env)
-    name = recipe_of(env_id)
+    family, name = family_of(single), recipe_of(single.spec.id) if single.spec is not None else None
     if name is None:
-        raise UnsupportedEnvError(_without_recipe(env if vector is None else vector, env))
-    recipe = _EVERY[name]
-    of_recipe, of_filter = _options(recipe), _options(CBFActionFilter)
-    for name in options:
-        if name not in of_recipe + of_filter:
-            known = ", ".join(of_filter + of_recipe)
-            raise UnknownNameError(f"protect has no option {name!r} for {_family(env_id)}; it has {known}")
-    return recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
+        raise UnsupportedEnvError(_without_recipe(kind.__name__, single))
+    recipe = EVERY[name]
+    of_recipe, of_filter = ([*inspect.signature(takes).parameters] for takes in (recipe, CBFActionFilter))
+    known = [option for option in (*of_filter, *of_recipe) if option not in ("env", "constraints")]
+    for option in options:
+        if option not in known:
+            raise UnknownNameError(
+                f"protect has no option {option!r} for {family}; it has {', '.join(known)}"
+            )
+    constraints = recipe(single, **{n: options.pop(n) for n in of_recipe if n in options})
+    if family in PLANTS:
+        options.setdefault("plant", PLANTS[family]())
+    filtered: CBFActionFilter | VectorCBFActionFilter = kind(env, constraints, **options)
+    return filtered
 
 
-def _remedy(env: Any, single: gym.Env[Any, Any]) -> tuple[str, str]:
-    """Lines that make the first filter that works out of `env`, and the text that introduces them.
+def _without_recipe(kind: str, single: gym.Env[Any, Any]) -> str:
+    """Lines that make the first filter that works, or why none does, and then the recipes of similar names.
 
-    A speed limit by MuJoCo's model, else a simulation of the env. `single` is the env itself, or one of a vector
-    env's, of which filters are made to be tried; some of them reset it.
-
-    Raises:
-        ConfigurationError: None can be made; the message says why.
+    A speed limit by MuJoCo's model, else a simulation of the env. Filters are made of `single` to be tried, and some
+    of them reset it; `kind` is how the filter is called.
     """
+    shield: Constraint = PredictiveShield(lambda seen: 1.0, 2, "hold")
+    tried: list[tuple[tuple[str, str], Constraint, str]] = [
+        (_LIMIT, JointSpeedLimit(4.0), ""),
+        (_SHIELD, shield, ""),
+        (_SHIELD, shield, ', plant=sw.SimulatorPlant("fork")'),
+    ]
     discrete = isinstance(single.action_space, gym.spaces.Discrete)
-    kind: Any = ActionShield if discrete else CBFActionFilter
-    vector = isinstance(env, gym.vector.VectorEnv) and not discrete
-    name = VectorCBFActionFilter.__name__ if vector else kind.__name__
-    if not discrete:
-        check_actions(single)
-        if _is_made(kind, single, JointSpeedLimit(4.0)) is None:
-            return "These lines protect it", f"{_LIMIT_LINE}\nenv = sw.{name}(env, [limit])"
-    shield = PredictiveShield(lambda seen: 1.0, 2, "hold")
-    code = f"{_SHIELD_LINE}\nenv = sw.{name}(env, [shield]"
-    if _is_made(kind, single, shield) is None:
-        return _SHIELD, f"{code})"
-    refused = _is_made(kind, single, shield, plant=SimulatorPlant("fork"))
-    if refused is None:
-        return _SHIELD, f'{code}, plant=sw.SimulatorPlant("fork"))'
-    if isinstance(refused, ConfigurationError):
-        raise refused
-    raise UnsupportedEnvError(f"{type(refused).__name__}: {refused}") from refused
-
-
-def _is_made(kind: Any, env: Any, constraint: Constraint, **plant: Any) -> Exception | None:
-    """What refuses the filter, or None."""
-    try:
-        kind(env, [constraint], **plant)
-    except Exception as error:  # whatever the step of an env raises that cannot be copied
-        return error
-    return None
-
-
-def _without_recipe(env: gym.Env[Any, Any] | VectorEnv, single: gym.Env[Any, Any]) -> str:
-    """The lines that protect an env by hand, or why none do, and then the recipes of similar names."""
-    try:
-        says, code = _remedy(env, single)
-        by_hand = f"{says}:\n" + textwrap.indent(f"import safe_wrappers as sw\n{code}", "    ")
-    except ConfigurationError as error:
-        by_hand = f"A filter by hand is refused, too: {error}"
-    near = difflib.get_close_matches(_family(_env_id(single)), recipe_names(), n=3, cutoff=0.5)
+    by_hand = ""
+    for (says, line), constraint, plant in tried[1:] if discrete else tried:
+        made: Any = ActionShield if discrete else CBFActionFilter
+        try:
+            made(single, [constraint], plant=SimulatorPlant("fork") if plant else None)
+        except Exception as error:  # whatever the step of an env raises that cannot be copied
+            why = error if isinstance(error, ConfigurationError) else f"{type(error).__name__}: {error}"
+            by_hand = f"A filter by hand is refused, too: {why}"
+        else:
+            code = (
+                f"import safe_wrappers as sw\n{line}\nenv = sw.{kind}(env, [{line.partition(' ')[0]}]{plant})"
+            )
+            by_hand = f"{says}:\n{textwrap.indent(code, '    ')}"
+            break
+    near = difflib.get_close_matches(family_of(single), EVERY, n=3, cutoff=0.5)
     similar = f"\nRecipes of similar names: {', '.join(near)}" if near else ""
-    return f"no recipe for {_env_id(single) or single.unwrapped!r}. {by_hand}{similar}"
+    name = single.spec.id if single.spec is not None else repr(single.unwrapped)
+    return f"no recipe for {name}. {by_hand}{similar}"
 
 
 def _of_no_env(given: Any) -> str:

@@ -36,9 +36,9 @@ MAY_USE = {
     "constraints": {"control", "plants", "drawing", "filter", "constraints", *COMMON},
     "wrappers": {"wrappers", *BELOW_WRAPPERS},
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
-    "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
+    "diagnosis": {"wrappers", "diagnosis", "protect", "recipes", *BELOW_WRAPPERS},
     "envs": {"control", "constraints", "envs", *COMMON},
-    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "", *BELOW_WRAPPERS},
+    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "recipes", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {
