@@ -13,7 +13,7 @@ from safe_wrappers.control.numerics.projection import project
 from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 from safe_wrappers.plants import AnalyticPlant, IdentifiedPlant, MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.wrappers import faults, occlusion, teleop
 from safe_wrappers.wrappers.action_shield import ActionShield
@@ -39,7 +39,6 @@ __all__ = [
     "AdaptionPenalty",
     "AnalyticPlant",
     "BalanceMonitor",
-    "BoundConstraint",
     "CBFActionFilter",
     "ChunkHandover",
     "Constraint",
