@@ -12,7 +12,8 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks import mujoco_drivers
 from benchmarks.drivers import Action, Driver, Maker, held
-from safe_wrappers.recipes import RECIPES
+from safe_wrappers.filter.bound import Bound
+from safe_wrappers.wrappers.recipes import RECIPES
 
 Array = np.ndarray
 
@@ -226,7 +227,7 @@ def margin_reading(ball: bool) -> Maker:
         constraints: list[Any] = recipe(env, keep_out=obstacles(env) if ball else [])
         plant = sw.plants.DisplacementPlant()
         plant.bind(env)
-        bound = [constraint.bind(plant) for constraint in constraints]
+        bound = [Bound(constraint, plant) for constraint in constraints]
         state: dict[str, Any] = {"way": rng.normal(size=3)}
 
         def left(action: Action) -> float:
@@ -235,7 +236,7 @@ def margin_reading(ball: bool) -> Maker:
         def act() -> Action:
             plant.observe()
             for c in bound:
-                c.observe(c.start())  # nobody says when an episode begins
+                c.observe({})  # nobody says when an episode begins
             if rng.random() < 0.04:
                 state["way"] = rng.normal(size=3)
             fingers = rng.choice([-1.0, 1.0])

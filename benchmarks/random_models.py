@@ -205,7 +205,7 @@ def _proposal(space: gym.spaces.Box, rng: random.Random) -> Any:
 
 def _check_forecast(onlooker: sw.MujocoPlant, machine: Machine, executed: Any) -> None:
     """The forecast from the state before the step is where the env is now, bit for bit."""
-    end = onlooker.forecast(executed).path[-1]
+    end = onlooker.rollout(executed).states[-1]
     reached = np.concatenate([machine.data.qpos, machine.data.qvel])
     was_reset = machine.data.warning.number[mujoco.mjtWarning.mjWARN_BADQPOS :].any() and np.isnan(end).all()
     rounding = 1e-3 if _sleeps(machine.model) else 0.0  # MuJoCo's state does not say who sleeps
@@ -247,7 +247,7 @@ def _check_response(onlooker: sw.MujocoPlant, rng: random.Random) -> None:
 def _ask(onlooker: sw.MujocoPlant, executed: Any) -> None:
     """Whatever else constraints may ask a plant."""
     body = onlooker.model.body(onlooker.model.nbody - 1).name
-    longer = onlooker.forecast(executed, 3)
+    longer = onlooker.rollout(executed, 3)
     asked: dict[str, Any] = {
         "f": onlooker.f,
         "g": onlooker.g,
@@ -255,7 +255,7 @@ def _ask(onlooker: sw.MujocoPlant, executed: Any) -> None:
         "position": onlooker.motion("body", body)[0],
         "braking": onlooker.braking(),
         "substep_ago": onlooker.substep_ago().frames,
-        "poses": longer.poses().centres if np.isfinite(longer.path).all() else 0.0,
+        "poses": longer.poses().centres if np.isfinite(longer.states).all() else 0.0,
         "point": onlooker.point("body", body)[3],
     }
     onlooker.sketch(executed, 2)

@@ -24,7 +24,7 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks.tables import keep, markdown, measured, options
 from safe_wrappers.plants import View
-from safe_wrappers.shelf import PLANTS
+from safe_wrappers.wrappers.recipes import PLANTS
 
 DRIVERS = ("random", "greedy", "attacking")
 _TRIED, _HELD = 8, 5
@@ -108,8 +108,7 @@ def run(case: Case, driver: str, on: bool, steps: int) -> dict[str, float]:
     """Drive the env, and judge it after every step."""
     gym.register_envs(importlib.import_module(case.needs or "gymnasium"))
     env = gym.make(case.env_id)
-    make_plant = PLANTS.get(case.env_id.rpartition("-v")[0], lambda env: sw.SimulatorPlant())
-    plant: Any = make_plant(env)
+    plant: Any = PLANTS.get(case.env_id.rpartition("-v")[0], sw.SimulatorPlant)()
     plant.bind(env)
     stepped: gym.Env[Any, Any] = sw.protect(env) if on else env
     env.action_space.seed(0)

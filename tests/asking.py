@@ -1,6 +1,7 @@
 """A constraint on a plant, asked at whatever state the plant has observed."""
 
 import safe_wrappers as sw
+from safe_wrappers.filter.bound import Bound
 
 
 def bound(env, **options):
@@ -35,14 +36,14 @@ class Asked:
     """
 
     def __init__(self, constraint, plant):
-        self.bound, self.plant = constraint.bind(plant), plant
-        self.memory, self.seen = self.bound.start(), None
+        self.bound, self.plant = Bound(constraint, plant), plant
+        self.memory, self.seen = {}, None
 
     def executed(self, control):
         self.memory = self.bound.executed(control)
 
     def start(self):
-        self.memory, self.seen = self.bound.start(), None
+        self.memory, self.seen = {}, None
 
     def __getattr__(self, name):
         if self.seen != self.plant.observation_id:

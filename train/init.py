@@ -13,7 +13,7 @@ from rich.console import Console
 
 import safe_wrappers
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.protect import recipe_names, recipe_of
+from safe_wrappers.wrappers.recipes import EVERY, recipe_of
 
 from .config import parse_experiment, read_config
 from .config.algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY
@@ -131,7 +131,7 @@ def _algorithms() -> dict[str, str]:
 
 _LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
     "envs": _envs,
-    "recipes": lambda: dict.fromkeys(recipe_names(), ""),
+    "recipes": lambda: dict.fromkeys(EVERY, ""),
     "wrappers": _wrappers,
     "algorithms": _algorithms,
 }

@@ -6,21 +6,13 @@ from matplotlib.figure import Figure
 import safe_wrappers as sw
 from _cart import Cart, run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, panels
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.constraint import Constraint
 
 WALL, GAMMA = 1.0, 2.0
 
 
 class ContinuousRow(Constraint):
     """(a / v) (gamma h - v), the textbook's row, evaluated at the samples."""
-
-    def bind(self, plant: sw.Plant) -> BoundConstraint:
-        """On a plant."""
-        return BoundContinuousRow(self, plant)
-
-
-class BoundContinuousRow(BoundConstraint):
-    """ContinuousRow on a plant."""
 
     def rows(self) -> sw.HalfSpaces:
         """One half-space on the acceleration; nothing at standstill."""

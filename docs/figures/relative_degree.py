@@ -7,21 +7,13 @@ import safe_wrappers as sw
 from _cart import Cart, run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, SAFE, panels
 from safe_wrappers.control.backup.stopping import held_stop
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.constraint import Constraint
 
 WALL = 2.0
 
 
 class NextPosition(Constraint):
     """The naive rule: any control whose next position is still left of the wall."""
-
-    def bind(self, plant: sw.Plant) -> BoundConstraint:
-        """On a plant."""
-        return BoundNextPosition(self, plant)
-
-
-class BoundNextPosition(BoundConstraint):
-    """NextPosition on a plant."""
 
     def rows(self) -> sw.HalfSpaces:
         """X + v hold + u hold^2 / 2 <= wall."""

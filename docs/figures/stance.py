@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 import safe_wrappers as sw
 from _ant import gait
 from _style import ON, OTHER
+from safe_wrappers.filter.bound import Bound
 
 BEFORE = 16
 """Control steps of the gait, after which a foot stands and the next torques would make it slide."""
@@ -32,8 +33,8 @@ def draw() -> Figure:
     ):
         distances = []
         for share in SHARES:
-            stance = sw.constraints.Stance(float(share), joint_tolerance=None, **options).bind(plant)
-            stance.observe(stance.start())
+            stance = Bound(sw.constraints.Stance(float(share), joint_tolerance=None, **options), plant)
+            stance.observe({})
             stance.admits(wanted)
             (answer,) = stance.candidates(wanted)
             distances.append(np.linalg.norm(answer - wanted) if stance.admits(answer) else np.nan)

@@ -1,6 +1,5 @@
 """Safety requirements: each turns a plant into half-spaces on the control."""
 
-from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.constraints.backup.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.backup.heading_drive_clearance import HeadingDriveClearance
 from safe_wrappers.constraints.backup.point_clearance import EscapeClearance, WallClearance
@@ -17,7 +16,6 @@ from safe_wrappers.constraints.traction import Traction
 
 __all__ = [
     "Barrier",
-    "BoundBackupClearance",
     "Box",
     "Clearance",
     "CoastingClearance",

@@ -1,17 +1,17 @@
 """Barrier: the user's own h on the plant's state."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from safe_wrappers.checks import Array, non_negative, one_number, positive
 from safe_wrappers.control import barriers as cbf
-from safe_wrappers.control.numerics.projection import keeps_rows
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
-from safe_wrappers.filter.linearize import linearize
-from safe_wrappers.plants.plant import Plant
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.plants.plant import Plant, Trajectory
 
 _ROUNDING = 1e-9  # round-off, as a share of h's size: of its value and its gradient together
 _NO_EFFECT = 1e-7  # error of differences, as a share of h's size and of the control's effect on the state
@@ -37,82 +37,49 @@ class Barrier(Constraint):
     alpha: float = 1.0
     margin: float = 0.0
 
+    rows_decide: ClassVar[bool] = True
+    recovery_s: ClassVar[float] = math.inf  # the row asks for the recovery
+
     def __post_init__(self) -> None:
         if not callable(self.h):
             raise ConfigurationError(f"h must be a function of the state, got {self.h!r}")
         self.alpha = positive("alpha", self.alpha, "1/s")
         self.margin = non_negative("margin", self.margin, "units of h")
 
-
-class BoundBarrier(BoundConstraint, of=Barrier):
-    """Barrier on a plant."""
-
-    predicts: bool = True
-    spec: Barrier
-
-    def __init__(self, spec: Barrier, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         plant.require_acceleration("Barrier")
-        super().__init__(spec, plant)
-        if spec.alpha * plant.control_dt > 1.0:
-            crossing = f"alpha = {spec.alpha}/s lets h cross zero within one hold of {plant.control_dt} s"
+        super().setup(plant)
+        if self.alpha * plant.control_dt > 1.0:
+            crossing = f"alpha = {self.alpha}/s lets h cross zero within one hold of {plant.control_dt} s"
             raise ConfigurationError(
                 f"{crossing}; alpha must be at most 1/hold = {1.0 / plant.control_dt:g}/s"
             )
         self._degree_checked = False
 
     def observe(self, memory: Memory) -> None:
-        self._row: HalfSpaces | None = None
-        self._now = self._height(self.plant.state)
-
-    def value(self) -> Array:
-        return np.array([self._now])
+        if not (memory or self._degree_checked):
+            self._check_degree()
+            self._degree_checked = True
 
     def _height(self, x: Array) -> float:
-        return one_number("h", self.spec.h(x))
+        return one_number("h", self.h(x))
+
+    def h_along(self, path: Trajectory) -> Array:
+        """Of every state."""
+        return np.array([[self._height(x)] for x in path.states])
 
     def rows(self) -> HalfSpaces:
-        if self._row is None:
-            self._row = self._condition()
-        return self._row
-
-    def _condition(self) -> HalfSpaces:
+        """One row `Lf h + Lg h u >= -alpha (h - margin)`."""
         x = self.plant.state
-        gradient = cbf.numerical_gradient(self._height, x)
-        self._rounding = _ROUNDING * (abs(self._now) + max(map(abs, gradient.tolist()), default=0.0))
-        decay = self.spec.alpha * (self._now - self.spec.margin)
+        now, gradient = self._height(x), cbf.numerical_gradient(self._height, x)
+        self.rounding = _ROUNDING * (abs(now) + max(map(abs, gradient.tolist()), default=0.0))
+        decay = self.alpha * (now - self.margin)
         drift, effect = gradient @ self.plant.f, gradient @ self.plant.g
         return HalfSpaces(-effect[None, :], np.array([drift + decay]))
 
-    def slack(self, control: Array) -> float:
-        """Not measured: whether a control is admitted is all that is known."""
-        return 0.0 if self.admits(control) else -np.inf
-
-    def admits(self, control: Array) -> bool:
-        """Whether the row holds and prediction keeps h through the hold (from outside: does not lose more)."""
-        row = self.rows()
-        kept = float(row.normals[0] @ control - row.offsets[0]) <= 0.0
-        box = self.plant.lower, self.plant.upper
-        if not kept and not keeps_rows(control, row.normals, row.offsets, *box):
-            return False
-        floor = min(self._now, 0.0) - self._rounding
-        return all(self._height(x) >= floor for x in self.plant.path(control))
-
-    def linearize(self, control: Array) -> HalfSpaces:
-        self.rows()
-        floor = min(self._now, 0.0)
-
-        def slacks(u: Array) -> Array:
-            heights = [self._height(x) - floor for x in self.plant.path(u)]
-            return np.array(heights) if len(heights) <= 3 else np.array([heights[-1], min(heights)])
-
-        return linearize(slacks, control, self.plant.lower, self.plant.upper)
-
-    def check(self) -> None:
+    def _check_degree(self) -> None:
         """Refuse an h on which no control acts at first order, at the first state or anywhere near."""
-        if self._degree_checked:
-            return
         x = self.plant.state
-        self._degree_checked = True
         h = self._height(x)
         if not np.isfinite([*x, h]).all():
             raise ConfigurationError(f"the first state must be finite and h of it too; got {x}, h = {h}")

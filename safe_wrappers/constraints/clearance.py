@@ -10,7 +10,6 @@ from safe_wrappers.checks import Array, check_fields, name_list, non_negative, p
 from safe_wrappers.constraints.obstacles import (
     Nearest,
     Plain,
-    obstacle_marks,
     obstacles_from,
     refuse_more_dimensions,
 )
@@ -20,10 +19,9 @@ from safe_wrappers.control.backup.stopping import (
     approach_rows_of,
     approaches,
 )
-from safe_wrappers.drawing.marks import Mark, segment
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
-from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.points import Points
 
@@ -62,7 +60,8 @@ class Clearance(Constraint):
     margin: float = 0.0
     state_error: float = 0.0
 
-    measures_approach: ClassVar[bool] = True
+    predicts: ClassVar[bool] = False
+    rows_decide: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)
@@ -75,20 +74,14 @@ class Clearance(Constraint):
             wanted = "position and velocity are up to three state indices each, in the same order"
             raise ConfigurationError(f"{wanted}; got {self.position} and {self.velocity}")
 
-
-class BoundClearance(BoundConstraint, of=Clearance):
-    """Clearance on a plant."""
-
-    spec: Clearance
-
-    def __init__(self, spec: Clearance, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         plant.require_acceleration("Clearance")
-        super().__init__(spec, plant)
-        named = {"body": spec.bodies, "site": spec.sites, "geom": spec.geoms}
-        self._points = Points(plant, named, spec.position, spec.velocity)
+        super().setup(plant)
+        named = {"body": self.bodies, "site": self.sites, "geom": self.geoms}
+        self._points = Points(plant, named, self.position, self.velocity)
         self._still: Array | None = None
-        if all(isinstance(o, Plain) and o.still for o in spec.obstacles):
-            self._still = np.concatenate([o.surfaces(plant) for o in spec.obstacles])
+        if all(isinstance(o, Plain) and o.still for o in self.obstacles):
+            self._still = np.concatenate([o.surfaces(plant) for o in self.obstacles])
             size = self._points.coordinates
             for surface in self._still:
                 refuse_more_dimensions(int(surface[1]), size)
@@ -98,15 +91,15 @@ class BoundClearance(BoundConstraint, of=Clearance):
 
     def _surfaces(self, p: Array) -> Nearest:
         """The surfaces around a point."""
-        found = [o.nearest(p, self.plant) for o in self.spec.obstacles]
+        found = [o.nearest(p, self.plant) for o in self.obstacles]
         return Nearest(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
     def _look(self) -> tuple[Array, HalfSpaces]:
         """The rooms and the rows, once per observation."""
         if self._observed is None:
-            plant, spec = self.plant, self.spec
+            plant = self.plant
             limits = plant.lower, plant.upper, plant.delay_s, plant.control_dt
-            machine: Machine = *limits, spec.radius, spec.braking, spec.state_error + spec.margin
+            machine: Machine = *limits, self.radius, self.braking, self.state_error + self.margin
             found = [
                 approach_rows(*self._surfaces(p), v, drift, effect, machine)
                 if self._still is None
@@ -118,14 +111,14 @@ class BoundClearance(BoundConstraint, of=Clearance):
             self._observed = rooms, HalfSpaces(normals, offsets)
         return self._observed
 
-    def value(self) -> Array:
-        """Room left after braking, margin and state error not taken off, m, one per point and surface."""
-        return self._look()[0]
+    def h_along(self, path: Any) -> Array:
+        """Of the present state: room left after braking, margin and state error not taken off, m, per surface."""
+        return self._look()[0][None]
 
     def approach(self) -> tuple[Array, Array]:
         """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""
         # Not through `_look`: the accelerations, which only the rows need, are most of its work.
-        delay_s, radius = self.plant.delay_s, self.spec.radius
+        delay_s, radius = self.plant.delay_s, self.radius
         found = [
             approaches(near.distance, near.normal, near.velocity, v, delay_s, radius)
             for near, v in ((self._surfaces(p), v) for p, v in self._points.motions())
@@ -133,15 +126,9 @@ class BoundClearance(BoundConstraint, of=Clearance):
         clearances, speeds = zip(*found, strict=True)
         return np.concatenate(clearances), np.concatenate(speeds)
 
-    def draw(self) -> list[Mark]:
-        """The obstacles with what is kept free before them, and every point's way until rest along its motion."""
-        spec, found = self.spec, []
-        inset = spec.radius + spec.margin + spec.state_error
-        for p, v in self._points.motions():
-            way = 0.5 * float(np.linalg.norm(v)) / spec.braking * v
-            found.append(segment("way", p, p + way, max(spec.radius, 0.01)))
-            found += obstacle_marks(spec.obstacles, self.plant, inset, p)
-        return found
+    def points(self, path: Any) -> Array:
+        """Where they are now, shape (1, points, d), m."""
+        return np.array([[p for p, _ in self._points.motions()]])
 
     def rows(self) -> HalfSpaces:
         """One row per point and surface whose limit the actuators could exceed."""
@@ -174,34 +161,27 @@ class TrackPermission(Constraint):
         if self.tracks is not None:
             self.tracks = name_list("tracks", self.tracks, also="None for all")
 
-
-class BoundTrackPermission(BoundConstraint, of=TrackPermission):
-    """TrackPermission on a plant."""
-
-    spec: TrackPermission
-    plant: MujocoPlant
-
-    def __init__(self, spec: TrackPermission, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         machine = require_mujoco(plant, "TrackPermission needs a MujocoPlant: it brakes a body of its model")
         machine.require_acceleration("TrackPermission")
-        super().__init__(spec, machine)
-        self.plant.named("body", self.spec.body)
+        super().setup(machine)
+        self.plant.named("body", self.body)
         names = list(self.plant.attribute("track_names"))
-        chosen = names if self.spec.tracks is None else list(self.spec.tracks)
+        chosen = names if self.tracks is None else list(self.tracks)
         for name in chosen:
             if name not in names:
                 raise UnknownNameError(f"there is no track {name!r}; there are {', '.join(names)}")
         self._which = [names.index(name) for name in chosen]
 
-    def rows(self) -> HalfSpaces:
+    def rows(self) -> HalfSpaces | None:
         """Two rows per axis that a control acts on, while a permission has expired; else none."""
         if bool(np.asarray(self.plant.attribute("permitted"))[self._which].all()):
-            return HalfSpaces.none(self.plant.lower.size)
-        _, v, drift, effect = self.plant.point("body", self.spec.body)
+            return None
+        _, v, drift, effect = self.plant.point("body", self.body)
         acted = np.abs(effect).max(axis=1) > 1e-12
         v, drift, effect = v[acted], drift[acted], effect[acted]
         speed = float(np.sqrt(v @ v))
-        left = max(0.0, 1.0 - self.spec.braking * self.plant.control_dt / speed) if speed > 0.0 else 0.0
+        left = max(0.0, 1.0 - self.braking * self.plant.control_dt / speed) if speed > 0.0 else 0.0
         allowed = np.abs(left * v)  # in each axis, at the end of the hold
         least, most = ((end - v) / self.plant.control_dt - drift for end in (-allowed, allowed))
         return HalfSpaces(np.concatenate([effect, -effect]), np.concatenate([most, -least]))

@@ -17,12 +17,10 @@ from safe_wrappers.control.numerics.shapes import (
     nearest_points,
     surface_distances,
 )
-from safe_wrappers.drawing.marks import Mark, ball, block, pad, ring, spatial
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
 _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)  # of the horizon, at which growth is looked at; the first: its rate now
-_PAD_M = 0.4  # half of the square that is drawn of a plane
 
 
 class Nearest(NamedTuple):
@@ -312,31 +310,4 @@ def obstacles_from(
     for obstacle in found:
         if kinds and not isinstance(obstacle, kinds):
             raise ConfigurationError(f"{name} holds {fitting}, got {type(obstacle).__name__}")
-    return found
-
-
-def obstacle_marks(obstacles: Sequence[Any], plant: Plant, inset: float, point: Array) -> list[Mark]:
-    """Marks of obstacles, each larger by an inset, m; of a plane the part nearest to a point of 1 to 3 coordinates.
-
-    An obstacle of another kind than the library's is not drawn.
-    """
-    found: list[Mark] = []
-    for obstacle in obstacles:
-        if isinstance(obstacle, Disc | Discs | Sphere):
-            centers, radius = obstacle.centers(plant), obstacle.radius + inset
-            if centers.shape[1] == 2:
-                found += [mark for center in centers for mark in ring("limit", center, radius)]
-            else:
-                found += [ball("keep out", center, radius) for center in centers]
-        elif isinstance(obstacle, Box):
-            found.append(block("keep out", obstacle.center, np.array(obstacle.half_size) + inset))
-        elif isinstance(obstacle, Plane):
-            normal = spatial(obstacle.normal, 0.0)
-            at, of = spatial(point), spatial(obstacle.point, 0.0)
-            foot = at - ((at - of) @ normal - inset) * normal
-            found.append(pad("keep out", foot, normal, _PAD_M))
-        elif isinstance(obstacle, TrackedDiscs):
-            centers, halves = (part[0] for part in obstacle.boxes(plant, np.zeros(1)))
-            sizes = halves + obstacle.radius + inset
-            found += [block("estimate", *one) for one in zip(centers, sizes, strict=True)]
     return found

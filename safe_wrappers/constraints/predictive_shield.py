@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative, one_number, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
-from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.rollouts import NotFiniteError, RolloutPlant, View
+from safe_wrappers.filter.constraint import Constraint, Memory
+from safe_wrappers.plants.plant import Model, Plant
+from safe_wrappers.plants.rollouts import NotFiniteError, View
 
 Value = Callable[[Any, Array], ArrayLike]
 """Of an observation and actions, shape (k, m): how good they are, shape (k,)."""
@@ -26,11 +26,19 @@ _ENDS_ALONE = (
     "Gymnasium's MujocoEnv does. Else keep a margin, or take JointSpeedLimit, JointPositionLimit, SpeedLimit, "
     "Workspace or another constraint that forecasts every substep"
 )
-_NOT_REACHED = -math.ulp(0.0)  # the slack of a rollout that keeps h but does not end in the terminal set
+_NOT_REACHED = -1e-6  # the slack of a rollout that keeps h but does not end in the terminal set
+
+
+class Plan(NamedTuple):
+    """What a control leaves of the requirement with the best backup after it, and which one that is."""
+
+    slack: float
+    backup: int
+    holds: int = 1  # control intervals, as of every trajectory
 
 
 @dataclass
-class PredictiveShield(Constraint):
+class PredictiveShield(Constraint, Model):
     """Keep `h >= margin` at every step, by simulating what a backup could do after an action.
 
     An action is admitted if after it one of the backups keeps h to the horizon, or until the episode ends, or, with a
@@ -72,6 +80,9 @@ class PredictiveShield(Constraint):
     margin: float = 0.0
 
     simulates: ClassVar[bool] = True
+    smooth: ClassVar[bool] = False
+    rounding = 1e-12
+    recovery_s: ClassVar[float] = 0.0  # from outside, too, h is to be kept
 
     def __post_init__(self) -> None:
         if not (callable(self.h) or (isinstance(self.h, str) and self.h)):
@@ -91,115 +102,78 @@ class PredictiveShield(Constraint):
             raise ConfigurationError("backup is a backup, or a list with at least one")
         self.backup = [_checked(one) for one in backups]
 
-
-def _checked(backup: Any) -> Any:
-    """A backup; of a model its `predict`, which is not copied with the constraint; of an array a list."""
-    if hasattr(backup, "predict"):
-        return _PolicyBackup(backup)
-    if isinstance(backup, str) and backup not in ("zero", "hold"):
-        raise UnknownNameError(
-            f"no backup {backup!r}; give zero, hold, an action, a function, a model, or a list of these"
-        )
-    if callable(backup) or isinstance(backup, str):
-        return backup
-    if not isinstance(backup, np.ndarray | list | tuple | int | np.integer):
-        raise ConfigurationError(
-            f"backup is zero, hold, an array or a whole number, a function, a model, or a list; got {backup!r}"
-        )
-    return np.asarray(backup).tolist()
-
-
-class _PolicyBackup:
-    """A model's deterministic actions. Copies share the model."""
-
-    def __init__(self, model: Any) -> None:
-        self.model = model
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "_PolicyBackup":
-        return self
-
-    def __call__(self, observation: Any) -> Any:
-        return self.model.predict(observation, deterministic=True)[0]
-
-
-class Plan(NamedTuple):
-    """What a control leaves of the requirement with the best backup after it, and which one that is."""
-
-    slack: float
-    backup: int
-
-
-class BoundPredictiveShield(BoundConstraint, of=PredictiveShield):
-    """PredictiveShield on a plant that simulates."""
-
-    predicts = True
-    spec: PredictiveShield
-    plant: RolloutPlant
-
-    def __init__(self, spec: PredictiveShield, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         if not plant.simulates:
             raise UnsupportedEnvError(
                 f"PredictiveShield simulates backups, which a {type(plant).__name__} cannot: take "
                 "plant=SimulatorPlant(), and put other constraints' requirements into h"
             )
-        super().__init__(spec, plant)
-        self.info_keys = self.plant.info_keys
-        if not self.plant.simulates_env and (spec.sees == "env" or isinstance(spec.h, str)):
+        super().setup(plant)
+        self.model = self
+        if not self.plant.simulates_env and (self.sees == "env" or isinstance(self.h, str)):
             raise UnsupportedEnvError(
                 f"the rollouts of an {type(plant).__name__} have observations alone, and neither an env nor its "
                 'info: take sees="observation", and as h a function of it'
             )
         if not self.plant.exact:
-            spec.promise = "best effort"  # of an unchecked, noisy or fitted model a set proves nothing
-        self._between = spec.sees == "env" and self.plant.judges_substeps
+            self.promise = "best effort"  # of an unchecked, noisy or fitted model a set proves nothing
+        self._between = self.sees == "env" and self.plant.judges_substeps
         # The env's own judge, an info key, decides by itself when it looks.
-        if self.plant.substeps > 1 and not (self._between or isinstance(spec.h, str)):
+        if self.plant.substeps > 1 and not (self._between or isinstance(self.h, str)):
             warnings.warn(_ENDS_ALONE.format(self.plant.substeps), stacklevel=2)
         discrete = self.plant.discrete
-        if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
+        if discrete and "zero" in [one for one in self.backup if isinstance(one, str)]:
             raise ConfigurationError(
                 "a discrete action has no zero: give as backup the action that is safe, or hold, or a function"
             )
-        self._backups = [self._prepared(one) for one in spec.backup]
-        self._needed = spec.margin + self.plant.margins(self._measure, spec.horizon)
-        self._points = np.random.default_rng(0).random((spec.candidates, self.plant.lower.size))
-
-    def start(self) -> Memory:
-        return 0, np.clip(np.zeros_like(self.plant.lower), self.plant.lower, self.plant.upper)
+        self._backups = [self._prepared(one) for one in self.backup]
+        self._needed = self.margin + self.plant.margins(self._measure, self.horizon)
+        self._points = np.random.default_rng(0).random((self.candidates, self.plant.lower.size))
 
     def observe(self, memory: Memory) -> None:
-        self._survivor, self._last = memory
+        begins, none = (
+            not memory,
+            np.clip(np.zeros_like(self.plant.lower), self.plant.lower, self.plant.upper),
+        )
+        self._last = memory.get("control", none)
         self._known: dict[bytes, Plan] = {}
+        plans: dict[bytes, Plan] = memory.get("plans", {})
+        executed = plans.get(self._last.tobytes())
+        self._survivor = memory.get("survivor", 0) if executed is None else executed.backup
+        memory["plans"], memory["survivor"] = self._known, self._survivor
         view = self.plant.view
         # Many envs report their cost after steps, and not after a reset.
-        self._unknown = isinstance(self.spec.h, str) and self.spec.h not in view.info
-        self._now = math.inf if self._unknown else self._measure(view)
+        unknown = isinstance(self.h, str) and self.h not in view.info
+        self._now = np.zeros(0) if unknown else np.array([self._measure(view)])
         if not self.plant.exact:  # any more
-            self.spec.promise = "best effort"
-
-    def check(self) -> None:
-        if np.isfinite(self.plant.state).all():
+            self.promise = "best effort"
+        if begins and np.isfinite(self.plant.state).all():
             for backup in self._backups:
-                self._first(backup)
+                self._first(backup)  # refuses at a reset what no action is
 
-    def value(self) -> Array:
-        return np.zeros(0) if self._unknown else np.array([self._now])
+    def rollout(self, control: Array | None, horizon: int = 1) -> Plan | None:
+        """What a control leads to; nothing of None: the present state is known."""
+        return None if control is None else self.plan(control)
+
+    def h_along(self, path: Plan | None) -> Array:
+        """The least h, less what the plant's errors may take."""
+        now: Array = self._now[None]
+        return now if path is None else np.array([[path.slack + self.margin]])
 
     def _measure(self, view: View) -> float:
         """h; NaN where it is not a number."""
-        spec = self.spec
-        if isinstance(spec.h, str):
-            if spec.h not in view.info:
-                raise ConfigurationError(f"the env reports no info[{spec.h!r}]; it has {sorted(view.info)}")
-            return -float(view.info[spec.h])
-        return one_number("h", spec.h(self._seen(view)))
+        if isinstance(self.h, str):
+            if self.h not in view.info:
+                raise ConfigurationError(f"the env reports no info[{self.h!r}]; it has {sorted(view.info)}")
+            return -float(view.info[self.h])
+        return one_number("h", self.h(self._seen(view)))
 
     def _seen(self, view: View) -> Any:
-        return view if self.spec.sees == "view" else getattr(view, self.spec.sees)
+        return view if self.sees == "view" else getattr(view, self.sees)
 
     def _terminal(self, view: View) -> bool:
-        assert self.spec.terminal is not None
-        return bool(self.spec.terminal(self._seen(view)))
+        assert self.terminal is not None
+        return bool(self.terminal(self._seen(view)))
 
     def _prepared(self, backup: Any) -> Any:
         """A function, a control, shape (m,), or "hold"."""
@@ -213,7 +187,8 @@ class BoundPredictiveShield(BoundConstraint, of=PredictiveShield):
         if not callable(backup):
             return np.asarray(backup)
         seen = view.observation if isinstance(backup, _PolicyBackup) else self._seen(view)
-        return self.plant.control(backup(seen), "the backup")
+        found: Array = self.plant.control(backup(seen), "the backup")
+        return found
 
     def _action(self, backup: Any, view: View) -> Any:
         return self.plant.action(self._control(backup, view))
@@ -247,12 +222,12 @@ class BoundPredictiveShield(BoundConstraint, of=PredictiveShield):
 
     def _after(self, control: Array, backup: Any) -> float:
         """The slack of a control with a backup after it; NaN where an h is."""
-        spec, policy = self.spec, None if isinstance(backup, str) else functools.partial(self._action, backup)
-        until = None if spec.terminal is None else self._terminal
+        policy = None if isinstance(backup, str) else functools.partial(self._action, backup)
+        until = None if self.terminal is None else self._terminal
         least = float(self._needed.min())
         try:
             rollout = self.plant.rollout(
-                control, spec.horizon, policy, self._measure, least, until, self._between
+                control, self.horizon, policy, self._measure, least, until, self._between
             )
         except NotFiniteError:
             return -math.inf  # the backup has no answer
@@ -262,31 +237,49 @@ class BoundPredictiveShield(BoundConstraint, of=PredictiveShield):
             return min(slack, _NOT_REACHED)
         return slack
 
-    def slack(self, control: Array) -> float:
-        return self.plan(control).slack
-
-    def candidates(self, control: Array) -> Iterable[Array]:
-        every = self.plant.neighbours(control, self._points, self._firsts())
-        if self.spec.value is None:
+    def proposals(self, control: Array | None) -> Iterable[Array]:
+        if control is None:
+            # What the first backup would do that survives its own action, else what the best one would.
+            return sorted(self._firsts(), key=lambda first: -min(self.plan(first).slack, 0.0))[:1]
+        every: list[Array] = self.plant.neighbours(control, self._points, self._firsts())
+        if self.value is None:
             return every
-        admitted = np.array([u for u in every if self.admits(u)])
+        admitted = np.array([u for u in every if self.plan(u).slack >= 0.0])
         if not len(admitted):
             return ()
-        values = np.asarray(self.spec.value(self.plant.view.observation, admitted), dtype=np.float64)
+        values = np.asarray(self.value(self.plant.view.observation, admitted), dtype=np.float64)
         if values.shape != (len(admitted),):
             raise ConfigurationError(
                 f"value must return a number for each of {len(admitted)} actions, got shape {values.shape}"
             )
         return admitted[np.argsort(np.where(np.isnan(values), np.inf, -values), kind="stable")]
 
-    def backup(self) -> Array | None:
-        """What the first backup would do that survives its own action, else what the best one would."""
-        return max(self._firsts(), key=lambda first: min(self.slack(first), 0.0), default=None)
 
-    def executed(self, control: Array) -> Memory:
-        known = self._known.get(control.tobytes())
-        return self._survivor if known is None else known.backup, control
+def _checked(backup: Any) -> Any:
+    """A backup; of a model its `predict`, which is not copied with the constraint; of an array a list."""
+    if hasattr(backup, "predict"):
+        return _PolicyBackup(backup)
+    if isinstance(backup, str) and backup not in ("zero", "hold"):
+        raise UnknownNameError(
+            f"no backup {backup!r}; give zero, hold, an action, a function, a model, or a list of these"
+        )
+    if callable(backup) or isinstance(backup, str):
+        return backup
+    if not isinstance(backup, np.ndarray | list | tuple | int | np.integer):
+        raise ConfigurationError(
+            f"backup is zero, hold, an array or a whole number, a function, a model, or a list; got {backup!r}"
+        )
+    return np.asarray(backup).tolist()
 
-    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The plant's own info keys."""
-        return self.plant.info()
+
+class _PolicyBackup:
+    """A model's deterministic actions. Copies share the model."""
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "_PolicyBackup":
+        return self
+
+    def __call__(self, observation: Any) -> Any:
+        return self.model.predict(observation, deterministic=True)[0]

@@ -1,9 +1,9 @@
 """Traction: keep driven wheels on the stable side of a traction curve that nobody knows."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -13,8 +13,8 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, name_list, non_negative, positive
 from safe_wrappers.control.vehicle import FrictionEstimate, slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
-from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
 
@@ -31,6 +31,25 @@ _LEAST_LOAD = 0.05  # share of the largest load seen below which a wheel counts 
 _MOST_FRICTION = 3.0  # force over load beyond which something else than the ground held the wheel
 # Integrators that step a servo's feedback as they step damping.
 _IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
+
+
+@dataclass
+class TractionMemory:
+    """What Traction remembers of an episode; arrays of shape (wheels,), before the last control."""
+
+    estimate: FrictionEstimate
+    rate: Array | None  # turning rates, rad/s; None: nothing was measured
+    time: float  # s
+    ground: Array  # speeds of the ground below, m/s
+    slip: Array  # slip ratios along the heading
+    across: Array  # and across it
+    load: Array  # forces on the ground, N
+    most_load: Array  # the largest so far, N
+    faster: Array  # recent error of the predicted ground speed, upwards, m/s
+    slower: Array  # downwards, m/s
+    ahead: Array  # by how much the ground speed is predicted to change, m/s
+    traction: Array  # force of the ground in the last control step, N
+    present: Array  # of the ground at its end, N
 
 
 @dataclass
@@ -61,6 +80,8 @@ class Traction(Constraint):
     regularization: float = 0.5
     margin: float = 0.0
 
+    info_keys: ClassVar[tuple[str, ...]] = (keys.SLIP_RATIO, keys.SLIP_MU_ESTIMATE)
+
     def __post_init__(self) -> None:
         self.wheels = name_list("wheels", self.wheels, "joint names", least=0)
         self.max_slip = positive("max_slip", self.max_slip, "slip, in (0, 1)")
@@ -72,70 +93,47 @@ class Traction(Constraint):
         if self.margin >= self.max_slip:
             raise ConfigurationError(f"margin must be below max_slip = {self.max_slip}, got {self.margin}")
 
-
-@dataclass
-class TractionMemory:
-    """What Traction remembers of an episode; arrays of shape (wheels,), before the last control."""
-
-    estimate: FrictionEstimate
-    rate: Array | None  # turning rates, rad/s; None: nothing was measured
-    time: float  # s
-    ground: Array  # speeds of the ground below, m/s
-    slip: Array  # slip ratios along the heading
-    across: Array  # and across it
-    load: Array  # forces on the ground, N
-    most_load: Array  # the largest so far, N
-    faster: Array  # recent error of the predicted ground speed, upwards, m/s
-    slower: Array  # downwards, m/s
-    ahead: Array  # by how much the ground speed is predicted to change, m/s
-    traction: Array  # force of the ground in the last control step, N
-    present: Array  # of the ground at its end, N
-
-
-class BoundTraction(BoundConstraint, of=Traction):
-    """Traction on a plant."""
-
-    info_keys: tuple[str, ...] = (keys.SLIP_RATIO, keys.SLIP_MU_ESTIMATE)
-    spec: Traction
-    plant: MujocoPlant
-    seen: TractionMemory  # what is known at the observed state
-
-    def __init__(self, spec: Traction, plant: Plant) -> None:
-        hint = "Traction needs a MujocoPlant: it reads the wheels from the model"
-        super().__init__(spec, require_mujoco(plant, hint))
+    def setup(self, plant: Plant) -> None:
+        super().setup(
+            require_mujoco(plant, "Traction needs a MujocoPlant: it reads the wheels from the model")
+        )
         if self.plant.delay_s > 0.0:
             raise ConfigurationError(
                 "Traction measures the ground's force from how the wheels answer, which a plant with a delay "
                 f"({self.plant.delay_s} s) predicts instead; use delay_s=0"
             )
-        self.wheels = DrivenWheels(self.plant, self.spec.wheels)
-        self.wheels.refuse_stiff_servos(self.plant)
-        self.constants = self.wheels.constants(self.plant)
-        options, feedback = self.plant.model.opt, self.wheels.feedback
+        self._wheels = DrivenWheels(self.plant, self.wheels)
+        self._wheels.refuse_stiff_servos(self.plant)
+        self.constants = self._wheels.constants(self.plant)
+        options, feedback = self.plant.model.opt, self._wheels.feedback
         hold = float(options.timestep), self.plant.substeps
         self._response = self.constants.response(*hold, feedback, int(options.integrator) in _IMPLICIT)
+        slip, friction = np.zeros(len(self.wheels)), self._start().estimate.mean
+        self.report |= {keys.SLIP_RATIO: slip, keys.SLIP_MU_ESTIMATE: friction}
 
-    def start(self) -> Memory:
-        n = len(self.spec.wheels)
+    def _start(self) -> TractionMemory:
+        n = len(self.wheels)
         return TractionMemory(FrictionEstimate(n), None, math.nan, *(np.zeros(n) for _ in range(10)))
 
-    def executed(self, control: Array) -> Memory:
-        return self.seen
-
-    def observe(self, memory: TractionMemory) -> None:
+    def observe(self, memory: Memory) -> None:
         """Take the state and measure what the last control step showed."""
-        self._rows: HalfSpaces | None = None
-        seen = self.seen = replace(memory, estimate=memory.estimate.copy())
-        rate, ground, sideways = self.wheels.motion(self.plant)
+        before = memory.get("traction") or self._start()
+        seen = memory["traction"] = self.seen = replace(before, estimate=before.estimate.copy())
+        self._measure(seen)
+        self.report[keys.SLIP_RATIO] = seen.slip.copy()
+        self.report[keys.SLIP_MU_ESTIMATE] = seen.estimate.mean
+
+    def _measure(self, seen: TractionMemory) -> None:
+        rate, ground, sideways = self._wheels.motion(self.plant)
         published = self.plant.published()
         assert published is not None  # there is no delay
-        load = self.wheels.loads(self.plant.attribute("model"), published)
+        load = self._wheels.loads(self.plant.attribute("model"), published)
         if not np.isfinite(rate + ground + sideways + load).all():
             seen.rate = None
             return
         wheel = self.constants.radius * rate
-        slip = slip_ratio(wheel, ground, self.spec.regularization)
-        faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.spec.regularization)
+        slip = slip_ratio(wheel, ground, self.regularization)
+        faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.regularization)
         across = np.abs(sideways) / faster
         elapsed, seen.time = self.plant.time - seen.time, self.plant.time
         held = math.isclose(elapsed, self.plant.control_dt, rel_tol=1e-6)
@@ -149,18 +147,18 @@ class BoundTraction(BoundConstraint, of=Traction):
             seen.faster = np.maximum(error, _SPEED_ERROR_FADE * seen.faster)
             seen.slower = np.maximum(-error, _SPEED_ERROR_FADE * seen.slower)
             seen.ahead = ground - seen.ground
-            torque = self.wheels.torque(published)
+            torque = self._wheels.torque(published)
             seen.traction = self.constants.traction(self._response, seen.rate, rate, torque)
             # Below the regularisation the number is no slip ratio, and says nothing about the curve.
-            self._learn(ground, slip, across, load, rolls=faster > self.spec.regularization)
+            self._learn(ground, slip, across, load, rolls=faster > self.regularization)
         seen.rate, seen.ground, seen.slip, seen.across, seen.load = rate, ground, slip, across, load
         at, spread = seen.estimate.peak_slip
-        limit = np.minimum(self.spec.max_slip, at - _CAUTION * spread) - self.spec.margin
+        limit = np.minimum(self.max_slip, at - _CAUTION * spread) - self.margin
         # Along and across share one curve: what slides sideways already is not left for driving and braking.
         limit = np.sqrt(np.maximum(limit**2 - across**2, 0.0))
-        self._limit = np.maximum(limit, _LEAST_LIMIT * self.spec.max_slip)
+        self._limit = np.maximum(limit, _LEAST_LIMIT * self.max_slip)
         speed, radius = ground + seen.ahead, self.constants.radius
-        low, high = slip_window(speed, self._limit, self.spec.regularization)
+        low, high = slip_window(speed, self._limit, self.regularization)
         self._window = low / radius, high / radius
         # A ground speed above the prediction is slip of a braked wheel, one below it of a driven wheel.
         below, above = _kept_free(seen.faster, speed - low), _kept_free(seen.slower, high - speed)
@@ -199,13 +197,8 @@ class BoundTraction(BoundConstraint, of=Traction):
         """Two per wheel, for driving and braking torque, where the drive could exceed them."""
         if self.seen.rate is None:  # says nothing, and a row that is not a number fails
             return HalfSpaces(np.full((1, self.plant.lower.size), np.nan), np.full(1, np.nan))
-        if self._rows is None:
-            self._rows = self._bounds()
-        return self._rows
-
-    def _bounds(self) -> HalfSpaces:
-        bias, effect = self.wheels.drive(self.plant)
-        carried = 0.0 if self.spec.friction is None else self.spec.friction * self.seen.load
+        bias, effect = self._wheels.drive(self.plant)
+        carried = 0.0 if self.friction is None else self.friction * self.seen.load
         most = self._torques(self._window[1], np.maximum(self.seen.present, carried)) - bias
         least = self._torques(self._window[0], np.minimum(self.seen.present, -carried)) - bias
         low, high = self.plant.acting_range
@@ -224,11 +217,15 @@ class BoundTraction(BoundConstraint, of=Traction):
         normals = np.concatenate([effect[up], -effect[down]])
         return HalfSpaces(normals, np.concatenate([most[up], -least[down]]))
 
-    def backup(self) -> Array:
+    def proposals(self, control: Array | None) -> Iterable[Array]:
         """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
+        if control is None:
+            yield self._braking()
+
+    def _braking(self) -> Array:
         if self.seen.rate is None:
             return np.zeros_like(self.plant.lower)
-        bias, effect = self.wheels.drive(self.plant)
+        bias, effect = self._wheels.drive(self.plant)
         speed = self.seen.ground + self.seen.ahead
         low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
         wanted = np.where(speed > 0.0, low, high)
@@ -236,10 +233,6 @@ class BoundTraction(BoundConstraint, of=Traction):
         wanted = np.where(speed > 0.0, np.maximum(wanted, 0.0), np.minimum(wanted, 0.0))
         torque = self._torques(wanted, self.seen.present) - bias
         return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
-
-    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info keys `slip/...`, of the state before the step."""
-        return {keys.SLIP_RATIO: self.seen.slip.copy(), keys.SLIP_MU_ESTIMATE: self.seen.estimate.mean}
 
 
 def _kept_free(error: Array, room: Array) -> Array:

@@ -26,6 +26,10 @@ LONGEST_HORIZON = 60
 """Control steps of a proposed horizon at most: each costs a forecast of as many."""
 
 
+class NotMeasuredError(Exception):
+    """Why a symptom cannot be measured in an env; never leaves this package."""
+
+
 def random_driver(env: Env, seed: int) -> Driver:
     """Uniform random actions."""
     rng, (low, high) = np.random.default_rng(seed), box(env)
@@ -35,15 +39,15 @@ def random_driver(env: Env, seed: int) -> Driver:
 def attacking_driver(env: Env, seed: int) -> Driver:
     """Random corners of the action space, each held for 15 steps."""
     rng, (low, high) = np.random.default_rng(seed), box(env)
-    held: dict[str, Any] = {"left": 0}
 
-    def act(observation: Any) -> Any:
-        if held["left"] == 0:
-            held.update(left=PULSE_STEPS, action=np.where(rng.random(low.shape) < 0.5, low, high))
-        held["left"] -= 1
-        return held["action"].astype(env.action_space.dtype)
+    def actions() -> Iterator[Any]:
+        while True:
+            corner = np.where(rng.random(low.shape) < 0.5, low, high)
+            for _ in range(PULSE_STEPS):
+                yield corner.astype(env.action_space.dtype)
 
-    return act
+    drawn = actions()
+    return lambda observation: next(drawn)
 
 
 def policy_driver(policy: Any) -> Driver:
@@ -69,60 +73,73 @@ def box(env: Env) -> tuple[Array, Array]:
     return np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
 
 
+def _physics(env: Env) -> tuple[mujoco.MjModel, mujoco.MjData] | tuple[None, None]:
+    raw: Any = env.unwrapped
+    model, data = getattr(raw, "model", None), getattr(raw, "data", None)
+    known = isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData)
+    return (model, data) if known else (None, None)
+
+
 @dataclass
 class Recording:
-    """What one driver did; k control steps. What MuJoCo says is empty for an env without it.
+    """What one driver did in k control steps. What MuJoCo says is empty for an env without it.
 
     Attributes:
+        env: As it was given to `record`.
+        control_dt: Control interval, s; NaN where nothing says it.
         infos: Of each step, with those of a contact and a balance monitor, where the env allows them.
+        struck: Names of the two bodies with the largest force of each step; None where there was none.
+        touching: After each step, pairs of geoms that touch, ids.
         first: The first steps of episodes, shape (k,).
         terminated: Shape (k,).
         executed: The actions that the unwrapped env was given, shape (k, m).
-        struck: Names of the two bodies with the largest force of each step; None where there was none.
-        controls: The model's control that each step left, shape (k, nu).
         qpos: After each step, shape (k, nq).
         qvel: Shape (k, nv).
-        contacts: After each step, pairs of geoms that touch, ids.
         diverged: Whether MuJoCo has found numbers in a step that are not finite, and has reset its data, shape (k,).
-        control_dt: Control interval, s; NaN where nothing says it.
     """
 
+    env: Env
+    control_dt: float
     infos: list[dict[str, Any]]
+    struck: list[tuple[str, str] | None]
+    touching: list[set[tuple[int, int]]]
     first: np.ndarray
     terminated: np.ndarray
     executed: Array
-    struck: list[tuple[str, str] | None]
-    controls: Array
     qpos: Array
     qvel: Array
-    contacts: list[set[tuple[int, int]]]
     diverged: np.ndarray
-    control_dt: float
 
     def of_info(self, key: str) -> Array:
         """A number of each step's info, shape (k,); NaN where a step does not report it."""
         return np.array([float(info.get(key, np.nan)) for info in self.infos])
 
     @property
-    def not_replayed(self) -> str:
-        """Why a monitor's figures say nothing of this env; "" where they do."""
+    def model(self) -> mujoco.MjModel | None:
+        """MuJoCo's model of the env; None where it has none."""
+        return _physics(self.env)[0]
+
+    @property
+    def needed_model(self) -> mujoco.MjModel:
+        """The same; `NotMeasuredError` where there is none."""
+        if (model := self.model) is None:
+            raise NotMeasuredError("the env has no MuJoCo model")
+        return model
+
+    def check_replays(self) -> None:
+        """`NotMeasuredError` where the figures of the monitors say nothing of this env."""
         partial = max(np.mean(self.of_info(f"{monitor}/partial") > 0.0) for monitor in ("contact", "balance"))
-        why = "most control steps, made once more, end elsewhere: the env changes its state between substeps"
-        return why if partial > 0.5 else ""
+        if partial > 0.5:
+            raise NotMeasuredError(
+                "most control steps, made once more, end elsewhere: the env changes its state between substeps"
+            )
 
-
-def braking_horizon(recording: Recording) -> int:
-    """Control steps in which the speeds that were seen are braked, by the changes of speed that were usual."""
-    change = np.abs(np.diff(recording.qvel, axis=0)).max(axis=1)[~recording.first[1:]]
-    usual = float(np.median(change)) if change.size else 0.0
-    return int(np.clip(np.ceil(np.abs(recording.qvel).max() / max(usual, 1e-9)), 5, LONGEST_HORIZON))
-
-
-def physics(env: Env) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-    """MuJoCo's model and data of an env; None where it has none."""
-    raw: Any = env.unwrapped
-    model, data = getattr(raw, "model", None), getattr(raw, "data", None)
-    return (model, data) if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData) else None
+    @property
+    def braking_horizon(self) -> int:
+        """Control steps in which the speeds that were seen are braked, by the changes of speed that were usual."""
+        change = np.abs(np.diff(self.qvel, axis=0)).max(axis=1)[~self.first[1:]]
+        usual = float(np.median(change)) if change.size else 0.0
+        return int(np.clip(np.ceil(np.abs(self.qvel).max() / max(usual, 1e-9)), 5, LONGEST_HORIZON))
 
 
 class _Spy(gym.Wrapper[Any, Any, Any, Any]):
@@ -136,30 +153,14 @@ class _Spy(gym.Wrapper[Any, Any, Any, Any]):
 
 
 @contextmanager
-def _spied(env: Env) -> Iterator[tuple[Env, _Spy]]:
-    """The env with a spy as its innermost wrapper, as long as this lasts."""
-    spy = _Spy(env.unwrapped)
-    innermost = next((layer for layer in wrappers_of(env) if layer.env is env.unwrapped), None)
-    if innermost is None:
-        yield spy, spy
-        return
-    innermost.env = spy
+def _spied(env: gym.Wrapper[Any, Any, Any, Any]) -> Iterator[_Spy]:
+    """A spy as the env's innermost wrapper, as long as this lasts."""
+    *_, innermost = wrappers_of(env)
+    innermost.env = spy = _Spy(env.unwrapped)
     try:
-        yield env, spy
+        yield spy
     finally:
         innermost.env = spy.env
-
-
-def _monitored(env: Env) -> tuple[Env, ContactMonitor | None]:
-    """The env in a contact and a balance monitor, where it allows them."""
-    contacts = None
-    for monitor in (ContactMonitor, BalanceMonitor):
-        with suppress(
-            ConfigurationError
-        ):  # no MuJoCo, nothing that stands, or a wrapper inside whose step is many
-            env = monitor(env)
-        contacts = env if isinstance(env, ContactMonitor) else contacts
-    return env, contacts
 
 
 def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
@@ -168,40 +169,39 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
     Raises:
         ActionError: The driver gave an action of another shape, or one that is not finite; the env never gets it.
     """
-    found, size = physics(env), math.prod(env.action_space.shape or ())
-    env, monitor = _monitored(env)
+    data, size = _physics(env)[1], math.prod(env.action_space.shape or ())
+    monitored: Any = gym.Wrapper(env)
+    for monitor in (ContactMonitor, BalanceMonitor):
+        with suppress(ConfigurationError):  # no MuJoCo, nothing that stands, a wrapper whose step is many
+            monitored = monitor(monitored)
+    contacts = next((layer for layer in wrappers_of(monitored) if isinstance(layer, ContactMonitor)), None)
     rows: list[tuple[Any, ...]] = []
-    states: list[tuple[Any, ...]] = []
     observation, over, episode, control_dt = None, True, 0, math.nan
     with suppress(ConfigurationError):
         control_dt = check_timing(env, None)
-    with _spied(env) as (env, spy), warnings.catch_warnings():
+    with _spied(monitored) as spy, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         for _ in range(steps):
             first = over
             if first:
-                observation, _ = env.reset(seed=seed + episode)
+                observation, _ = monitored.reset(seed=seed + episode)
                 getattr(driver, "reset", lambda: None)()
                 episode += 1
             action = finite_action(driver(observation), size)
-            before = (0.0, 0) if found is None else (found[1].time, _warnings(found[1]))
-            observation, _, terminated, truncated, info = env.step(action)
-            struck = None if monitor is None else monitor.peak_bodies
-            rows.append((info, first, terminated, spy.given, struck))
+            before = (0.0, 0) if data is None else (data.time, _warnings(data))
+            observation, _, terminated, truncated, info = monitored.step(action)
             over = bool(terminated or truncated)
-            if found is not None:
-                data = found[1]
+            struck = None if contacts is None else contacts.peak_bodies
+            pairs, qpos, qvel, diverged = set(), np.empty(0), np.empty(0), False
+            if data is not None:
                 diverged = _warnings(data) > before[1]
                 control_dt = control_dt if diverged else data.time - before[0]
                 touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
                 pairs = {(int(a), int(b)) for a, b in touching}
-                states.append((data.ctrl.copy(), data.qpos.copy(), data.qvel.copy(), pairs, diverged))
-    infos, starts, ends, executed, bodies = zip(*rows, strict=True)
-    controls, qpos, qvel, contacts, bad = zip(*states, strict=True) if states else ((),) * 5
-    return Recording(
-        list(infos), np.array(starts), np.array(ends), np.array(executed), list(bodies),
-        np.array(controls), np.array(qpos), np.array(qvel), list(contacts), np.array(bad), control_dt,
-    )  # fmt: skip
+                qpos, qvel = data.qpos.copy(), data.qvel.copy()
+            rows.append((info, struck, pairs, first, terminated, spy.given, qpos, qvel, diverged))
+    infos, bodies, touched, *arrays = zip(*rows, strict=True)
+    return Recording(env, control_dt, list(infos), list(bodies), list(touched), *map(np.array, arrays))
 
 
 def _warnings(data: mujoco.MjData) -> int:

@@ -1,22 +1,18 @@
-"""What a constraint is: a specification, and what it becomes on a plant."""
+"""Constraint: one safety requirement, as data and a function h of where a control leads."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.shapes import squashed
-from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
 Promise = Literal["proved", "best effort"]
-Memory = Any
-"""What a bound constraint keeps from one control step to the next; None if nothing."""
+Memory = dict[str, Any]
+"""What lasts of an episode: written in one control step, read in the next ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,35 +36,97 @@ class HalfSpaces:
 
 
 class Constraint:
-    """One safety requirement, as a specification: plain data, bound to no env.
+    """One safety requirement: `h >= margin` wherever a control leads.
 
-    A subclass is a dataclass that checks its fields. On a plant it becomes the `BoundConstraint` that is declared
-    `of` it, or what its own `bind` returns.
+    A subclass is a dataclass: its fields are checked in `__post_init__`, and it writes `h_along`, or `rows` alone.
+    Everything else has a default. The filter works with copies, one for every plant.
+
+    A control is admitted if `h` of its trajectory keeps the margin (from outside: comes back towards it). The
+    trajectory is that of `model`: the control held for one control interval, and braking after it.
 
     Attributes:
         promise: What holds for an executed control that is not flagged: "proved" or "best effort".
+        margin: Kept free before the limit, in the unit of h.
+        state_error: Bound on the error of what is measured, in the same unit.
+        horizon: Control intervals of the trajectory.
+        max_decrease: The most that h can fall within `horizon` control steps; states with more than that left need
+            no trajectory. It is checked at every step, and dropped with a warning when broken. None: unknown.
+        unit: Of h, for messages.
+        plant: Set by `setup`.
+        model: What predicts; it has `rollout(control, horizon)`. The plant by default.
+        memory: Of the episode.
+        report: The info keys of its own, those in `info_keys`; `setup` writes what they are where nothing is known,
+            and `observe` or `h_along` what they are in this step, of the executed control in the end.
     """
 
     promise: Promise = "best effort"
-    measures_approach: ClassVar[bool] = False
-    """Whether `BoundConstraint.approach` measures clearance and approach speed."""
+    margin: float = 0.0
+    state_error: float = 0.0
+    horizon: int = 1
+    max_decrease: float | None = None
+    unit: ClassVar[str] = "units of h"
+    info_keys: ClassVar[tuple[str, ...]] = ()
+
+    predicts: ClassVar[bool] = True
+    """Whether h of the trajectory decides."""
+    measures_state: ClassVar[bool] = True
+    """Whether h says something of the present state."""
+    rows_decide: ClassVar[bool] = False
+    """Whether the rows are the requirement, or a part of it; else they are a guess that h verifies."""
+    recovery_s: ClassVar[float] = 0.1
+    """Time constant with which a violation must shrink, s; 0: the next step starts afresh; inf: it must not grow."""
+    decay: ClassVar[float] = 1.0
+    """The share of h that one control step may use up, where `proposals(None)` leaves so much."""
+    smooth: ClassVar[bool] = True
+    """Whether h changes smoothly with the control, so that tangents are worth their trajectories."""
+    rounding: float = 1e-9
+    """How far below zero what is left may be and count as rounding."""
+    at_rest: ClassVar[float] = 0.0
+    """What h of a machine at rest may lose on springy contacts."""
+    scale: float = 1.0
+    """A typical size of h, to compare constraints of different units."""
     simulates: ClassVar[bool] = False
     """Whether it needs a plant that rolls out policies, `SimulatorPlant` by default."""
-    margin = 0.0
-    """Kept free before the limit, in the constraint's own unit."""
-    state_error = 0.0
-    """Bound on the error of what is measured, in the same unit."""
+    look_ahead_below: float | None = None
+    """A control that leaves this much after its own control step is admitted without a look at the others."""
+    euler_look_ahead: bool = False
+    """Whether those are looked at by Euler steps."""
 
-    _becomes: ClassVar[type["BoundConstraint"]]
+    plant: Any
+    model: Any
+    memory: Memory
+    report: dict[str, Any]
 
-    def bind(self, plant: Plant) -> "BoundConstraint":
-        """The constraint on a plant that is bound to its env.
+    def setup(self, plant: Plant) -> None:
+        """Read what is needed of the plant's model, such as ids of names; again when the model has changed.
 
         Raises:
             UnsupportedEnvError: The plant does not have what the constraint needs.
             ConfigurationError: Names or numbers that do not fit the plant.
         """
-        return self._becomes(self, plant)
+        self.plant = self.model = plant
+
+    def observe(self, memory: Memory) -> None:
+        """Take the plant's present state; `memory["control"]` is what was executed before, if anything was.
+
+        What is written into the memory lasts if a control is executed in this state.
+        """
+
+    def h_along(self, path: Any) -> Array:
+        """What is left of the limit along a trajectory, in time, margin not taken off: shape (instants, k).
+
+        Also of `model.rollout(None)`: the present state, or for models that stop from there the way to rest. NaN
+        counts as lost. k may be 0 where nothing is near.
+        """
+        return np.zeros((1, 0))
+
+    def rows(self) -> HalfSpaces | None:
+        """Half-spaces on the control, or None."""
+        return None
+
+    def proposals(self, control: Array | None) -> Iterable[Array]:
+        """Controls to try for a refused one, the best first; of None: backups. Only admitted ones are taken."""
+        return ()
 
     def widened(self, margin: float) -> Self:
         """A copy whose margin is wider by this much, in the unit of its margin."""
@@ -78,165 +136,3 @@ class Constraint:
         own: Any = self
         wider: Self = replace(own, margin=own.margin + margin)
         return wider
-
-
-class BoundConstraint:
-    """A constraint on one plant. Every method has a default; a subclass overrides what it can answer.
-
-    In every control step the filter calls `observe` once, after the plant has taken the env's state, then the other
-    methods, and closes the step with `executed`. What lasts from step to step is a value: `start` gives that of a new
-    episode, `observe` takes it, `executed` returns the next one. A constraint may keep what it has computed until the
-    next `observe`, and must not change anything else.
-
-    A constraint that says its requirement as rows overrides `rows` alone. One that predicts a held control sets
-    `predicts` and overrides `slack`, or `admits`; its rows are then a guess.
-
-    `class BoundThis(BoundConstraint, of=This)` is what `This.bind` returns.
-
-    Args:
-        spec: The specification.
-        plant: Bound to its env.
-    """
-
-    predicts: bool = False
-    """Whether `admits` and `slack` predict a held control; else they evaluate the rows."""
-    has_value: bool = False
-    """Whether there is a barrier: set for every subclass that overrides `value`."""
-    has_backup: bool = False
-    """Whether it knows a backup control: set for every subclass that overrides `backup`."""
-    tolerance: float = 0.0
-    """How far below zero a slack may be and count as rounding."""
-    info_keys: tuple[str, ...] = ()
-    """The keys that `info` writes."""
-
-    def __init_subclass__(cls, of: type[Constraint] | None = None, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if of is not None:
-            of._becomes = cls
-        cls.has_value = cls.value is not BoundConstraint.value
-        cls.has_backup = cls.backup is not BoundConstraint.backup
-
-    def __init__(self, spec: Any, plant: Any) -> None:
-        self.spec, self.plant = spec, plant
-
-    @property
-    def scale(self) -> float:
-        """A typical size of the slack, to compare constraints of different units."""
-        return 1.0
-
-    def start(self) -> Memory:
-        """The memory at the start of an episode."""
-        return None
-
-    def observe(self, memory: Memory) -> None:
-        """Take the plant's present state and the memory."""
-
-    def check(self) -> None:
-        """Refuse at a reset what only a state can show."""
-
-    def load(self) -> None:
-        """Run once, in the first observed state, the compiled code that a step may need."""
-
-    def value(self) -> Array:
-        """The barriers h, shape (k,), positive inside; the margin is not taken off. k may be 0: nothing is near."""
-        return np.zeros(0)
-
-    def feature_count(self, neighbours: int) -> int:
-        """How many `features` there are, at every state."""
-        return 1
-
-    def features(self, neighbours: int) -> Array:
-        """What a learner may be shown of the observed state, in [-1, 1], shape (feature_count,).
-
-        The first is the smallest h, squashed: `scale` is 0.5, and 1 is none at all. A constraint with obstacles adds
-        the `neighbours` nearest.
-        """
-        lowest = float(self.value().min(initial=np.inf))
-        return np.array([squashed(lowest, self.scale)])
-
-    def approach(self) -> tuple[Array, Array] | None:
-        """Clearances in m and approach speeds in m/s, shapes (k,), or None: they are not measured."""
-        return None
-
-    def rows(self) -> HalfSpaces:
-        """The half-spaces on the control."""
-        return HalfSpaces.none(self.plant.lower.size)
-
-    def slack(self, control: Array) -> float:
-        """What a control, shape (m,), leaves of the requirement, in its unit; >= 0: kept. NaN counts as lost."""
-        rows = self.rows()
-        return float((rows.offsets - rows.normals @ control).min(initial=np.inf))
-
-    def admits(self, control: Array) -> bool:
-        """Whether a control, held for one control interval, keeps the requirement."""
-        return self.slack(control) >= -self.tolerance
-
-    def keeps_limit(self, control: Array) -> bool:
-        """Inside the margin: whether a refused control keeps the limit, and loses no more of the margin.
-
-        Asked where no control is admitted. Such a control is executed without being reported as infeasible.
-        """
-        return False
-
-    def linearize(self, control: Array) -> HalfSpaces:
-        """The requirement linearised about a refused control; no rows: it cannot be."""
-        return HalfSpaces.none(self.plant.lower.size)
-
-    def candidates(self, control: Array) -> Iterable[Array]:
-        """Controls to try for a refused one before it is projected, the best first; only admitted ones are taken."""
-        return ()
-
-    def backup(self) -> Array | None:
-        """A control that the constraint knows to keep it, shape (m,), or None."""
-        return None
-
-    @classmethod
-    def batch(cls, bound: Sequence[Self]) -> "ConstraintBatch | None":
-        """The same constraint on the plants of n envs, judged in one call, or None: one by one.
-
-        Asked where each is the only constraint of its env.
-        """
-        return None
-
-    def executed(self, control: Array) -> Memory:
-        """The memory after a control was executed in the observed state."""
-        return None
-
-    def draw(self) -> Sequence[Mark]:
-        """What a picture of the observed state shows of the constraint (`SafetyOverlay`), in world coordinates."""
-        return ()
-
-    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info keys of its own, always the same; None: nothing was judged yet, or the state is not a number."""
-        return {}
-
-
-class ConstraintBatch(ABC):
-    """The bound constraints of n envs with one action box; `BoundConstraint.batch` makes it.
-
-    It judges proposals as the constraints one by one, bit for bit.
-    """
-
-    @abstractmethod
-    def restart(self, env: int, memory: Memory) -> None:
-        """Take an env's new episode, or the memory that its own constraint was left with."""
-
-    @abstractmethod
-    def memory(self, env: int) -> Memory:
-        """What the constraint of an env remembers, as its own `start` and `executed` give it."""
-
-    @abstractmethod
-    def judge(self, proposals: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Take every env's present state.
-
-        Args:
-            proposals: Inside the action box, shape (n, m); rows with NaN get an arbitrary answer.
-
-        Returns:
-            The smallest h of each env, shape (n,), NaN if one is not a number; whether its proposal is admitted,
-            shape (n,).
-        """
-
-    @abstractmethod
-    def executed(self, envs: NDArray[np.bool_]) -> None:
-        """Remember that the proposals of these envs, shape (n,), which were admitted, are executed."""

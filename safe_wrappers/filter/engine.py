@@ -9,7 +9,8 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.projection import load_solvers
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.bound import Bound
+from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.filter.search import Decision, SafeActionSearch
 from safe_wrappers.plants.plant import Plant
@@ -64,8 +65,8 @@ class SafetyFilter:
         """Let the constraints read what they need of the plant's model."""
         fallback, low, high, dtype, search = self._making
         plant = self.plant
-        self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in self._constraints]
-        self.reporting = [c for c in self.bound if c.info_keys]
+        self.bound = [Bound(constraint, plant) for constraint in self._constraints]
+        self.reporting = [c for c in self.bound if c.spec.info_keys]
         kinds = [type(c.spec).__name__ for c in self.reporting]
         for kind in kinds:
             if kinds.count(kind) > 1:
@@ -80,16 +81,14 @@ class SafetyFilter:
         return self.plant.model_version != self._model_version
 
     def start(self) -> None:
-        """Forget the episode, take the state of the next one, and refuse what only a state can show."""
+        """Forget the episode, and take the state of the next one."""
         self.plant.executed(None)
-        self.memories = [c.start() for c in self.bound]
+        self.memories: list[Memory] = [{} for _ in self.bound]
         self.last = np.clip(np.zeros_like(self._low), self._low, self._high)
         self.observe()
-        for c in self.bound:
-            c.check()
         if not self._loaded and self.margin == self.margin:
-            for c in self.bound:
-                c.load()
+            for c in self.bound:  # compiles what a step may need
+                c.rows(), c.slack(self.last), c.backup()
             self._loaded = True
 
     def take_over(self, before: "SafetyFilter") -> None:
@@ -98,8 +97,6 @@ class SafetyFilter:
         It is to be observed next. Before an episode there is nothing to go on with.
         """
         if hasattr(before, "memories"):
-            for c in self.bound:
-                c.start()
             self.memories, self.last, self.margin = before.memories, before.last, before.margin
 
     def observe(self) -> None:
@@ -108,21 +105,18 @@ class SafetyFilter:
         plant.observe()
         if self.outdated:  # what the constraints remember of the episode stays
             self._bind()
-            for c in self.bound:
-                c.start()
         self.margin = math.nan
+        for c in self.reporting:
+            c.forget_report()
         state = float(np.add.reduce(plant.state))  # half the time of its method
         if state - state != 0.0:
             return
         lowest = math.inf
         for c, memory in zip(self.bound, self.memories, strict=True):
             c.observe(memory)
-            h = c.value()
-            if h.size:
-                least = float(h.min()) if h.size > 1 else float(h[0])
-                if least != least:
-                    return
-                lowest = min(lowest, least)
+            if c.least != c.least:
+                return
+            lowest = min(lowest, c.least)
         self.margin = lowest
 
     def filter(self, boxed: Array | None) -> Decision:
@@ -145,11 +139,9 @@ class SafetyFilter:
             for i, c in enumerate(self.bound):
                 self.memories[i] = c.executed(control)
 
-    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The constraints' own info keys about the observed state; None after a reset."""
-        if self.margin != self.margin:
-            proposed = executed = None
-        found: dict[str, Any] = {}
+    def info(self) -> dict[str, Any]:
+        """The info keys of the plant's and of the constraints' own about the observed state."""
+        found = self.plant.info()
         for c in self.reporting:
-            found |= c.info(proposed, executed)
+            found |= c.spec.report
         return found

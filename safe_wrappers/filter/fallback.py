@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from safe_wrappers.checks import Array, float_array
 from safe_wrappers.control.numerics.projection import box_least_squares
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import BoundConstraint
+from safe_wrappers.filter.bound import Bound
 from safe_wrappers.plants.mujoco.model import inertia
 from safe_wrappers.plants.plant import Plant
 
@@ -32,7 +32,7 @@ class Fallback:
         UnknownNameError: No fallback of that name.
     """
 
-    def __init__(self, choice: str | FallbackFunction, constraints: Sequence[BoundConstraint] = ()) -> None:
+    def __init__(self, choice: str | FallbackFunction, constraints: Sequence[Bound] = ()) -> None:
         if not callable(choice) and choice not in NAMES:
             names = ", ".join(NAMES)
             raise UnknownNameError(f"no fallback {choice!r}; choose {names}, or pass a function of the plant")

@@ -19,7 +19,8 @@ from safe_wrappers.control.numerics.projection import (
     keeps_rows,
     project_unchecked,
 )
-from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
+from safe_wrappers.filter.bound import Bound
+from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.plants.plant import Plant
 
@@ -88,7 +89,7 @@ class SafeActionSearch:
     def __init__(
         self,
         plant: Plant,
-        constraints: Sequence[BoundConstraint],
+        constraints: Sequence[Bound],
         fallback: Fallback,
         low: Array,
         high: Array,
@@ -98,7 +99,8 @@ class SafeActionSearch:
         self._plant, self._fallback, self._low, self._high = plant, fallback, low, high
         self._constraints = list(constraints)
         self._predicting = [c for c in constraints if c.predicts]
-        self._rows_only = [c for c in constraints if not c.predicts]
+        self._guessing = [c for c in constraints if not c.rows_decide]
+        self._ruling = [c for c in constraints if c.rows_decide]
         self._no_rows: Rows = np.zeros((0, low.size)), np.zeros(0)
         self._tried: list[Array] = []
 
@@ -112,7 +114,7 @@ class SafeActionSearch:
 
     def _decide(self, proposal: Array, last: Array) -> Decision:
         refused = bool(self._predicting) and not self._admitted(proposal)
-        strict = self._rows(self._rows_only) if self._rows_only else self._no_rows
+        strict = self._rows(self._ruling) if self._ruling else self._no_rows
         if not refused:
             if not strict[1].size:
                 return Decision(proposal, Stage.PROPOSAL, changed=False)
@@ -137,7 +139,7 @@ class SafeActionSearch:
 
     def _search(self, proposal: Array, strict: Rows, last: Array) -> Decision:
         """Project on the rows of all constraints; where prediction refuses the answer, look closer."""
-        rows = _joined(strict, self._rows(self._predicting))
+        rows = _joined(strict, self._rows(self._guessing))
         result, control = self._project(proposal, *rows)
         if result.status is Status.INFEASIBLE:
             # Linear rows of constraints that predict are only a guess: what counts is the others' rows.
@@ -196,7 +198,7 @@ class SafeActionSearch:
 
     def _room(self, control: Array) -> float:
         """The least slack of what predicts, in shares of the scales."""
-        return min((c.slack(control) / c.scale for c in self._predicting), default=np.inf)
+        return min((c.slack(control) / c.spec.scale for c in self._predicting), default=np.inf)
 
     def _nearby(self, proposal: Array, control: Array, rows: Rows, strict: Rows, last: Array) -> Decision:
         """More of the same correction, a backup control, or something in between; else the least violation."""
@@ -299,7 +301,7 @@ class SafeActionSearch:
     def _within(self, control: Array, strict: Rows) -> bool:
         return not strict[1].size or keeps_rows(control, *strict, self._low, self._high)
 
-    def _rows(self, asked: list[BoundConstraint]) -> Rows:
+    def _rows(self, asked: list[Bound]) -> Rows:
         return self._stacked([c.rows() for c in asked])
 
     def _stacked(self, parts: list[HalfSpaces]) -> Rows:

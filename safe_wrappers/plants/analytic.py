@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse_second_env
-from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.plant import Plant, Trajectory
 
 
 class AnalyticPlant(Plant):
@@ -106,16 +106,27 @@ class AnalyticPlant(Plant):
             x = x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
         return x
 
-    def path(self, control: Array) -> list[Array]:
-        """States half-way and at the end of a held control, by one Runge-Kutta step; the end by one Euler step."""
+    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
+        """States half-way and at the end of a held control, by one Runge-Kutta step; the end by one Euler step.
+
+        Raises:
+            ConfigurationError: A longer horizon: nothing says what follows after the held control.
+        """
         x, hold = self.state, self.control_dt
+        if control is None:
+            return Trajectory(None, x[None])
+        if horizon > 1:
+            raise ConfigurationError(
+                f"an AnalyticPlant predicts one control interval and does not know how to brake after it; got a "
+                f"horizon of {horizon}"
+            )
         half = 0.5 * hold
         k1 = self.f + self.g @ control
         k2 = self._rate(x + half * k1, control)
         k3 = self._rate(x + half * k2, control)
         k4 = self._rate(x + hold * k3, control)
         end = x + hold / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-        return [x + half * k3, end, x + hold * k1]
+        return Trajectory(control, np.array([x + half * k3, end, x + hold * k1]))
 
     def _rate(self, x: Array, control: Array) -> Array:
         return np.asarray(self._f(x), dtype=np.float64) + np.asarray(self._g(x), dtype=np.float64) @ control

@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import moves_by_displacement, welds
-from safe_wrappers.plants.mujoco.forecast import Forecast, Recorder
+from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Recorder
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 # The envs add the turn to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum.
@@ -130,11 +130,11 @@ class DisplacementPlant(MujocoPlant):
         super()._load_to_step()
         self.data.xpos[self._body], self.data.xquat[self._body] = self._pose[:3], self._pose[3:]
 
-    def forecast(self, control: Array, horizon: int = 1, euler: bool = False) -> Forecast:
+    def rollout(self, control: Array | None, horizon: int = 1, euler: bool = False) -> MujocoTrajectory:
         """A displacement, shape (4,), for one control interval, then none."""
-        if self.blocked:  # the last entry has no effect: share the forecast
+        if self.blocked and control is not None:  # the last entry has no effect: share the trajectory
             control = np.append(control[:3], 0.0)
-        return super().forecast(control, horizon, euler)
+        return super().rollout(control, horizon, euler)
 
     def _linearise(self) -> None:
         mujoco.mj_forward(self.model, self.data)

@@ -316,15 +316,15 @@ class IdentifiedPlant(RolloutPlant):
             predicted = self.model(self.state, control)
             self._least = measured(self._watched, predicted) - self._first
 
-    def rollout(
+    def simulate(
         self,
         control: Array,
         horizon: int,
-        policy: Policy | None = None,
-        measure: Measure | None = None,
-        least: float = -np.inf,
-        until: Callable[[View], bool] | None = None,
-        between: bool = False,
+        policy: Policy | None,
+        measure: Measure | None,
+        least: float,
+        until: Callable[[View], bool] | None,
+        between: bool,
     ) -> Rollout:
         """Roll out the model from the last observation: see `RolloutPlant.rollout`.
 

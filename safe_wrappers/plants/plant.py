@@ -9,7 +9,36 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
 
 
-class Plant(ABC):
+class Trajectory:
+    """Where a control leads.
+
+    Attributes:
+        control: The one that is held for the first control interval, shape (m,); None: of the present state alone.
+        states: Of the plant at k instants in time, shape (k, n).
+        holds: Control intervals, of as many instants each.
+    """
+
+    def __init__(self, control: Array | None, states: Array, holds: int = 1) -> None:
+        self.control, self.states, self.holds = control, states, holds
+
+
+class Model(ABC):
+    """What predicts where a control leads from the observed state."""
+
+    @abstractmethod
+    def rollout(self, control: Array | None, horizon: int = 1) -> Any:
+        """The trajectory of a control, shape (m,), over so many control intervals: it is held for the first.
+
+        Of None: of the present state, or where the model stops from there, on the way to rest. It has `holds`, as
+        `Trajectory` has.
+        """
+
+    def sketch(self, control: Array, horizon: int = 1) -> Any:
+        """The same, perhaps less exact and cheaper, to learn how it changes with the control."""
+        return self.rollout(control, horizon)
+
+
+class Plant(Model):
     """A control-affine machine `x' = f(x) + g(x) u`, read afresh from an env at every step.
 
     Attributes:
@@ -64,14 +93,14 @@ class Plant(ABC):
     def observe(self) -> None:
         """Take the env's present state."""
 
-    def received(self, observation: Any, info: dict[str, Any]) -> None:  # noqa: B027 - most plants read the env
+    def received(self, observation: Any, info: dict[str, Any]) -> None:
         """Take what the env's reset or step has returned; called before the next `observe`."""
 
     def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
         """Step the env with what may be executed; what `env.step` returns."""
         return env.step(action)
 
-    def follow(self) -> None:  # noqa: B027 - most plants have no model of the env's
+    def follow(self) -> None:
         """Read the env's model anew if it has changed; `model_version` counts how often."""
 
     def deviation(self) -> str:
@@ -94,9 +123,9 @@ class Plant(ABC):
         """The controls between which the force still changes, shapes (m,); None: all between the bounds."""
         return None
 
-    def path(self, control: Array) -> list[Array]:
-        """States on the way and at the end of a held control; empty where the plant cannot predict them."""
-        return []
+    def info(self) -> dict[str, Any]:
+        """The info keys of its own, always the same, after what was received last."""
+        return {}
 
     def drift(self, x: Array) -> Array:
         """The drift at any state, shape (n,); by default that of the present one."""

@@ -49,6 +49,11 @@ class Rollout:
     ended: bool = False
     reached: bool = False
 
+    @property
+    def holds(self) -> int:
+        """Control intervals."""
+        return len(self.observations)
+
 
 class RolloutPlant(Plant):
     """A plant that predicts by rollouts alone; it has neither f nor g."""
@@ -189,18 +194,17 @@ class RolloutPlant(Plant):
             raise ConfigurationError(wanted)
         return clipped.astype(self._space.dtype).astype(np.float64)
 
-    @abstractmethod
     def rollout(
         self,
-        control: Array,
-        horizon: int,
+        control: Array | None,
+        horizon: int = 1,
         policy: Policy | None = None,
         measure: Measure | None = None,
         least: float = -np.inf,
         until: Callable[[View], bool] | None = None,
         between: bool = False,
     ) -> Rollout:
-        """Simulate a control, then a policy, from the env's present state.
+        """Simulate a control, then a policy, from the env's present state; of None, the present state alone.
 
         Args:
             control: For the first step, shape (m,).
@@ -212,6 +216,22 @@ class RolloutPlant(Plant):
             between: Measure the env at physics substeps, too, where the plant `judges_substeps`; the least of a
                 step counts. The `View` has no observation there.
         """
+        if control is None:
+            return Rollout([self.view.observation])
+        return self.simulate(control, horizon, policy, measure, least, until, between)
+
+    @abstractmethod
+    def simulate(
+        self,
+        control: Array,
+        horizon: int,
+        policy: Policy | None,
+        measure: Measure | None,
+        least: float,
+        until: Callable[[View], bool] | None,
+        between: bool,
+    ) -> Rollout:
+        """A `rollout` of a control."""
 
     @abstractmethod
     def margins(self, measure: Measure, horizon: int) -> Array:

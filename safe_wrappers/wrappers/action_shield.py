@@ -101,6 +101,6 @@ class ActionShield(CBFActionFilter):
             return np.ones(len(every), dtype=bool)
         admitted = np.array([engine.admits(control) for control in every])
         if not admitted.any():
-            slacks = [min(c.slack(control) / c.scale for c in engine.bound) for control in every]
+            slacks = [min(c.slack(control) / c.spec.scale for c in engine.bound) for control in every]
             admitted[int(np.argmax(slacks))] = True
         return admitted

@@ -12,7 +12,8 @@ import numpy as np
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.bound import Bound
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import SafeActionSearch, Stage
@@ -174,7 +175,7 @@ class CBFActionFilter(LayerWrapper):
         # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
         report[keys.PROPOSED_ACTION] = np.zeros(self._shape)
         report[keys.EXECUTED_ACTION] = np.zeros(self._shape)
-        report |= self.filter.info(None, None)
+        report |= self.filter.info()
         self.started = True
         return report
 
@@ -196,8 +197,7 @@ class CBFActionFilter(LayerWrapper):
             self.plant.received(observation, info)
             info |= report
             info[keys.CBF_MISMATCH] = self.deviates()
-            if self.filter.reporting:
-                info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
+            info |= self.filter.info()
         return observation, reward, terminated, truncated, info
 
     def observe(self) -> None:
@@ -208,7 +208,7 @@ class CBFActionFilter(LayerWrapper):
         self.filter.observe()
         self._observed = True
 
-    def look(self) -> Sequence[BoundConstraint]:
+    def look(self) -> Sequence[Bound]:
         """The constraints in the env's present state, for who looks on; none where that is not a number.
 
         `step` observes anew, and decides and reports what it would have.

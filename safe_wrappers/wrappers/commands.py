@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.plants.default import default_plant
@@ -39,8 +40,8 @@ class FallbackController:
         self.plant, self.constraint = plant, None
         if plant is not None:
             plant.bind(env)
-            self.constraint = None if constraint is None else constraint.bind(plant)
-            known = self.constraint is not None and self.constraint.has_backup
+            self.constraint = None if constraint is None else Bound(constraint, plant)
+            known = self.constraint is not None and self.constraint.may_back_up
             if choice == "brake" and not (known or plant.can_brake):
                 others = f'with a {type(plant).__name__} choose "hold", "zero" or a function of the plant'
                 raise ConfigurationError(f'"brake" needs a MujocoPlant; {others}')
@@ -52,7 +53,6 @@ class FallbackController:
         self._last = np.clip(np.zeros_like(self._low), self._low, self._high)
         if self.plant is not None:
             self.plant.executed(None)
-        self._memory = None if self.constraint is None else self.constraint.start()
 
     def executed(self, control: Array) -> None:
         """Keep what was sent, for "hold" and for the plant's delay."""
@@ -67,7 +67,7 @@ class FallbackController:
             self.plant.observe()
             readable = bool(np.isfinite(self.plant.state).all())
             if readable and self.constraint is not None:
-                self.constraint.observe(self._memory)
+                self.constraint.observe({})
         return self._fallback(self.plant, self._last, self._low, self._high, None, readable)
 
 

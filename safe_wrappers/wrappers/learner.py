@@ -135,7 +135,7 @@ class FilterObservation(LayerWrapper):
     """Appends to the observation what the filter decides by, so that the filtered task is Markov for the learner.
 
     The features are bounded in [-1, 1] and have the same shape at every step: of each constraint its
-    `BoundConstraint.features` (the smallest h; of obstacles the nearest ones, their direction, clearance and closing
+    `features` (the smallest h; of obstacles the nearest ones, their direction, clearance and closing
     speed; the side of a detour), then the last correction, in shares of the action box.
 
     It shows the constraints' truth, for example exact positions where the task's own observation has a lidar. So
@@ -190,7 +190,8 @@ class FilterObservation(LayerWrapper):
         self._observer = inside if inside is not None else observer
         low, high = np.ravel(self._observer.action_space.low), np.ravel(self._observer.action_space.high)  # type: ignore[attr-defined]
         self._low, self._high = low.astype(np.float64), high.astype(np.float64)
-        count = sum(c.feature_count(self.neighbours) for c in self._observer.filter.bound) + low.size
+        self._counts = [c.feature_count(self.neighbours) for c in self._observer.filter.bound]
+        count = sum(self._counts) + low.size
         self._widen_observation(KEY, spaces.Box(-1.0, 1.0, (count,), np.float32))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -218,5 +219,5 @@ class FilterObservation(LayerWrapper):
         if observed.margin == observed.margin:
             parts = [c.features(self.neighbours) for c in observed.bound]
         else:  # the state is not a number, and nothing was judged
-            parts = [np.full(c.feature_count(self.neighbours), np.nan) for c in observed.bound]
+            parts = [np.full(count, np.nan) for count in self._counts]
         return self._with_numbers(observation, KEY, np.concatenate([*parts, shares]))

@@ -12,7 +12,8 @@ from safe_wrappers.checks import Array, check_fields, non_negative, positive, se
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room, round_trip_ceiling
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.bound import Bound
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
@@ -85,7 +86,7 @@ class StoppingBudget:
     @property
     def measures_approach(self) -> bool:
         """Whether approach speeds are measured, and not only bounded by `closing_speed`."""
-        return not isinstance(self.clearance, Constraint) or self.clearance.measures_approach
+        return not isinstance(self.clearance, Constraint) or isinstance(self.clearance, Clearance)
 
 
 BudgetLike = StoppingBudget | dict[str, Any]
@@ -123,25 +124,23 @@ class BoundBudget:
         """The plant given, else the env's MuJoCo model where the constraint needs one; to be bound before `bind`."""
         return default_plant(self._env) if plant is None and self.constraint is not None else plant
 
-    def bind(self, plant: Plant | None, bound: BoundConstraint | None = None) -> None:
+    def bind(self, plant: Plant | None, bound: Bound | None = None) -> None:
         """Measure on a plant that is bound to the env, and on the constraint if it is bound already."""
         self._bound = bound
         if bound is None and self.constraint is not None and plant is not None:
-            self._bound = self.constraint.bind(plant)
-        if self._bound is not None and not (self._measures_approach or self._bound.has_value):
+            self._bound = Bound(self.constraint, plant)
+        if self._bound is not None and not self._bound.measures_state:
             name = type(self.constraint).__name__
             raise ConfigurationError(f"{name} has no value that a lease could be worked out from")
 
     def reset(self) -> None:
         """Forget the episode, and let the constraint refuse what only a state can show."""
         if self._bound is not None:
-            self._memory = self._bound.start()
             self._observe(self._bound)
-            self._bound.check()
 
-    def _observe(self, bound: BoundConstraint) -> None:
+    def _observe(self, bound: Bound) -> None:
         bound.plant.observe()
-        bound.observe(self._memory)
+        bound.observe({})
 
     def measure(self) -> None:
         """Read clearances and approach speeds of the present state."""
@@ -152,9 +151,8 @@ class BoundBudget:
         if not np.isfinite(self._bound.plant.state).all():  # of which it may read only a part
             self.clearance = self.speed = np.full(1, np.nan)
             return
-        approach = self._bound.approach()
-        if approach is not None:
-            self.clearance, self.speed = approach
+        if isinstance(self._bound.spec, Clearance):
+            self.clearance, self.speed = self._bound.spec.approach()
             return
         value = np.asarray(self._bound.value(), dtype=np.float64)
         self.clearance = value[value != np.inf]

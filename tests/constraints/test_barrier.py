@@ -7,6 +7,7 @@ from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.bound import Bound
 
 
 class Spring(gym.Env):
@@ -147,8 +148,8 @@ def test_constructor_refuses_nonsense(arguments, message):
 
 
 def test_a_decay_that_outruns_the_hold_is_refused():
-    sw.constraints.Barrier(h, alpha=10.0).bind(observed([0.0]))
+    Bound(sw.constraints.Barrier(h, alpha=10.0), observed([0.0]))
     with pytest.raises(
         ConfigurationError, match=r"alpha = 10.1/s lets h cross zero within one hold of 0.1 s; .* 10/s"
     ):
-        sw.constraints.Barrier(h, alpha=10.1).bind(observed([0.0]))
+        Bound(sw.constraints.Barrier(h, alpha=10.1), observed([0.0]))

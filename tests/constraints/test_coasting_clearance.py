@@ -9,8 +9,8 @@ import pytest
 from asking import Asked, asked
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.backup.base import Detour
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
+from safe_wrappers.filter.bound import Bound
 
 FULL = np.array([1.0, 1.0])
 BACK = -FULL
@@ -158,15 +158,15 @@ def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
         first, second = limit.candidates(FULL)[0]
         return float(np.sign(first - second))
 
-    first_turns = {memory.side: turns(memory) for memory in (Detour(1.0, 1), Detour(-1.0, 1))}
+    first_turns = {side: turns({"detour": (side, 1)}) for side in (1.0, -1.0)}
     assert first_turns[1.0] == -first_turns[-1.0] != 0.0  # what is being made goes on
-    assert turns(Detour()) == first_turns[-1.0]  # what is on the left is passed on the right
+    assert turns({}) == first_turns[-1.0]  # what is on the left is passed on the right
     # So is it when the other side has not been needed for long.
-    assert turns(Detour(1.0, 0)) == first_turns[-1.0]
-    assert limit.executed(FULL) == Detour(-1.0, 24)
-    limit.observe(Detour(-1.0, 24))  # not needed in this step
-    assert limit.executed(FULL) == Detour(-1.0, 23)
-    assert limit.start() == Detour(0.0, 0)
+    assert turns({"detour": (1.0, 0)}) == first_turns[-1.0]
+    memory = limit.executed(FULL)
+    assert memory["detour"] == (-1.0, 25)
+    limit.observe(memory)  # not needed in this step
+    assert limit.executed(FULL)["detour"] == (-1.0, 24)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_bad_arguments_are_refused_when_it_is_made(options, message):
 def test_a_plant_without_a_model_is_refused():
     plant = sw.AnalyticPlant(f=lambda x: -x, g=lambda x: np.eye(1), state=lambda env: np.zeros(1))
     with pytest.raises(UnsupportedEnvError, match="needs a MujocoPlant"):
-        sw.constraints.CoastingClearance(keep_out=[sw.constraints.Disc([0, 0], 1)]).bind(plant)
+        Bound(sw.constraints.CoastingClearance(keep_out=[sw.constraints.Disc([0, 0], 1)]), plant)
 
 
 # CoastingClearance where zero control leaves less than the margin, or does not lead to rest within the horizon

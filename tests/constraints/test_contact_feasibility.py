@@ -9,6 +9,7 @@ from judged_loops import Scene, flagged
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.filter.bound import Bound
 from safe_wrappers.plants.mujoco.model import weight_n
 
 ROUNDING = 1e-6
@@ -78,7 +79,7 @@ def test_bad_arguments_are_refused_in_words(arguments, words):
 
 def test_what_it_cannot_watch_is_refused_when_it_is_bound():
     def watched(env, **arguments):
-        sw.constraints.ContactFeasibility(**arguments).bind(bound(env))
+        Bound(sw.constraints.ContactFeasibility(**arguments), bound(env))
 
     watched(pushed_balls())
     with pytest.raises(UnsupportedEnvError, match="no body of this model"):
@@ -89,7 +90,7 @@ def test_what_it_cannot_watch_is_refused_when_it_is_bound():
         f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, control_dt=0.1
     )
     with pytest.raises(UnsupportedEnvError, match="AnalyticPlant"):
-        sw.constraints.ContactFeasibility().bind(plant)
+        Bound(sw.constraints.ContactFeasibility(), plant)
 
 
 CASES = [

@@ -9,7 +9,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.backup.base import Detour
 from safe_wrappers.control.backup.heading_drive import (
     Motion,
     beyond_reach,
@@ -76,14 +75,14 @@ def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
         limit.observe(memory)
         return limit.candidates(drive)[0][1]
 
-    assert side(Detour()) == -1.0  # on the left: passed on the right
-    assert side(Detour(1.0, 1)) == 1.0  # but a detour on the left goes on
-    assert limit.executed(drive) == Detour(1.0, 49)
-    assert side(Detour(1.0, 0)) == -1.0  # until it has not been needed for long
-    assert limit.executed(drive) == Detour(-1.0, 49)
-    limit.observe(Detour(-1.0, 49))  # not needed in this step
-    assert limit.executed(drive) == Detour(-1.0, 48)
-    assert limit.start() == Detour(0.0, 0)
+    assert side({}) == -1.0  # on the left: passed on the right
+    assert side({"detour": (1.0, 1)}) == 1.0  # but a detour on the left goes on
+    assert limit.executed(drive)["detour"] == (1.0, 50)
+    assert side({"detour": (1.0, 0)}) == -1.0  # until it has not been needed for long
+    memory = limit.executed(drive)
+    assert memory["detour"] == (-1.0, 50)
+    limit.observe(memory)  # not needed in this step
+    assert limit.executed(drive)["detour"] == (-1.0, 49)
 
 
 @pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")

@@ -287,7 +287,7 @@ def test_nothing_that_touches_is_skipped(plant):
         raw = plant._raw
         raw.data.qpos[:3], raw.data.qvel[:3] = rng.uniform(-1.5, 1.5, 3), rng.uniform(-6.0, 6.0, 3)
         plant.observe()
-        forecast = plant.forecast(rng.uniform(-9.0, 9.0, 3), 8)
+        forecast = plant.rollout(rng.uniform(-9.0, 9.0, 3), 8)
         for pair in range(len(gaps.pairs)):
             distance, touch = brute(plant, gaps, forecast, pair), gaps.touch[pair]
             if np.abs(distance - touch).min() < 1e-9:

@@ -1,4 +1,4 @@
-"""A backup manoeuvre of one's own: what BoundBackupClearance makes of three methods."""
+"""A backup manoeuvre of one's own: a model that brakes, and what is made of it."""
 
 from dataclasses import dataclass
 
@@ -7,43 +7,43 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints import BoundBackupClearance
+from safe_wrappers.plants.plant import Model, Trajectory
 
 WALL, BRAKE, DT = 10.0, 2.0, 0.1
 
 
 @dataclass
-class StopBefore(sw.Constraint):
+class StopBefore(sw.Constraint, Model):
     """A point of 1 kg that brakes with `brake` N before a wall."""
 
     margin: float = 0.01
     brake: float = BRAKE
 
-    def bind(self, plant):
-        return BoundStopBefore(self, plant)
+    def setup(self, plant):
+        self.plant, self.model = plant, self
 
+    def rollout(self, control, horizon=1):
+        states = [self.plant.state]
+        if control is not None:
+            states += self._held(states[-1], control[0])
+        while states[-1][1] > 1e-9:
+            states += self._held(states[-1], self._braking(states[-1]))
+        return Trajectory(control, np.array(states))
 
-class BoundStopBefore(BoundBackupClearance):
-    def clearance(self):
-        return np.array([self._left(*self.plant.state)])
+    def _held(self, state, control):
+        return [
+            state + np.array([t * state[1] + 0.5 * t * t * control, t * control])
+            for t in np.linspace(0.0, DT, 21)[1:]
+        ]
 
-    def _after(self, control):
-        x, v = self.plant.state
-        # A step that turns back reaches farthest on its way.
-        turned = v**2 / (-2.0 * control[0]) if v > 0.0 and v + DT * control[0] < 0.0 else 0.0
-        ends = x + DT * v + 0.5 * DT**2 * control[0], v + DT * control[0]
-        return min(self._left(*ends), WALL - x - turned)
+    def _braking(self, state):
+        return -min(self.brake, max(state[1], 0.0) / DT)
 
-    def admits(self, control):
-        left = self._after(control)
-        return left >= self.spec.margin or left >= self._after(self.backup())
+    def h_along(self, path):
+        return WALL - path.states[:, :1]
 
-    def backup(self):
-        return np.array([-min(self.spec.brake, max(self.plant.state[1], 0.0) / DT)])
-
-    def _left(self, x, v):
-        # In its last step the point brakes just to rest: up to an eighth of a step's change of speed longer.
-        return WALL - x - max(v, 0.0) ** 2 / (2.0 * self.spec.brake) - 0.125 * BRAKE * DT**2 * (v > 0.0)
+    def proposals(self, control):
+        return [np.array([self._braking(self.plant.state)])] if control is None else []
 
 
 class Point(gym.Env):
@@ -88,7 +88,7 @@ def test_nothing_is_violated_and_nothing_flagged_whatever_drives(seed):
     assert farthest > WALL - 0.1
 
 
-def test_what_loses_no_more_than_the_backup_is_admitted_where_the_margin_is_lost():
+def test_from_outside_what_the_backup_keeps_is_admitted_and_what_loses_more_is_not():
     with pytest.warns(sw.UnsafeStateWarning):
         _, bound = filtered((9.5, 2.0))
     backup = bound.backup()

@@ -1,6 +1,7 @@
 """What constraints on a forecast share: what is asked of it, from inside and from outside, and when it is spared."""
 
 import warnings
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,8 @@ from hypothesis import strategies as st
 from judged_loops import Judge, flagged, sliders
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutMemory
+from safe_wrappers.filter.bound import Bound
+from safe_wrappers.plants.plant import Model, Trajectory
 
 HOLD_S = 0.05
 LIMITS = {
@@ -100,13 +102,13 @@ def test_outside_it_comes_back_and_stays_whatever_the_policy_does():
 
 def count_forecasts(monkeypatch):
     calls = [0]
-    real = sw.MujocoPlant.forecast
+    real = sw.MujocoPlant.rollout
 
-    def counted(self, *asked):
-        calls[0] += 1
-        return real(self, *asked)
+    def counted(self, control, *asked):
+        calls[0] += control is not None
+        return real(self, control, *asked)
 
-    monkeypatch.setattr(sw.MujocoPlant, "forecast", counted)
+    monkeypatch.setattr(sw.MujocoPlant, "rollout", counted)
     return calls
 
 
@@ -163,39 +165,41 @@ def test_a_reading_that_is_no_number_runs_the_fallback(kind, max_decrease):
 # Where controls are displacements: how long slopes are kept ----------------------------------------------------
 
 
-class Approaching(BoundRollout):
-    """What is left of a bound on the first control, on a plant of one line of arithmetic."""
+@dataclass
+class Approaching(sw.Constraint, Model):
+    """What is left of a bound on the first control, on a model of one line of arithmetic."""
 
-    def __init__(self, left):
-        self.spec = SimpleNamespace(
-            margin=0.0, horizon=1, look_ahead_below=None, euler_look_ahead=False, unit="m"
-        )
-        self.left, self.max_decrease, self.sketches = left, None, 0
-        self.plant = SimpleNamespace(
-            has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1,
-            braking=lambda: np.zeros(2), forecast=lambda control, *_: control, sketch=self._sketch,
-        )  # fmt: skip
+    left: float
+    sketches = 0
 
-    def _sketch(self, control, horizon):
+    def setup(self, plant):
+        self.plant, self.model = plant, self
+
+    def braking(self):
+        return np.zeros(2)
+
+    def rollout(self, control, horizon=1):
+        return Trajectory(control, np.zeros((8, 0)))
+
+    def sketch(self, control, horizon=1):
         self.sketches += 1
-        return control
+        return self.rollout(control)
 
-    def room(self, forecast):
-        return self.left - forecast[0] * np.linspace(0.1, 1.0, 8)[:, None]
-
-    def now(self):
-        return np.array([self.left])
+    def h_along(self, path):
+        first = 0.0 if path.control is None else path.control[0]
+        return self.left - first * np.linspace(0.1, 1.0, 8)[:, None]
 
 
 @pytest.mark.parametrize(("left", "often"), [(0.5, 10), (-0.1, 1)])
 def test_slopes_are_kept_for_ten_control_steps_and_from_outside_for_none(left, often):
-    limit, memory, made = Approaching(left), RolloutMemory(), []
-    for limit.plant.observation_id in range(1, 25):
+    plant = SimpleNamespace(has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1)
+    limit, memory, made = Bound(Approaching(left), plant), {}, []
+    for plant.observation_id in range(1, 25):
         limit.observe(memory)
-        limit.sketches = 0
+        limit.spec.sketches = 0
         for _ in range(2):  # once per observation
             limit.rows()
-        made.append(limit.sketches)
+        made.append(limit.spec.sketches)
         memory = limit.executed(np.zeros(2))
     # Of braking and of one difference for each control.
     assert made == [3 * (k % often == 0) for k in range(24)]

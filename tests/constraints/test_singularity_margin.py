@@ -10,6 +10,7 @@ from judged_loops import DRIVERS, Judge, Scene, drive
 import safe_wrappers as sw
 from safe_wrappers.control.barriers import validated_threshold
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.bound import Bound
 
 CHAIN = """<mujoco><compiler angle="radian"/><option timestep="0.002"><flag contact="disable"/></option><worldbody>
 <body name="base" pos=".1 0 1" euler="20 10 30"><joint name="rail" type="slide" axis="1 .2 0" range="-.5 .5"
@@ -68,7 +69,7 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
         env.data.qpos[:], env.data.qvel[:] = rng.uniform(-1.5, 1.5, (2, 5))
         plant.observe()
         assert limit.value() == pytest.approx(expected(env.data.qpos), rel=1e-9, abs=1e-9)
-        forecast = plant.forecast(rng.uniform(-3.0, 3.0, 4), 2)
+        forecast = plant.rollout(rng.uniform(-3.0, 3.0, 4), 2)
         room = limit.room(forecast)
         assert room.shape == (10, 1)
         for k in range(10):
@@ -122,7 +123,7 @@ def test_a_square_task_is_not_passed_through_its_singular_pose():
         )
         limit = asked(env, spec)
         assert limit.value() == pytest.approx(0.011 * np.sin(0.5) / 0.003 - 1.0)
-        forecast = limit.plant.forecast(np.zeros(2), 2)
+        forecast = limit.plant.rollout(np.zeros(2), 2)
         crossing = forecast.qpos[:, 1]
         assert (crossing * side).min() < -0.2  # it does pass through, to where w is large again
         np.testing.assert_allclose(limit.room(forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0)
@@ -260,7 +261,7 @@ def test_nonsense_is_refused(arguments, error, message):
 
 def test_a_pose_with_a_position_that_is_no_number_has_no_manipulability():
     plant = bound(gym.make("Reacher-v5"))
-    limit = sw.constraints.SingularityMargin(1e-4, body="fingertip", directions="xy").bind(plant)
+    limit = Bound(sw.constraints.SingularityMargin(1e-4, body="fingertip", directions="xy"), plant)
     qpos = np.tile([0.3, 0.8, 0.1, 0.1], (3, 1))
     qpos[1, 2], qpos[2, 0] = (
         np.nan,

@@ -11,6 +11,7 @@ from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.filter.bound import Bound
 
 LEGS = [(x, y) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
 FRICTION = 0.8
@@ -220,7 +221,7 @@ def test_plants_that_it_cannot_read_are_refused():
         f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, control_dt=0.1
     )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
-        sw.constraints.Stance().bind(plant)
+        Bound(sw.constraints.Stance(), plant)
     reacher = bound(gym.make("Reacher-v5"))
     with pytest.raises(UnsupportedEnvError, match="nothing to stand on"):
-        sw.constraints.Stance().bind(reacher)
+        Bound(sw.constraints.Stance(), reacher)

@@ -12,7 +12,7 @@ from point_worlds import RADIUS, PointWorld
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.constraint import Constraint
 
 MARGIN = 0.001
 ROOM = RADIUS + 2 * 0.002 + MARGIN
@@ -163,11 +163,6 @@ def test_far_from_walls_actions_pass_bit_for_bit():
 class SlowAlongY(Constraint):
     """Rows only: the speed along y stays below 0.5 m/s after the step."""
 
-    def bind(self, plant):
-        return BoundSlowAlongY(self, plant)
-
-
-class BoundSlowAlongY(BoundConstraint):
     def rows(self):
         plant = self.plant
         axis = plant.model.opt.timestep * 90.0 / (plant.model.body_mass[1] + 0.01)

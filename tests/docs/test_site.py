@@ -58,7 +58,7 @@ def test_nothing_is_loaded_from_elsewhere(site, pages):
     for path, page in pages.items():
         for address in page.loaded:
             assert not urlsplit(address).scheme and not address.startswith("//"), (path, address)
-            assert (path.parent / unquote(urlsplit(address).path)).exists(), (path, address)
+            assert (path.parent / unquote(urlsplit(address).states)).exists(), (path, address)
     for sheet in site.rglob("*.css"):
         text = sheet.read_text(encoding="utf-8")
         assert "@import" not in text and "url(http" not in text and "url(//" not in text, sheet

@@ -1,9 +1,12 @@
 """Bound constraints whose every answer is given, and a search over two controls in [-1, 1]."""
 
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
+from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.filter.search import SafeActionSearch
 
@@ -44,18 +47,22 @@ def half_spaces(*rows):
     )
 
 
-class Rows(sw.BoundConstraint):
+class Rows(Bound):
     """Rows alone."""
 
+    predicts, rows_decide, spec, plant = False, True, SimpleNamespace(scale=1.0), None
+
     def __init__(self, *rows):
-        super().__init__(None, None)
         self._own = half_spaces(*rows)
+
+    def admits(self, control):
+        return bool((self._own.normals @ control <= self._own.offsets + 1e-9).all())
 
     def rows(self):
         return self._own
 
 
-class Predicting(sw.BoundConstraint):
+class Predicting(Bound):
     """A slack of the control is all that counts; rows, tangents, candidates and backup are given.
 
     Args:
@@ -67,14 +74,18 @@ class Predicting(sw.BoundConstraint):
         scale: Of the slack.
     """
 
-    predicts = True
-    tolerance = 1e-9
-    scale = 1.0
+    predicts, rows_decide = True, False
 
     def __init__(self, slack, guess=(), tangents=None, candidates=(), control=None, scale=1.0):
-        super().__init__(None, None)
+        self.spec, self.plant = SimpleNamespace(scale=scale), None
         self._slack, self._guess, self._tangents = slack, half_spaces(*guess), tangents
-        self._candidates, self._control, self.scale = candidates, control, scale
+        self._candidates, self._control = candidates, control
+
+    def admits(self, control):
+        return self.slack(control) >= -1e-9
+
+    def keeps_limit(self, control):
+        return False
 
     def slack(self, control):
         return float(self._slack(control))

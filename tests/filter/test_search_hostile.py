@@ -13,26 +13,18 @@ class Careless(sw.Constraint):
     def __init__(self, offered):
         self.offered = offered
 
-    def bind(self, plant):
-        return BoundCareless(self, plant)
-
-
-class BoundCareless(sw.BoundConstraint):
-    predicts = True
+    smooth = False
+    recovery_s = 0.0
     judged = ()
 
-    def admits(self, control):
-        self.judged = (*self.judged, *control.tolist())
-        return not np.any(control == np.float32(0.9))
+    def h_along(self, path):
+        if path.control is None:
+            return np.ones((1, 1))
+        self.judged = (*self.judged, *path.control.tolist())
+        return np.array([[-1.0 if np.any(path.control == np.float32(0.9)) else 0.0]])
 
-    def slack(self, control):
-        return 0.0 if self.admits(control) else -1.0
-
-    def candidates(self, control):
-        return [np.full(2, self.spec.offered)]
-
-    def backup(self):
-        return np.full(2, self.spec.offered)
+    def proposals(self, control):
+        return [np.full(2, self.offered)]
 
 
 @pytest.mark.parametrize("offered", [np.nan, np.inf, -np.inf, 5.0])
@@ -42,5 +34,5 @@ def test_candidates_and_backups_are_boxed_and_finite_before_they_are_judged(offe
     info = env.step(np.full(2, 0.9, np.float32))[4]
     assert np.isfinite(info["executed_action"]).all() and (np.abs(info["executed_action"]) <= 1.0).all()
     assert info["cbf/intervened"]
-    judged = np.array(env.filter.bound[0].judged)
+    judged = np.array(env.filter.bound[0].spec.judged)
     assert np.isfinite(judged).all() and (np.abs(judged) <= 1.0).all()

@@ -69,7 +69,7 @@ def test_a_filter_keeps_a_limit_of_a_machine_two_levels_down(env):
         action = rng.uniform(-1.0, 1.0, 1) if k < 20 else env.action_space.high
         *_, info = filtered.step(action)
         fastest, changed = max(fastest, abs(env.sim.data._data.qvel[0])), changed + info["cbf/intervened"]
-        assert np.array_equal(plant.forecast(info["executed_action"]).path[-1], env.observed())
+        assert np.array_equal(plant.rollout(info["executed_action"]).states[-1], env.observed())
         assert not info["cbf/infeasible"]
     assert 1.9 < fastest <= 2.0 and changed
 
@@ -122,7 +122,7 @@ def missed(env, plant, data, episodes=2, steps=100):
         for _ in range(steps):
             plant.observe()
             action = rng.uniform(env.action_space.low, env.action_space.high)
-            end = plant.forecast(action).path[-1]
+            end = plant.rollout(action).states[-1]
             env.step(action)
             worst = max(worst, float(np.abs(end - np.concatenate([data.qpos, data.qvel])).max()))
     return worst

@@ -94,7 +94,7 @@ def test_a_step_of_a_robotic_hand_is_its_forecast_to_the_last_bit(hand):
         action = rng.uniform(-1.0, 1.0, plant.lower.size).astype(np.float32)
         if k % 2:
             action = np.sign(action)
-        end = plant.forecast(action.astype(np.float64)).path[-1]
+        end = plant.rollout(action.astype(np.float64)).states[-1]
         hand.step(action)
         assert np.array_equal(end, np.concatenate([raw.data.qpos, raw.data.qvel]))
 
@@ -133,8 +133,8 @@ def test_acceleration_and_acting_range_are_those_of_the_twin_in_other_units(serv
         mapped = np.sort(OFFSET + SCALE * np.array(plant.acting_range), axis=0)
         np.testing.assert_allclose(mapped, plain.acting_range, atol=1e-12)
         np.testing.assert_allclose(OFFSET + SCALE * plant.braking(), plain.braking(), atol=1e-12)
-        longer = plant.forecast(action, 3).path
-        np.testing.assert_allclose(longer, plain.forecast(control, 3).path, atol=1e-12)
+        longer = plant.rollout(action, 3).states
+        np.testing.assert_allclose(longer, plain.rollout(control, 3).states, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -66,11 +66,11 @@ def test_every_substep_is_the_envs_own_to_the_last_bit(env_id):
         plant.observe()
         control = action.astype(np.float64)
         if k % 3 == 1:  # other questions between do not disturb it
-            plant.pose(), plant.forecast(-control), plant.forward(), plant.braking()
+            plant.pose(), plant.rollout(-control), plant.forward(), plant.braking()
         if k % 5 == 0:
-            plant.forecast(control)
+            plant.rollout(control)
             expected = inputs(plant.data)
-        forecast = plant.forecast(control, horizon=2)
+        forecast = plant.rollout(control, horizon=2)
         seen.clear()
         *_, over, _ = env.step(action)
         n = raw.n_substeps
@@ -92,7 +92,7 @@ def test_after_the_held_action_a_forecast_brakes_as_steps_of_zero_do(env_id):
         env.step(action)
     plant.observe()
     action = np.array([1.0, -0.4, -0.2, 0.7], dtype=np.float32)
-    forecast = plant.forecast(action.astype(np.float64), horizon=4)
+    forecast = plant.rollout(action.astype(np.float64), horizon=4)
     assert np.array_equal(plant.braking(), np.zeros(4))
     for hold in range(4):
         env.step(action if hold == 0 else np.zeros(4, np.float32))

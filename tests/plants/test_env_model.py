@@ -86,7 +86,7 @@ def test_a_filtered_env_goes_on_with_its_own_model(env_id):
     if "Goal" not in env_id and "Rover" not in env_id and "Maze" not in env_id:
         env.plant.observe()
         action = executed[-1].astype(np.float64)
-        end = env.plant.forecast(action).path[-1]
+        end = env.plant.rollout(action).states[-1]
         env.unwrapped.step(executed[-1])
         np.testing.assert_array_equal(end[: env.unwrapped.model.nq], env.unwrapped.data.qpos)
 

@@ -42,21 +42,21 @@ def by_hand(raw, plant, control, own_holds, holds):
 def test_the_look_ahead_and_a_sketch_are_euler_steps(env_id):
     raw, plant = started(env_id)
     control = 0.8 * plant.upper
-    forecast, own = plant.forecast(control, 3, euler=True), plant.forecast(control, 3)
-    np.testing.assert_array_equal(forecast.path, by_hand(raw, plant, control, 1, 3))
-    np.testing.assert_array_equal(own.path, by_hand(raw, plant, control, 3, 3))
-    np.testing.assert_array_equal(plant.sketch(control, 2).path, by_hand(raw, plant, control, 0, 2))
+    forecast, own = plant.rollout(control, 3, euler=True), plant.rollout(control, 3)
+    np.testing.assert_array_equal(forecast.states, by_hand(raw, plant, control, 1, 3))
+    np.testing.assert_array_equal(own.states, by_hand(raw, plant, control, 3, 3))
+    np.testing.assert_array_equal(plant.sketch(control, 2).states, by_hand(raw, plant, control, 0, 2))
     assert plant.model.opt.integrator == raw.model.opt.integrator
 
 
 def test_poses_published_by_euler_steps_do_not_lag():
     _, plant = started("Ant-v5")
-    forecast = plant.forecast(0.5 * plant.upper, 3, euler=True)
+    forecast = plant.rollout(0.5 * plant.upper, 3, euler=True)
     ends = forecast.poses(plant.substeps)
     np.testing.assert_array_equal(forecast.published_frames[1:], ends.frames[1:])
     np.testing.assert_array_equal(forecast.published_centres[1:], ends.centres[1:])
     # As after Runge-Kutta steps, whose last stage is near the end.
-    own = plant.forecast(0.5 * plant.upper, 3)
+    own = plant.rollout(0.5 * plant.upper, 3)
     ends = own.poses(plant.substeps)
     moved = np.abs(np.diff(own.qpos, axis=0)).max()
     assert np.abs(own.published_frames - ends.frames).max() < 0.1 * moved

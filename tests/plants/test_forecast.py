@@ -74,8 +74,8 @@ def test_every_substep_is_what_the_env_does_to_the_last_bit(robot, version):
         plant.observe()
         if k % 3 == 1:  # other questions between do not disturb it
             _ = plant.acceleration
-            plant.forecast(-action.astype(float), 2).poses()
-        forecast = plant.forecast(action.astype(float), 2)
+            plant.rollout(-action.astype(float), 2).poses()
+        forecast = plant.rollout(action.astype(float), 2)
         qpos, qvel = integrate(raw, action, n)
         assert forecast.qpos.shape == (2 * n, raw.model.nq) and forecast.qvel.shape == (2 * n, raw.model.nv)
         assert forecast.qpos[:n].tobytes() == qpos.tobytes()
@@ -113,7 +113,7 @@ def test_every_integrator_through_contact_and_under_applied_forces(integrator):
     for _ in range(40):
         u = rng.uniform(-1.0, 1.0, 1)
         plant.observe()
-        forecast = plant.forecast(u)
+        forecast = plant.rollout(u)
         qpos, qvel = integrate(env, u, 5)
         assert forecast.qpos.tobytes() == qpos.tobytes() and forecast.qvel.tobytes() == qvel.tobytes()
         env.data.ctrl[:] = u
@@ -126,7 +126,7 @@ def test_bodies_that_the_env_moves_by_hand_stay_where_they_are():
     hand = '<body name="hand" mocap="true" pos="1 0 0"><geom size=".1" mass="2" contype="0" conaffinity="0"/></body>'
     env = Scene(FALLING.format("Euler").replace("</worldbody>", f"{hand}</worldbody>"))
     env.data.mocap_pos[0], env.data.mocap_quat[0] = [3.0, 1.0, 2.0], [0.0, 1.0, 0.0, 0.0]
-    poses = bound(env).forecast(np.zeros(1)).poses()
+    poses = bound(env).rollout(np.zeros(1)).poses()
     for frames in (poses.frames, poses.centres):
         np.testing.assert_allclose(frames[:, env.model.body("hand").id], np.tile([3.0, 1.0, 2.0], (5, 1)))
     np.testing.assert_allclose(poses.axes[0, env.model.body("hand").id], np.diag([1.0, -1.0, -1.0]))
@@ -155,7 +155,7 @@ def test_one_control_is_simulated_once_until_something_changes(monkeypatch):
 
     def asked(control, horizon):
         before = count[0]
-        forecast = plant.forecast(control, horizon)
+        forecast = plant.rollout(control, horizon)
         return forecast, count[0] - before
 
     long, first = asked(u, 3)
@@ -197,7 +197,7 @@ def test_nothing_of_the_envs_data_is_written(robot):
         u = rng.uniform(env.action_space.low, env.action_space.high)
         before = {f: getattr(raw.data, f).tobytes() for f in fields}
         plant.observe()
-        plant.forecast(u, 3).poses()
+        plant.rollout(u, 3).poses()
         plant.pose()
         assert plant.published() is raw.data
         assert [f for f in fields if getattr(raw.data, f).tobytes() != before[f]] == []
@@ -246,7 +246,7 @@ def test_braking_halves_the_speed_of_a_driven_slide_in_every_control_step(kind, 
         env.data.qpos[0], env.data.qvel[0] = 0.3, speed
         plant.observe()
         unforced = {"with a constant force": -0.25, "position servo without damping": 0.3}.get(kind, 0.0)
-        speeds = plant.forecast(np.array([unforced]), 8).qvel[4::5, 0]
+        speeds = plant.rollout(np.array([unforced]), 8).qvel[4::5, 0]
         # The speed that is read is one substep old, hence not exactly a half.
         assert (np.abs(speeds[1:]) < 0.62 * np.abs(speeds[:-1])).all(), speeds
         assert (speeds / speeds[0] > -0.01).all(), speeds  # nor does it turn back
@@ -263,12 +263,12 @@ def test_what_mujoco_resets_is_not_a_number(qpos, qvel, control, tmp_path, monke
     env = Scene(SLIDER.format(mass=1.0, actuator='<motor joint="x" gear="1000" ctrllimited="false"/>'))
     env.data.qpos[0], env.data.qvel[0] = qpos, qvel
     plant = bound(env)
-    forecast = plant.forecast(np.array([control]), 2)
+    forecast = plant.rollout(np.array([control]), 2)
     for values in (forecast.qpos, forecast.qvel, forecast.published_frames, forecast.poses().centres[:, 1]):
         assert np.isnan(values).all()
     env.data.qpos[0], env.data.qvel[0] = 0.0, 1.0
     plant.observe()
-    assert np.isfinite(plant.forecast(np.array([0.0]), 2).qpos).all()  # the next one is whole again
+    assert np.isfinite(plant.rollout(np.array([0.0]), 2).qpos).all()  # the next one is whole again
 
 
 def test_only_what_comes_after_a_break_down_is_lost(tmp_path, monkeypatch):
@@ -278,7 +278,7 @@ def test_only_what_comes_after_a_break_down_is_lost(tmp_path, monkeypatch):
     )
     env = Scene(runaway)
     env.data.qpos[0] = 1e-8  # a hundredfold with every substep
-    long, short = bound(env).forecast(np.zeros(1), 4), bound(env).forecast(np.zeros(1), 1)
+    long, short = bound(env).rollout(np.zeros(1), 4), bound(env).rollout(np.zeros(1), 1)
     assert np.isfinite(short.qpos).all() and short.qpos[-1] > 1.0
     assert long.qpos[:5].tobytes() == short.qpos.tobytes()
     assert np.isnan(long.qpos[5:]).all() and np.isnan(long.published_frames[1:]).all()

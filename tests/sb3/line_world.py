@@ -7,7 +7,6 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
 import safe_wrappers as sw
-from safe_wrappers.filter.constraint import BoundConstraint
 
 HOLD, WALL = 0.1, -0.3
 PENALTIES = {"penalty": 5.0, "per_correction": 0.5}
@@ -51,13 +50,8 @@ class BehindTheWall(sw.Constraint):
 
     wall: float
 
-    def bind(self, plant):
-        return BoundBehindTheWall(self, plant)
-
-
-class BoundBehindTheWall(BoundConstraint):
     def rows(self):
-        left = self.spec.wall - self.plant.state[0]
+        left = self.wall - self.plant.state[0]
         return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
 
 

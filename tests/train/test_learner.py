@@ -13,7 +13,6 @@ from test_run import Reports, run_killed_after
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
@@ -31,17 +30,12 @@ PENALTY = 1000.0
 class BehindTheWall(sw.Constraint):
     """Ends no step right of the wall."""
 
-    def bind(self, plant):
-        return BoundBehindTheWall(self, plant)
-
-
-class BoundBehindTheWall(BoundConstraint):
     def rows(self):
         return sw.HalfSpaces(np.array([[self.plant.control_dt, 0.0]]), np.array([WALL - self.plant.state[0]]))
 
-    def backup(self):
+    def proposals(self, control):
         """Away from the wall, as fast as the point goes."""
-        return np.array([-1.0, 0.0])
+        return [] if control is not None else [np.array([-1.0, 0.0])]
 
 
 def drift(x):

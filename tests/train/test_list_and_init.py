@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 import safe_wrappers as sw
-from safe_wrappers.protect import recipe_names, recipe_of
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import parse_experiment, read_config
 from safe_wrappers.train.config.algorithms import ALGORITHMS
 from safe_wrappers.train.init import _LISTS as LISTS
+from safe_wrappers.wrappers.recipes import EVERY, recipe_of
 
 
 def listed(capsys, *kinds):
@@ -32,7 +32,7 @@ def test_every_kind_is_listed_and_each_by_itself(capsys):
     found = listed(capsys)
     assert set(found) == set(LISTS)
     assert set(found["algorithms"]) == set(ALGORITHMS)
-    assert set(found["recipes"]) == set(recipe_names())
+    assert set(found["recipes"]) == set(EVERY)
     assert listed(capsys, "wrappers") == {"wrappers": found["wrappers"]}
 
 

@@ -201,14 +201,9 @@ class Switch(sw.Constraint):
 
     on = False
 
-    def bind(self, plant):
-        return BoundSwitch(self, plant)
-
-
-class BoundSwitch(sw.BoundConstraint):
     def rows(self):
         contradiction = sw.HalfSpaces(np.array([[1.0], [-1.0]]), np.array([-0.2, -0.4]))
-        return contradiction if self.spec.on else sw.HalfSpaces.none(1)
+        return contradiction if self.on else sw.HalfSpaces.none(1)
 
 
 CONTRADICTION = Raw([[1.0], [-1.0]], [-0.2, -0.4])  # u <= -0.2 and u >= 0.4
@@ -229,7 +224,7 @@ def test_infeasible_is_reported_and_the_fallback_runs(fallback, expected):
     filtered = cart([SpeedRow(50.0), Switch()], fallback=fallback)
     filtered.reset(seed=0)
     filtered.step(np.array([0.35], np.float32))
-    filtered.constraints[1].on = True
+    filtered.filter.bound[1].spec.on = True
     info = filtered.step(np.array([0.9], np.float32))[4]
     assert info["cbf/infeasible"] and info["cbf/fallback"] and info["cbf/intervened"]
     np.testing.assert_allclose(info["executed_action"], [expected], atol=1e-4)

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.wrappers.admission import Admission
 from safe_wrappers.wrappers.stopping_budget import BoundBudget
 
@@ -222,18 +221,13 @@ def test_least_s_needs_a_filter_inside_and_no_more_than_max_lease_s():
 class Checked(sw.Constraint):
     """A constraint that only a state can show to be wrong."""
 
-    def bind(self, plant):
-        return BoundChecked(self, plant)
-
-
-class BoundChecked(BoundConstraint):
     def rows(self):
         raise AssertionError("a lease needs no rows")
 
-    def value(self):
-        return np.ones(1)
+    def h_along(self, path):
+        return np.ones((1, 1))
 
-    def check(self):
+    def observe(self, memory):
         if self.plant.qpos[0] > 1.0:
             raise ConfigurationError("too far out")
 

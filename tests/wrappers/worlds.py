@@ -6,7 +6,6 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from safe_wrappers.filter.constraint import BoundConstraint
 
 
 class Cart(gym.Env):
@@ -69,13 +68,8 @@ class SpeedRow(sw.Constraint):
 
     limit: float
 
-    def bind(self, plant):
-        return BoundSpeedRow(self, plant)
-
-
-class BoundSpeedRow(BoundConstraint):
     def rows(self):
-        left = self.spec.limit - self.plant.state[1]
+        left = self.limit - self.plant.state[1]
         return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
 
 
@@ -85,10 +79,5 @@ class Raw(sw.Constraint):
     def __init__(self, normals, offsets):
         self.half_spaces = sw.HalfSpaces(np.array(normals, float), np.array(offsets, float))
 
-    def bind(self, plant):
-        return BoundRaw(self, plant)
-
-
-class BoundRaw(BoundConstraint):
     def rows(self):
-        return self.spec.half_spaces
+        return self.half_spaces

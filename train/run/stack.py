@@ -15,6 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
+from safe_wrappers.filter.bound import Bound
+from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.plants.default import default_plant
@@ -196,7 +198,7 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
             )
         its_filter: SafetyFilter = judging.get_wrapper_attr("filter")
         for constraint in its_filter.bound:
-            if not constraint.has_value:
+            if not constraint.measures_state:
                 raise ConfigurationError(
                     f"env.judge: {type(constraint.spec).__name__} has no h (`value`) and cannot judge; use env.cost: "
                     "module:function"
@@ -215,9 +217,7 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
 
     def _bind(self) -> None:
         self._model_version = self._plant.model_version
-        self._constraints = [constraint.spec.bind(self._plant) for constraint in self._constraints]
-        for constraint in self._constraints:
-            constraint.start()
+        self._constraints = [Bound(constraint.spec, self._plant) for constraint in self._constraints]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -225,7 +225,7 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         """Resets the env; info has the cost of the state in which the episode starts."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._plant.executed(None)
-        self._memories = [constraint.start() for constraint in self._constraints]
+        self._memories: list[Memory] = [{} for _ in self._constraints]
         self._judge(observation, info)
         return observation, info
 

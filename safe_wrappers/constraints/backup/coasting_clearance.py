@@ -4,20 +4,18 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, finite_array, non_negative, positive, whole_number
-from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
-from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_marks, obstacles_from
+from safe_wrappers.constraints.backup.base import DetourClearance
+from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline, nearest_discs
-from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
-from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.plant import Plant, Trajectory
 from safe_wrappers.plants.queries.coasting import Coasting, Course
 
 _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
@@ -28,7 +26,7 @@ _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 
 
 @dataclass
-class CoastingClearance(Constraint):
+class CoastingClearance(DetourClearance):
     """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
 
     For machines that friction and damping stop within a few steps, for example on wheels. A control is forecast on
@@ -70,6 +68,7 @@ class CoastingClearance(Constraint):
     detour: bool = False
 
     promise = "proved"
+    detour_steps: ClassVar[int] = 25
 
     def __post_init__(self) -> None:
         for name in ("keep_out", "untouched"):
@@ -94,31 +93,24 @@ class CoastingClearance(Constraint):
         check_fields(self, positive, ("max_decrease",), "m")
         check_fields(self, non_negative, ("max_decrease_per_speed",), "m per m/s")
 
-
-class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
-    """CoastingClearance on a plant."""
-
-    detour_steps = 25
-    spec: CoastingClearance
-    plant: MujocoPlant
-
-    def __init__(self, spec: CoastingClearance, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         hint = "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
-        super().__init__(spec, require_mujoco(plant, hint))
-        name = spec.robot_model_attr
+        super().setup(require_mujoco(plant, hint))
+        self.model = self
+        name = self.robot_model_attr
         alone = None if name is None else plant.attribute(name)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             wanted = "robot_model_attr names an attribute that holds an MjModel"
             raise ConfigurationError(f"{wanted}; {name!r} is {alone!r}")
-        self.plant.named("body", spec.body, "body")
-        self.coasting = Coasting(self.plant, spec.body, alone)
+        self.plant.named("body", self.body, "body")
+        self.coasting = Coasting(self.plant, self.body, alone)
         self._still = np.zeros(self.plant.model.nu)
-        outline = np.reshape(spec.outline, (-1, 2))
+        outline = np.reshape(self.outline, (-1, 2))
         self._corners = convex_outline(outline) if len(outline) else outline
         self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
-        self._origin = _Group(spec.keep_out, np.zeros((0, 2)))
-        self._body = _Group(spec.untouched, self._corners)
-        self.max_decrease = spec.max_decrease
+        self._origin = _Group(self.keep_out, np.zeros((0, 2)))
+        self._whole = _Group(self.untouched, self._corners)
+        self._most, self.max_decrease = self.max_decrease, None  # counted here, not by the filter
         self._first_turns_left: bool | None = None
 
     def clearance(self) -> Array:
@@ -129,23 +121,20 @@ class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
         here = self.coasting.start()
         self._here, self._ahead = here.places[0], here.ahead[0]
         way, rolls = math.inf, 0.0
-        if self.max_decrease is not None:
-            added = self.spec.max_decrease_per_speed * self.coasting.speed(self._radius)
-            way = self.max_decrease + added
-            rolls = added if self.spec.max_decrease_per_speed else way
-        room = self.spec.margin + way
-        self._least = min(group.keep(self.plant, here, room) for group in (self._origin, self._body))
+        if self._most is not None:
+            added = self.max_decrease_per_speed * self.coasting.speed(self._radius)
+            way = self._most + added
+            rolls = added if self.max_decrease_per_speed else way
+        room = self.margin + way
+        self._least = min(group.keep(self.plant, here, room) for group in (self._origin, self._whole))
         self._within = way
         self._known: dict[bytes, _Outcome] = {}
-        if self._origin.near or self._body.near:
+        if self._origin.near or self._whole.near:
             return np.array([min(self._least, self._after(self._still).least)])
         return np.array([self._least - rolls])
 
-    def load(self) -> None:
-        _ = self.plant.acting_range
-
     def nearest(self, neighbours: int) -> Array:
-        discs = np.concatenate([self._origin.discs, self._body.discs])
+        discs = np.concatenate([self._origin.discs, self._whole.discs])
         (x, y), (ahead_x, ahead_y) = self._here, self._ahead
         vx, vy = self.coasting.velocity()
         return nearest_discs(discs, x, y, math.atan2(ahead_y, ahead_x), vx, vy, neighbours)
@@ -156,7 +145,7 @@ class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
         acting = np.minimum(np.maximum(control, low), high) + 0.0  # no -0.0: its bytes differ
         key = acting.tobytes()
         if key not in self._known:
-            course = self.coasting.run(acting, self.spec.horizon, self._radius)
+            course = self.coasting.run(acting, self.horizon, self._radius)
             outcome, fallen = self._outcome(course)
             if fallen > self._within + _SAME_M:
                 warnings.warn(
@@ -164,7 +153,8 @@ class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
                     f"max_decrease of {self._within:.3g} m; from now on every control is forecast",
                     stacklevel=2,
                 )
-                self.max_decrease, self._memory = None, Detour()
+                self._most = None
+                self.memory["detour"] = 0.0, 0
                 self.clearance()
                 outcome, _ = self._outcome(course)
             self._known[key] = outcome
@@ -172,19 +162,19 @@ class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
 
     def _outcome(self, course: Course) -> tuple["_Outcome", float]:
         """What a course leads to, and by how much a clearance falls on it, m."""
-        least, end, fallen = zip(*(group.along(course) for group in (self._origin, self._body)), strict=True)
+        least, end, fallen = zip(*(group.along(course) for group in (self._origin, self._whole)), strict=True)
         (ax, ay), (bx, by) = course.ahead[0].tolist(), course.ahead[-1].tolist()
         way, turn = course.places[-1] - self._here, math.atan2(ax * by - ay * bx, ax * bx + ay * by)
         return _Outcome(min(least) if course.rests else -math.inf, min(end), way, turn), max(fallen)
 
-    def admits(self, control: Array) -> bool:
+    def leaves_clear(self, control: Array) -> bool:
         """Whether a control leads to rest with the margin kept (or, where rest alone does not, to a way out)."""
-        if not (self._origin.near or self._body.near):
+        if not (self._origin.near or self._whole.near):
             return True  # no disc can come into play, whatever is done
         if self._least < 0.0:
             return self._leads_out(control)
         after = self._after(control)
-        if after.least >= self.spec.margin:
+        if after.least >= self.margin:
             return True
         if after.least < 0.0:
             return False
@@ -193,7 +183,7 @@ class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
             return rest.least >= 0.0
         # The rollouts' errors have used up the margin: no less than rest leaves on the way, and more at its end.
         kept = after.least >= max(rest.least - _SAME_M, 0.0) and after.end >= rest.end + _WAY_OUT_M
-        return rest.least < self.spec.margin and kept
+        return rest.least < self.margin and kept
 
     def _leads_out(self, control: Array) -> bool:
         best = max(self._after(drive).end for drive in self._drives())
@@ -205,21 +195,23 @@ class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
         low, high = self.plant.acting_range
         return [high, low, *(np.where(one, end, 0.0) for one in np.eye(low.size) for end in (low, high))]
 
-    def slack(self, control: Array) -> float:
-        """The least clearance on the way of a control (from inside: at the end of it), m."""
-        after = self._after(control)
-        return after.end if self._least < 0.0 else after.least
+    def h_along(self, path: Trajectory) -> Array:
+        """The least clearance on the way (from inside an obstacle at its end) where a control is admitted, m."""
+        if path.control is None:
+            return self.clearance()[None]
+        if self.leaves_clear(path.control):
+            return np.array([[math.inf]])
+        after = self._after(path.control)
+        return np.array([[min(after.end if self._least < 0.0 else after.least, self.margin - _SAME_M)]])
 
-    def backup(self) -> Array:
-        """No control at all: the machine rolls to rest where the last forecast said."""
-        return self._still
-
-    def candidates(self, control: Array) -> list[Array]:
-        """What to try for a refused control, the best first: ways around, less of the same, none."""
+    def proposals(self, control: Array | None) -> list[Array]:
+        """What to try for a refused control: ways around, less of the same, none. The backup is no control at all."""
+        if control is None:
+            return [self._still]
         if self._least < 0.0:
             return sorted(self._drives(), key=lambda u: -self._after(u).end)[:1]
         acting = np.clip(control, *self.plant.acting_range)
-        around = self._around(acting) if self.spec.detour and acting.size == 2 else []
+        around = self._around(acting) if self.detour and acting.size == 2 else []
         return [*around, 0.5 * acting, self._still]
 
     def _around(self, acting: Array) -> list[Array]:
@@ -230,7 +222,7 @@ class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
 
         def beside_the_nearest() -> float:
             way = self._after(acting).way
-            group = min((g for g in (self._origin, self._body) if g.near), key=lambda g: g.now.min())
+            group = min((g for g in (self._origin, self._whole) if g.near), key=lambda g: g.now.min())
             x, y = group.nearest() - self._here
             # What is to the left of the way is passed on its right.
             return -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
@@ -243,14 +235,6 @@ class BoundCoastingClearance(BoundDetourClearance, of=CoastingClearance):
         pairs = np.array(_AROUND) * drive
         outer_is_first = self._first_turns_left == (side * drive > 0.0)
         return list(pairs if outer_is_first else pairs[:, ::-1])
-
-    def draw(self) -> list[Mark]:
-        """The discs with what is kept free before them, and the way of the origin until rest without control."""
-        obstacles = [*self.spec.keep_out, *self.spec.untouched]
-        found = obstacle_marks(obstacles, self.plant, self.spec.margin, self._here)
-        course = self.coasting.run(self._still, self.spec.horizon, self._radius)
-        way = [self._here, *course.places[:: self.plant.substeps], course.places[-1]]
-        return [*found, *line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
 
 
 class _Outcome(NamedTuple):

@@ -3,40 +3,37 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
-from safe_wrappers.constraints.backup.base import BoundBackupClearance
+from safe_wrappers.constraints.backup.base import BackupClearance
 from safe_wrappers.constraints.obstacles import (
     Disc,
     Discs,
     Plane,
     TrackedDiscs,
     distances,
-    obstacle_marks,
     obstacles_from,
 )
 from safe_wrappers.control.backup import point_decision
-from safe_wrappers.control.backup.damped_axis import braking
 from safe_wrappers.control.backup.evasive_maneuvers import (
     Around,
     EvasiveManeuvers,
     Maneuver,
     least_left,
 )
-from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
-from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
-from safe_wrappers.plants.plant import Plant
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.plants.mujoco.plant import require_mujoco
+from safe_wrappers.plants.plant import Model, Plant, Trajectory
 from safe_wrappers.plants.queries.planar_point import planar_point, walls
 
 
 @dataclass
-class WallClearance(Constraint):
+class WallClearance(BackupClearance):
     """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
 
     A control is admitted if, held for one control step and followed by full braking of each axis, it keeps the point
@@ -72,20 +69,14 @@ class WallClearance(Constraint):
         self.margin = non_negative("margin", self.margin, "m")
         check_fields(self, positive, ("velocity_clip",), "m/s")
 
-
-class BoundWallClearance(BoundBackupClearance, of=WallClearance):
-    """WallClearance on a plant: the rules are in `control/backup/point_decision.py`."""
-
-    spec: WallClearance
-    plant: MujocoPlant
-
-    def __init__(self, spec: WallClearance, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         hint = "on an AnalyticPlant use Clearance([Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
-        super().__init__(spec, require_mujoco(plant, f"WallClearance needs a MujocoPlant; {hint}"))
-        clip = self.spec.velocity_clip
+        super().setup(require_mujoco(plant, f"WallClearance needs a MujocoPlant; {hint}"))
+        self.model = self
+        clip = self.velocity_clip
         self._point = point = planar_point(self.plant, math.inf if clip is None else clip)
         around, reach = walls(self.plant.model, point.body)
-        self._room = room = reach + self.spec.margin
+        self._room = room = reach + self.margin
         known = clip is not None
         at = point.axes, point.origin, point.joints, point.actuators
         self._scene = point_decision.scene(*at, room, known, around)
@@ -94,37 +85,22 @@ class BoundWallClearance(BoundBackupClearance, of=WallClearance):
     def clearance(self) -> Array:
         """Distance of the braking path from touching a wall, margin not taken off, m, shape (1,); no walls: (0,)."""
         self._left = point_decision.room_left(self._scene, self.plant.qpos, self.plant.qvel, self._motion)
-        return np.array([self._left + self.spec.margin] if len(self._scene[-1]) else [])
+        return np.array([self._left + self.margin] if len(self._scene[-1]) else [])
 
-    def admits(self, control: Array) -> bool:
+    def leaves_clear(self, control: Array) -> bool:
         return point_decision.is_admitted(self._scene, self._motion, self._left, control)
 
-    def load(self) -> None:
-        control = np.zeros(self.plant.model.nu)
-        self.admits(control)
-        self.candidates(control)
-
-    def backup(self) -> Array:
+    def _backup(self) -> Array:
         """The control that is always admitted: brake both axes. From outside it leads back inside."""
         pair = point_decision.backup_pair(self._scene, self._motion, self._left)
         return self._point.control(np.zeros(self.plant.model.nu), pair)
 
-    def candidates(self, control: Array) -> list[Array]:
+    def proposals(self, control: Array | None) -> list[Array]:
         """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
+        if control is None:
+            return [self._backup()]
         pairs = point_decision.candidates(self._scene, self._motion, self._left, control)
         return [self._point.control(control, pair) for pair in pairs]
-
-    def draw(self) -> list[Mark]:
-        """The edges that the point may not cross, around every wall, and its way until rest under full braking."""
-        x, y, vx, vy = self._motion.tolist()
-        ways = braking(self._point.axes[0], x, vx), braking(self._point.axes[1], y, vy)
-        longest = max(len(way) for way in ways)
-        way = np.stack([np.pad(way, (0, longest - len(way)), mode="edge") for way in ways], axis=1)
-        found = [*line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
-        for left, right, low, high in self._scene[-1] + self._room * np.array([-1.0, 1.0, -1.0, 1.0]):
-            corners = [[left, low], [right, low], [right, high], [left, high]]
-            found += line("limit", corners, THIN, closed=True)
-        return found
 
     def rows(self) -> HalfSpaces:
         """Bounds on the control along x and y: a convex part of what is admitted, braking included."""
@@ -143,7 +119,7 @@ _APPROACHED = 2  # how many of those are approached
 
 
 @dataclass
-class EscapeClearance(Constraint):
+class EscapeClearance(Constraint, Model):
     """Keep a point mass on two axes out of obstacles, moving ones above all, by keeping an escape open.
 
     A control is admitted if, held for one control step, it leaves a manoeuvre whose whole way keeps clear of where
@@ -173,6 +149,9 @@ class EscapeClearance(Constraint):
     margin: float = 0.05
     horizon_s: float = 2.5
 
+    smooth: ClassVar[bool] = False
+    recovery_s: ClassVar[float] = 0.0  # counted along every way
+
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles, kinds=(TrackedDiscs, Discs, Disc, Plane))
         check_fields(self, non_negative, ("radius", "margin"), "m")
@@ -181,32 +160,24 @@ class EscapeClearance(Constraint):
             if isinstance(obstacle, Plane) and len(obstacle.point) > 2:
                 raise ConfigurationError(f"obstacles are seen from above: give {obstacle!r} x and y alone")
 
-
-class BoundEscapeClearance(BoundBackupClearance, of=EscapeClearance):
-    """EscapeClearance on a plant."""
-
-    tolerance: float = 1e-9
-    spec: EscapeClearance
-    plant: MujocoPlant
-    _memory: int | None  # the manoeuvre that was open after the last control
-
-    def __init__(self, spec: EscapeClearance, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         hint = "EscapeClearance needs a MujocoPlant: it reads the point from the model"
         machine = require_mujoco(plant, hint)
-        self._moving: list[Any] = [o for o in spec.obstacles if _moves(o)]
-        self._fixed = [o for o in spec.obstacles if not _moves(o)]
+        self._moving: list[Any] = [o for o in self.obstacles if _moves(o)]
+        self._fixed = [o for o in self.obstacles if not _moves(o)]
         for obstacle in self._moving:
             if isinstance(obstacle, TrackedDiscs):
                 obstacle.tracks(machine)
-        super().__init__(spec, machine)
-        self._point = point = planar_point(self.plant, np.inf, self.spec.body)
+        super().setup(machine)
+        self.model = self
+        self._point = point = planar_point(self.plant, np.inf, self.body)
         # What one hold makes of a state; x and y.
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
-        holds = int(np.ceil(self.spec.horizon_s / self.plant.control_dt))
+        holds = int(np.ceil(self.horizon_s / self.plant.control_dt))
         longest = max(1, round(max(_GOING_S) / self.plant.control_dt))
         if holds <= longest:
             raise ConfigurationError(
-                f"horizon_s = {self.spec.horizon_s:g} s is too short for steps of {self.plant.control_dt:g} s: a "
+                f"horizon_s = {self.horizon_s:g} s is too short for steps of {self.plant.control_dt:g} s: a "
                 f"manoeuvre takes {longest} of them before it brakes"
             )
         bank = [Maneuver(0.0, 0.0, 0)]
@@ -216,27 +187,34 @@ class BoundEscapeClearance(BoundBackupClearance, of=EscapeClearance):
         self._usual = [0, *(bank.index(Maneuver(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
         self._firsts_of = [0, *(bank.index(Maneuver(x, y, 1)) for x, y in _DIRECTIONS)]
 
-    def executed(self, control: Array) -> Memory:
-        """The manoeuvre that is open after the control: that of the nearest one that was asked about."""
-        if not self._asked:
-            return None
-        velocity = self._held(self._driven(control))[1]
-        led_to = np.concatenate([v for v, _ in self._asked])
-        best = np.concatenate([b for _, b in self._asked])
-        return int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
+    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
+        return Trajectory(control, self.plant.state[None])
+
+    def observe(self, memory: Memory) -> None:
+        self._asked: list[tuple[Array, NDArray[np.intp]]] = []
+        joints = list(self._point.joints)
+        self._position = self.plant.qpos[joints] + np.asarray(self._point.origin)
+        going_on, asked = None, memory.get("asked", ())
+        if (
+            asked
+        ):  # the manoeuvre that is open after the executed control: of the nearest one that was asked about
+            _, _, _, _, keep, add = self._hold
+            velocity = keep * memory["velocity"] + add * self._acting(self._driven(memory["control"]))
+            led_to = np.concatenate([v for v, _ in asked])
+            best = np.concatenate([b for _, b in asked])
+            going_on = int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
+        self._going_on = going_on
+        memory["asked"] = self._asked
+        memory["velocity"] = self._velocity = self.plant.qvel[joints]
 
     def clearance(self) -> Array:
         """Distance now, not along a manoeuvre, from every obstacle or the bound of where it may be, m, shape (n,)."""
-        self._asked: list[tuple[Array, NDArray[np.intp]]] = []
-        which, going_on = list(self._usual), self._memory
+        which, going_on = list(self._usual), self._going_on
         if going_on is not None:
             # The same way with one hold less to go: the manoeuvres of a direction are in the order of their lengths.
             shorter = going_on - 1 if self._escapes.manoeuvres[going_on].holds > 1 else 0
             which += [i for i in (going_on, shorter) if i not in which]
         self._open = np.array(which, dtype=np.intp)
-        joints = list(self._point.joints)
-        self._position = self.plant.qpos[joints] + np.asarray(self._point.origin)
-        self._velocity = self.plant.qvel[joints]
         # A way after a held control begins one hold from now.
         times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._escapes.instants])
         parts = [self._expected(o, times) for o in self._moving]
@@ -244,30 +222,28 @@ class BoundEscapeClearance(BoundBackupClearance, of=EscapeClearance):
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
         halves = np.concatenate([none, *(h for _, h in parts)], axis=1)
         radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self._moving, strict=True)]
-        sizes = np.concatenate([*radii, np.zeros(0)]) + self.spec.radius
+        sizes = np.concatenate([*radii, np.zeros(0)]) + self.radius
         offsets = np.maximum(np.abs(self._position - centers[0]) - halves[0], 0.0)
         moving = np.sqrt((offsets * offsets).sum(axis=1)) - sizes
-        fixed = [distances(o, self._position[None], self.plant)[0] - self.spec.radius for o in self._fixed]
+        fixed = [distances(o, self._position[None], self.plant)[0] - self.radius for o in self._fixed]
         now = np.concatenate([moving, *fixed])
         self._around = Around(centers[1:], halves[1:], sizes, self._discs(), self._planes())
         # From outside, the violation must shrink along the way.
-        outside = min(float(now.min(initial=np.inf)) - self.spec.margin, 0.0)
-        self._wanted = self.spec.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
+        outside = min(float(now.min(initial=np.inf)) - self.margin, 0.0)
+        self._wanted = self.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
         return now
 
     def _discs(self) -> Array:
         """For `Around`."""
         discs = [o for o in self._fixed if not isinstance(o, Plane)]
-        parts = [
-            np.insert(o.centers(self.plant)[:, :2], 2, o.radius + self.spec.radius, axis=1) for o in discs
-        ]
+        parts = [np.insert(o.centers(self.plant)[:, :2], 2, o.radius + self.radius, axis=1) for o in discs]
         return np.concatenate([np.zeros((0, 3)), *parts])
 
     def _planes(self) -> Array:
         """For `Around`."""
         planes = [o for o in self._fixed if isinstance(o, Plane)]
-        rows = [[*_flat(o.point), *_flat(o.normal), self.spec.radius] for o in planes]
+        rows = [[*_flat(o.point), *_flat(o.normal), self.radius] for o in planes]
         return np.array(rows).reshape(-1, 5)
 
     def _expected(self, obstacle: Any, times: Array) -> tuple[Array, Array]:
@@ -285,10 +261,13 @@ class BoundEscapeClearance(BoundBackupClearance, of=EscapeClearance):
 
     def _held(self, controls: Array) -> tuple[Array, Array]:
         """Positions and velocities after held controls, shapes (..., 2)."""
-        low, high, drift, shift, keep, add = self._hold
-        held = np.minimum(np.maximum(controls, low), high)
+        _, _, drift, shift, keep, add = self._hold
+        held = self._acting(controls)
         position = self._position + drift * self._velocity + shift * held
         return position, keep * self._velocity + add * held
+
+    def _acting(self, controls: Array) -> Array:
+        return np.asarray(np.minimum(np.maximum(controls, self._hold[0]), self._hold[1]))
 
     def _slacks(self, controls: Array) -> Array:
         """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
@@ -301,45 +280,36 @@ class BoundEscapeClearance(BoundBackupClearance, of=EscapeClearance):
     def _driven(self, control: Array) -> Array:
         return np.asarray(control)[list(self._point.actuators)]
 
-    admits = BoundConstraint.admits  # by `slack`
-
-    def slack(self, control: Array) -> float:
-        """What the best way out after a held control leaves of what is asked for, m."""
-        left = float(self._slacks(self._driven(control)[None]).max())
-        if left >= 0.0:
-            return left
-        return left - self._needed() if left == left else -np.inf
-
-    def load(self) -> None:
-        self._slacks(self._firsts())
+    def h_along(self, path: Trajectory) -> Array:
+        """What the best way out after a held control leaves, m; now the distance from what is around."""
+        if path.control is None:
+            return self.clearance()[None]
+        left = float(self._slacks(self._driven(path.control)[None]).max())
+        if left < 0.0:
+            left -= self._needed()
+        return np.array([[left + self.margin]])
 
     def _needed(self) -> float:
         """What a way out must leave: 0, or the best that there is while new estimates use up only the margin."""
         if self._best is None:
             self._best = float(self._slacks(self._firsts()).max())
-        return self._best if -self.spec.margin < self._best < 0.0 else 0.0
+        return self._best if -self.margin < self._best < 0.0 else 0.0
 
-    def backup(self) -> Array:
+    def _backup(self) -> Array:
         """Braking where it leaves a way out, else the first control of the one that keeps farthest away."""
         firsts = self._firsts()
         left = self._slacks(firsts).max(axis=1)
         best = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
         return self._point.control(np.zeros(self.plant.model.nu), best)
 
-    def draw(self) -> list[Mark]:
-        """The obstacles with what is kept free before them, and the way of the manoeuvre that is open."""
-        spec, which = self.spec, np.array([self._memory or 0])
-        found = obstacle_marks(spec.obstacles, self.plant, spec.radius + spec.margin, self._position)
-        x, y = self._escapes.paths(self._position[None], self._velocity[None], which)
-        way = np.stack([x[0, 0], y[0, 0]], axis=1)
-        return [*found, *line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
-
     def _firsts(self) -> Array:
         """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""
         return np.array([self._escapes.first(i, self._velocity) for i in self._firsts_of])
 
-    def candidates(self, control: Array) -> list[Array]:
+    def proposals(self, control: Array | None) -> list[Array]:
         """Admissible controls near a refused one, the nearest first."""
+        if control is None:
+            return [self._backup()]
         asked, firsts = self._driven(control), self._firsts()
         left = self._slacks(firsts).max(axis=1)
         self._best = float(left.max())

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
-from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control import whole_body
 from safe_wrappers.control.contact import cone_excess
 from safe_wrappers.control.legged import support_distances
@@ -22,16 +21,17 @@ from safe_wrappers.control.whole_body import (
     predicted_position_rows,
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory
+from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
-from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.plant import Model, Plant, Trajectory
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
 _EDGES = 8  # of the pyramids inside the friction cones
 _SETTLE_S = 0.05  # time constant in which what still moves at a contact is to come to rest, s
+_REFUSED = 1e-6  # by how much a control that no forces can hold misses at least, shares of the weight
 _SAME = 1e-9  # distance from the program's answer that is rounding, control units
 
 
@@ -62,39 +62,41 @@ class ContactFeasibility(Constraint):
         self.friction_share = checked_friction_share(self.friction_share)
         check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
 
+    info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
+    measures_state: ClassVar[bool] = False
 
-class BoundContactFeasibility(BoundSlacks, of=ContactFeasibility):
-    """ContactFeasibility on a plant."""
-
-    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONE_MARGIN,)
-    spec: ContactFeasibility
-
-    def __init__(self, spec: ContactFeasibility, plant: Plant) -> None:
-        super().__init__(spec, require_contacts(plant, "ContactFeasibility"))
+    def setup(self, plant: Plant) -> None:
+        super().setup(require_contacts(plant, "ContactFeasibility"))
+        self.model = ContactModel(self.plant)
         self._chosen = np.flatnonzero(touching_bodies(self.plant, "there is no cone to stay in"))
+        self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
 
-    def insides(self, control: Array) -> Array:
-        """By how much each body's contact forces stay inside the cone, at worst, shape (k,), shares of the weight.
+    def h_along(self, path: ContactForecast | None) -> Array:
+        """By how much each body's contact forces stay inside the cone, tolerance added, shares of the weight.
 
-        Infinite for a body that touches nothing; NaN where the simulation has diverged.
+        At most as much as is asked for: differences between a touch and none would say nothing of the touch. NaN
+        where the simulation has diverged.
         """
-        found = self.plant.contact_forecast(control)
-        worst = np.full(self.plant.model.nbody, np.inf if found.finite else np.nan)
-        along = np.einsum("ki,ki->k", found.force, found.normal)
-        across = np.linalg.norm(found.force - along[:, None] * found.normal, axis=1)
-        inside = np.minimum(along, self.spec.friction_share * found.friction * along - across)
-        np.minimum.at(worst, found.body, inside / weight_n(self.plant.model))
-        return worst[self._chosen]
+        if path is None:
+            return np.zeros((1, 0))
+        worst = np.full(self.plant.model.nbody, np.inf if path.finite else np.nan)
+        along = np.einsum("ki,ki->k", path.force, path.normal)
+        across = np.linalg.norm(path.force - along[:, None] * path.normal, axis=1)
+        inside = np.minimum(along, self.friction_share * path.friction * along - across)
+        np.minimum.at(worst, path.body, inside / weight_n(self.plant.model))
+        worst, least = worst[self._chosen], float(worst[self._chosen].min())
+        self.report[keys.WHOLE_BODY_CONE_MARGIN] = least if np.isfinite(least) else 0.0
+        return (np.minimum(worst, self.margin) + self.tolerance)[None]
 
-    def slacks(self, control: Array) -> Array:
-        """What is left of the cone, tolerance added and margin taken off, per body, shares of the weight."""
-        # Capped at the margin: differences between a touch and none would say nothing of the touch.
-        return np.minimum(self.insides(control), self.spec.margin) + self.spec.tolerance - self.spec.margin
 
-    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info key `whole_body/cone_margin`: forecast for the executed control."""
-        margin = 0.0 if executed is None else float(self.insides(executed).min())
-        return {keys.WHOLE_BODY_CONE_MARGIN: margin if np.isfinite(margin) else 0.0}
+class ContactModel(Model):
+    """The contacts with the fixed world while a control is held for one control interval; None: nothing is known."""
+
+    def __init__(self, plant: MujocoPlant) -> None:
+        self._plant = plant
+
+    def rollout(self, control: Array | None, horizon: int = 1) -> ContactForecast | None:
+        return None if control is None else self._plant.contact_forecast(control)
 
 
 def require_contacts(plant: Plant, asker: str) -> MujocoPlant:
@@ -146,48 +148,28 @@ class SupportMargin(Constraint):
         self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
         self.margin = non_negative("margin", self.margin, "m")
 
+    info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_ZMP_MARGIN,)
+    measures_state: ClassVar[bool] = False
 
-class BoundSupportMargin(BoundSlacks, of=SupportMargin):
-    """SupportMargin on a plant."""
+    def setup(self, plant: Plant) -> None:
+        super().setup(require_contacts(plant, "SupportMargin"))
+        self.model = ContactModel(self.plant)
+        self.report = {keys.WHOLE_BODY_ZMP_MARGIN: 0.0}
 
-    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_ZMP_MARGIN,)
-    spec: SupportMargin
-
-    def __init__(self, spec: SupportMargin, plant: Plant) -> None:
-        super().__init__(spec, require_contacts(plant, "SupportMargin"))
-
-    def observe(self, memory: Memory) -> None:
-        self._known: list[tuple[ContactForecast, list[float]]] = []
-
-    def _distances(self, found: ContactForecast) -> list[float]:
-        """Of a forecast, computed once."""
-        for other, distances in self._known:
-            if other is found:
-                return distances
-        of = found.step, found.point, found.normal, found.force
-        distances = [float(distance) for distance in support_distances(*of)]
-        self._known.append((found, distances))
-        return distances
-
-    def slacks(self, control: Array) -> Array:
-        """Distance to the edge minus inset and margin where it is least, shape (1,), m; 0 where there is none."""
-        found = self.plant.contact_forecast(control)
-        if not found.finite:
-            return np.array([np.nan])
-        left = (d - self.spec.inset - self.spec.margin for d in self._distances(found))
-        return np.array([min(left, default=0.0)])
-
-    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info key `whole_body/zmp_margin`: forecast for the executed control."""
-        least = 0.0
-        if executed is not None:
-            found = self.plant.contact_forecast(executed)
-            least = min(self._distances(found), default=0.0) if found.finite else 0.0
-        return {keys.WHOLE_BODY_ZMP_MARGIN: least}
+    def h_along(self, path: ContactForecast | None) -> Array:
+        """Distance to the edge minus the inset where it is least, m; the margin where there is no polygon."""
+        if path is None:
+            return np.zeros((1, 0))
+        if not path.finite:
+            self.report[keys.WHOLE_BODY_ZMP_MARGIN] = 0.0
+            return np.array([[np.nan]])
+        distances = support_distances(path.step, path.point, path.normal, path.force)
+        self.report[keys.WHOLE_BODY_ZMP_MARGIN] = least = float(min(distances, default=0.0))
+        return np.array([[least - self.inset if len(distances) else self.margin]])
 
 
 @dataclass
-class Stance(Constraint):
+class Stance(Constraint, Model):
     """Keep to torques under which standing feet could stay: the whole-body program at one instant.
 
     Contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; the others
@@ -215,28 +197,25 @@ class Stance(Constraint):
         if self.joint_tolerance is not None:
             self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
 
+    info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
+    measures_state: ClassVar[bool] = False
+    smooth: ClassVar[bool] = False
 
-class BoundStance(BoundConstraint, of=Stance):
-    """Stance on a plant."""
-
-    predicts: bool = True
-    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONE_MARGIN,)
-    spec: Stance
-    plant: MujocoPlant
-
-    def __init__(self, spec: Stance, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         hint = "Stance reads inertia and contacts from a MujocoPlant whose controls are forces"
-        super().__init__(spec, require_mujoco(plant, hint))
+        super().setup(require_mujoco(plant, hint))
         if not plant.has_acceleration:
             raise UnsupportedEnvError(hint)
         refuse_mapped(self.plant.action_map, "Stance")
         touching_bodies(self.plant, "there is nothing to stand on")
-        if self.spec.joint_tolerance is not None:
+        if self.joint_tolerance is not None:
             refuse_uncovered_stops(self.plant.model)
         joints, low, high = stops(self.plant.model)
-        wider = self.spec.joint_tolerance or 0.0
+        wider = self.joint_tolerance or 0.0
         self._low, self._high = low - wider, high + wider
         self._qpos, self._dofs = self.plant.model.jnt_qposadr[joints], self.plant.model.jnt_dofadr[joints]
+        self.model = self
+        self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
 
     def observe(self, memory: Memory) -> None:
         self._known = False
@@ -264,7 +243,7 @@ class BoundStance(BoundConstraint, of=Stance):
         pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
         acceleration = -(jacobians @ self.plant.qvel) / _SETTLE_S
         limits: dict[str, Any] = {}
-        if self.spec.joint_tolerance is not None:
+        if self.joint_tolerance is not None:
             position, speed = self.plant.qpos[self._qpos], self.plant.qvel[self._dofs]
             joints = self._dofs, position, speed, self._low, self._high
             limits["accelerations"] = predicted_position_rows(
@@ -272,7 +251,7 @@ class BoundStance(BoundConstraint, of=Stance):
             )
         limits |= {"contact_acceleration": acceleration, "breaking": ~pressing}
         limits["first_tangents"] = found.first_tangents[ground]
-        contacts = jacobians, drift, normals, self.spec.friction_share * found.friction[ground]
+        contacts = jacobians, drift, normals, self.friction_share * found.friction[ground]
         controls = self.plant.lower, self.plant.upper, control
         problem = WholeBodyProblem(motion.inertia, bias, motion.actuation, *contacts, *controls, **limits)
         # Two points of one rigid foot cannot come to rest each as it likes.
@@ -280,13 +259,11 @@ class BoundStance(BoundConstraint, of=Stance):
         return replace(problem, contact_acceleration=attainable)
 
     def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
-        exact = self.spec.cone == "exact"
+        exact = self.cone == "exact"
         return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, _EDGES)
 
-    def admits(self, control: Array) -> bool:
+    def _holds(self, control: Array) -> bool:
         """Whether the standing contacts could answer this control with forces inside their cones."""
-        # An action space of another precision than the model's range may be a rounding wider.
-        control = np.clip(control, self.plant.lower, self.plant.upper)
         problem = self.problem(control)
         if problem is None:
             return False
@@ -303,25 +280,30 @@ class BoundStance(BoundConstraint, of=Stance):
         self._asked, self._answer = proposed.copy(), self.solve(replace(problem, nominal=proposed))
         return self._answer
 
-    def candidates(self, proposed: Array) -> Iterator[Array]:
+    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
+        """The present instant, under the control."""
+        return Trajectory(control, self.plant.state[None])
+
+    def h_along(self, path: Trajectory) -> Array:
+        """What the forces that would hold the contacts leave of their cones, shares of the weight."""
+        if path.control is None:
+            return np.zeros((1, 0))
+        # An action space of another precision than the model's range may be a rounding wider.
+        control = np.clip(path.control, self.plant.lower, self.plant.upper)
+        problem = self.problem(control)
+        if problem is None:
+            return np.array([[-np.inf]])
+        forces = whole_body.rigid_forces(problem, control)
+        missed = cone_excess(forces, problem.normals, problem.friction)
+        left = -float(missed.max()) / weight_n(self.plant.model) if len(forces) else 0.0
+        self.report[keys.WHOLE_BODY_CONE_MARGIN] = left
+        return np.array([[max(left, 0.0) if self._holds(control) else min(left, -_REFUSED)]])
+
+    def proposals(self, control: Array | None) -> Iterator[Array]:
         """The program's answer; where there is none, the proposed control, which is refused."""
-        proposed = np.clip(proposed, self.plant.lower, self.plant.upper)
+        if control is None:
+            return
+        proposed = np.clip(control, self.plant.lower, self.plant.upper)
         problem = self.problem(proposed)
         if problem is not None:  # another constraint may have refused before this one was asked
             yield (self._answer or self._ask(problem, proposed)).control
-
-    def slack(self, control: Array) -> float:
-        """What the forces that would hold the contacts leave of their cones, shares of the weight."""
-        control = np.clip(control, self.plant.lower, self.plant.upper)
-        problem = self.problem(control)
-        if problem is None:
-            return -np.inf
-        forces = whole_body.rigid_forces(problem, control)
-        missed = cone_excess(forces, problem.normals, problem.friction)
-        return -float(missed.max()) / weight_n(self.plant.model) if len(forces) else 0.0
-
-    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """The info key `whole_body/cone_margin`: of the forces that would hold the contacts."""
-        if executed is None or self._problem is None:
-            return {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
-        return {keys.WHOLE_BODY_CONE_MARGIN: 0.0 + self.slack(executed)}

@@ -1,6 +1,6 @@
 """ImpactSpeedLimit: bound the peak force of contacts by the approach speed."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
@@ -8,15 +8,40 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array, name_list, positive
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RolloutConstraint
 from safe_wrappers.control.contact import peak_force, speed_limit
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.geom_distance import geom_distance, nearest
 
 _FIXED = 1e-12  # mobility along the normal, 1/kg, below which a geom cannot move into contact
+
+
+class Contact(NamedTuple):
+    """Contacts, now or at the present speed, each field a number or shape (...)."""
+
+    gap: float | Array  # m, negative inside
+    speed: float | Array  # of the approach, m/s, >= 0
+    mass: float | Array  # effective, kg
+    stiffness: float | Array  # N/m
+    push: float | Array  # what presses on besides the motion, N, >= 0
+    deflection: float | Array  # m, >= 0
+
+    @property
+    def peak(self) -> Array:
+        """Force by the deepest deflection, under a push that goes on, N."""
+        return peak_force(*self[1:])
+
+    def left(self, limit: float) -> Array:
+        """What is left of a limit, N, to first order; in squares, nearly linear in the control."""
+        pressed = self.stiffness * self.deflection
+        # Beyond the limit the push would change its sign with that of the first factor.
+        push = np.where(pressed <= limit, self.push, -self.push)
+        share = self.speed / speed_limit(limit, self.mass, self.stiffness)
+        square = (limit - pressed) * (limit + pressed - 2.0 * push)
+        return np.asarray(square / (2.0 * limit) - 0.5 * limit * share**2)
 
 
 @dataclass
@@ -60,51 +85,17 @@ class ImpactSpeedLimit(RolloutConstraint):
             nothing = f"the margin {self.margin} N leaves nothing"
             raise ConfigurationError(f"{nothing} of the limit {self.force_limit} N")
 
-
-class Contact(NamedTuple):
-    """Contacts, now or at the present speed, each field a number or shape (...)."""
-
-    gap: float | Array  # m, negative inside
-    speed: float | Array  # of the approach, m/s, >= 0
-    mass: float | Array  # effective, kg
-    stiffness: float | Array  # N/m
-    push: float | Array  # what presses on besides the motion, N, >= 0
-    deflection: float | Array  # m, >= 0
-
-    @property
-    def peak(self) -> Array:
-        """Force by the deepest deflection, under a push that goes on, N."""
-        return peak_force(*self[1:])
-
-    def left(self, limit: float) -> Array:
-        """What is left of a limit, N, to first order; in squares, nearly linear in the control."""
-        pressed = self.stiffness * self.deflection
-        # Beyond the limit the push would change its sign with that of the first factor.
-        push = np.where(pressed <= limit, self.push, -self.push)
-        share = self.speed / speed_limit(limit, self.mass, self.stiffness)
-        square = (limit - pressed) * (limit + pressed - 2.0 * push)
-        return np.asarray(square / (2.0 * limit) - 0.5 * limit * share**2)
-
-
-class BoundImpactSpeedLimit(BoundRollout, of=ImpactSpeedLimit):
-    """ImpactSpeedLimit on a plant."""
-
-    spec: ImpactSpeedLimit
-
-    @property
-    def scale(self) -> float:
-        return self.spec.force_limit
-
-    def __init__(self, spec: ImpactSpeedLimit, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         plant.require_acceleration("ImpactSpeedLimit")
-        super().__init__(spec, plant)
+        super().setup(plant)
         m = self.plant.model
-        self._gaps = GeomGaps(self.plant, self.spec.bodies, self.spec.against)
+        self._gaps = GeomGaps(self.plant, self.bodies, self.against)
         self._probe = mujoco.MjData(m)
         self._integration = np.zeros(mujoco.mj_stateSize(m, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
-        self._limit = self.spec.force_limit - self.spec.margin
+        self._limit = self.force_limit - self.margin
         self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
         self._mobile = np.zeros((1, m.nv))
+        self.scale = self.force_limit
 
     def place(self, qpos: Array, qvel: Array, control: Array | None) -> None:
         """Everything about a state but its constraint forces; without a control the actuators do not push."""
@@ -142,7 +133,7 @@ class BoundImpactSpeedLimit(BoundRollout, of=ImpactSpeedLimit):
         given = self._mobile[0].copy()
         mobility = float(row @ given)
         speed = float(row @ self._speeds)
-        stiffness = self.spec.stiffness
+        stiffness = self.stiffness
         if mobility < _FIXED:
             return Contact(gap, 0.0, 1.0 / _FIXED, stiffness, 0.0, 0.0)
         mass = 1.0 / mobility
@@ -153,50 +144,47 @@ class BoundImpactSpeedLimit(BoundRollout, of=ImpactSpeedLimit):
         push = mass * max(moving, float(given @ self._resting), 0.0)
         return Contact(gap, max(speed, 0.0), mass, stiffness, push, max(-gap, 0.0))
 
-    def backup(self) -> Array:
-        """The braking with which every forecast goes on: what was admitted for its sake stays admissible."""
-        return self.plant.braking()
+    def proposals(self, control: Array | None) -> Iterable[Array]:
+        """The braking with which every trajectory goes on: what was admitted for its sake stays admissible."""
+        return () if control is not None else (self.plant.braking(),)
 
-    def now(self) -> Array:
+    def h_along(self, path: MujocoTrajectory) -> Array:
+        """What every pair's contact leaves of the limit; without one as much as the gentlest, N."""
+        if path.control is None:
+            return self._now()
+        k, pairs = len(path.qpos), len(self._gaps.pairs)
+        if not np.isfinite(path.qpos[-1]).all():
+            return np.full((k, pairs), np.nan)  # MuJoCo's simulation has diverged
+        touched: dict[int, list[int]] = {}
+        for pair in range(pairs):
+            for instant in self._gaps.touched(self.plant, path, self._probe, pair):
+                touched.setdefault(instant, []).append(pair)
+        soon = self.plant.substeps - 1
+        left = np.full((k, pairs), 0.5 * self._limit)
+        judged: list[tuple[int, int]] = []
+        contacts: list[Contact] = []
+        for instant, those in touched.items():
+            # At the end of the held step another control takes over.
+            control = path.control if instant < soon or instant == 0 else None
+            self.place(path.qpos[instant], path.qvel[instant], control)
+            for pair in those:
+                judged.append((instant, pair))
+                contacts.append(self.contact(pair))
+        if judged:
+            instants, those = np.transpose(judged)
+            left[instants, those] = _together(contacts).left(self._limit)
+        return left + self.margin
+
+    def _now(self) -> Array:
         m, d = self.plant.model, self._probe
         data, what = self.plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_getState(m, data, self._integration, what)
         mujoco.mj_setState(m, d, self._integration, what)
         self.place(self.plant.qpos, self.plant.qvel, None)
         contacts = _together([self.contact(pair) for pair in range(len(self._gaps.pairs))])
-        there = contacts.gap <= self._gaps.touch
+        there, left = contacts.gap <= self._gaps.touch, contacts.left(self._limit) + self.margin
         # Only a contact that is there counts; before it, how it will be is the forecast's to say.
-        left = self.spec.force_limit - contacts.peak
-        self._lost = np.where(there, np.minimum(contacts.left(self._limit), 0.0), 0.0)
-        return np.where(there, left, np.maximum(left, 0.0))
-
-    def _violation(self, value: Array) -> Array:
-        return self._lost
-
-    def room(self, forecast: Forecast) -> Array:
-        k, pairs = len(forecast.qpos), len(self._gaps.pairs)
-        if not np.isfinite(forecast.qpos[-1]).all():
-            return np.full((k, pairs), np.nan)  # MuJoCo's simulation has diverged
-        touched: dict[int, list[int]] = {}
-        for pair in range(pairs):
-            for instant in self._gaps.touched(self.plant, forecast, self._probe, pair):
-                touched.setdefault(instant, []).append(pair)
-        soon = self.plant.substeps - 1
-        # Without contact as much is left as in the gentlest one.
-        room = np.full((k, pairs), 0.5 * self._limit)
-        judged: list[tuple[int, int]] = []
-        contacts: list[Contact] = []
-        for instant, those in touched.items():
-            # At the end of the held step another control takes over.
-            control = forecast.control if instant < soon or instant == 0 else None
-            self.place(forecast.qpos[instant], forecast.qvel[instant], control)
-            for pair in those:
-                judged.append((instant, pair))
-                contacts.append(self.contact(pair))
-        if judged:
-            instants, those = np.transpose(judged)
-            room[instants, those] = _together(contacts).left(self._limit)
-        return room + self.spec.margin
+        return np.where(there, left, np.maximum(left, 0.0))[None]
 
 
 def _together(contacts: Sequence[Contact]) -> Contact:
@@ -244,16 +232,16 @@ class GeomGaps:
         return nearest(model, data, *self.pairs[pair])
 
     def touched(
-        self, plant: MujocoPlant, forecast: Forecast, data: mujoco.MjData, pair: int
+        self, plant: MujocoPlant, path: MujocoTrajectory, data: mujoco.MjData, pair: int
     ) -> Iterator[int]:
-        """The instants of a forecast at which a contact of a pair has to be judged, in time.
+        """The instants of a trajectory at which a contact of a pair has to be judged, in time.
 
         They are the first of every contact, the last of every control step in contact, and the first of every
         approach after a rebound in contact; in between the control is held, and the approach was judged when it
         began. Only the geoms' poses are written into `data`.
         """
         m, (a, b) = plant.model, self.pairs[pair]
-        (centres, axes), (other, others) = _path(m, forecast, a), _path(m, forecast, b)
+        (centres, axes), (other, others) = _path(m, path, a), _path(m, path, b)
         steps = _farthest(m, a, centres, axes) + _farthest(m, b, other, others)
         way = np.concatenate([[0.0], np.cumsum(steps)])
         k, touch, instant = len(centres), self.touch[pair], 0
@@ -288,9 +276,9 @@ def _geoms(plant: MujocoPlant, name: str) -> list[int]:
     raise UnknownNameError(f"the model has no body or geom {name!r}; {there}")
 
 
-def _path(model: mujoco.MjModel, forecast: Forecast, geom: int) -> tuple[Array, Array]:
-    """Centres, shape (k, 3), and axes, shape (k, 3, 3), of a geom along a forecast."""
-    poses, body = forecast.poses(), model.geom_bodyid[geom]
+def _path(model: mujoco.MjModel, path: MujocoTrajectory, geom: int) -> tuple[Array, Array]:
+    """Centres, shape (k, 3), and axes, shape (k, 3, 3), of a geom along a trajectory."""
+    poses, body = path.poses(), model.geom_bodyid[geom]
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
     axes = poses.axes[:, body]

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array, float_array, name_list, positive
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
-from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, SCALAR_JOINTS
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -130,47 +130,34 @@ class JointPositionLimit(RolloutConstraint):
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
 
-
-class BoundJointPositionLimit(BoundRollout, of=JointPositionLimit):
-    """JointPositionLimit on a plant."""
-
-    spec: JointPositionLimit
-
-    def __init__(self, spec: JointPositionLimit, plant: Plant) -> None:
-        super().__init__(spec, plant)
-        self._ids = ids = scalar_joints(self.plant, self.spec.joints)
+    def setup(self, plant: Plant) -> None:
+        super().setup(plant)
+        ids = scalar_joints(self.plant, self.joints)
         model: mujoco.MjModel = self.plant.model
         self._qpos = model.jnt_qposadr[ids]
         limited = model.jnt_limited[ids].astype(bool)
         own = np.where(limited[:, None], model.jnt_range[ids], [-np.inf, np.inf])
-        lower, upper = self.spec.lower, self.spec.upper
-        self._low = own[:, 0] if lower is None else per_joint("lower", lower, len(ids))
-        self._high = own[:, 1] if upper is None else per_joint("upper", upper, len(ids))
-        narrow = ~(self._high - self._low > 2.0 * self.spec.margin)
+        low = own[:, 0] if self.lower is None else per_joint("lower", self.lower, len(ids))
+        high = own[:, 1] if self.upper is None else per_joint("upper", self.upper, len(ids))
+        narrow = ~(high - low > 2.0 * self.margin)
         if narrow.any():
             j = int(np.flatnonzero(narrow)[0])
             raise ConfigurationError(
-                f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {self._low[j]:g} to "
-                f"{self._high[j]:g} with a margin of {self.spec.margin:g} at both ends"
+                f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {low[j]:g} to {high[j]:g} "
+                f"with a margin of {self.margin:g} at both ends"
             )
-        self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
-        if not (self._below.any() or self._above.any()):
+        self._below, self._above = np.isfinite(low), np.isfinite(high)
+        self._low, self._high = low[self._below], high[self._above]
+        if not (self._low.size or self._high.size):
             named = ", ".join(repr(model.joint(j).name) for j in ids)
             raise ConfigurationError(
                 f"none of these joints has a range in the model: pass lower and upper ({named})"
             )
 
-    def now(self) -> Array:
-        return self._left(self.plant.qpos)
-
-    def _left(self, qpos: Array) -> Array:
-        """Room to every bound that there is, the lower ones first, shape (..., n)."""
-        q = qpos[..., self._qpos]
-        sides = (q - self._low)[..., self._below], (self._high - q)[..., self._above]
-        return np.concatenate(sides, axis=-1)
-
-    def room(self, forecast: Forecast) -> Array:
-        return self._left(forecast.qpos)
+    def h_along(self, path: MujocoTrajectory) -> Array:
+        """Room to every bound that there is, the lower ones first, rad or m."""
+        q = path.qpos[:, self._qpos]
+        return np.concatenate([q[:, self._below] - self._low, self._high - q[:, self._above]], axis=1)
 
 
 def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
@@ -218,42 +205,29 @@ class JointSpeedLimit(RolloutConstraint):
         if min(checked) <= self.margin:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
 
-
-class BoundJointSpeedLimit(BoundRollout, of=JointSpeedLimit):
-    """JointSpeedLimit on a plant."""
-
-    spec: JointSpeedLimit
-
-    @property
-    def scale(self) -> float:
-        return float(np.min(self.spec.limit))
-
-    def __init__(self, spec: JointSpeedLimit, plant: Plant) -> None:
+    def setup(self, plant: Plant) -> None:
         hint = "on an AnalyticPlant write Barrier(lambda x: limit**2 - x[i]**2)"
         require_mujoco(plant, f"JointSpeedLimit needs a MujocoPlant (named joints); {hint}")
-        super().__init__(spec, plant)
-        self._ids = ids = scalar_joints(self.plant, self.spec.joints)
+        super().setup(plant)
+        ids = scalar_joints(self.plant, self.joints)
         self._dofs = self.plant.model.jnt_dofadr[ids]
-        self._limits = per_joint("limit", self.spec.limit, len(ids))
-        self._bound = np.asarray(self._limits - self.spec.margin)
+        self._limits = per_joint("limit", self.limit, len(ids))
+        self.scale = float(np.min(self.limit))
 
-    def now(self) -> Array:
+    def h_along(self, path: MujocoTrajectory) -> Array:
         """Speed left below the limit, per joint, rad/s or m/s."""
-        return np.asarray(self._limits - np.abs(self.plant.qvel[self._dofs]))
+        return np.asarray(self._limits - np.abs(path.qvel[:, self._dofs]))
 
-    def room(self, forecast: Forecast) -> Array:
-        return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
-
-    def rows(self) -> HalfSpaces:
+    def rows(self) -> HalfSpaces | None:
         """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""
         if not self.plant.has_acceleration:
-            return super().rows()
-        plant, hold = self.plant, self.plant.control_dt
+            return None
+        plant, hold, bound = self.plant, self.plant.control_dt, self._limits - self.margin
         drift, effect = (of_dof[self._dofs] for of_dof in plant.acceleration)
         speed, strongest = plant.qvel[self._dofs], np.maximum(np.abs(plant.lower), np.abs(plant.upper))
         # No push, not NaN, where an actuator without effect is infinitely strong.
         pushes = (np.abs(effect) * np.where(effect != 0.0, strongest, 0.0)).sum(axis=1)
-        near = np.abs(speed) + hold * (np.abs(drift) + pushes) > self._bound
-        drift, effect, room, rate = drift[near], effect[near], self._bound[near] / hold, speed[near] / hold
+        near = np.abs(speed) + hold * (np.abs(drift) + pushes) > bound
+        drift, effect, room, rate = drift[near], effect[near], bound[near] / hold, speed[near] / hold
         normals = np.concatenate([effect, -effect])
         return HalfSpaces(normals, np.concatenate([room - rate - drift, room + rate + drift]))

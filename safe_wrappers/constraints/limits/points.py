@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -15,12 +15,11 @@ from safe_wrappers.checks import (
     positive,
     true_or_false,
 )
-from safe_wrappers.constraints.obstacles import distances, obstacle_marks, obstacles_from
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
-from safe_wrappers.drawing.marks import Mark, ball, edges, pad
+from safe_wrappers.constraints.obstacles import distances, obstacles_from
+from safe_wrappers.constraints.rollout import RolloutConstraint
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory
-from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.plant import Plant
 
 DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
@@ -63,6 +62,7 @@ class SpeedLimit(RolloutConstraint):
     euler_look_ahead: bool = False
 
     unit: ClassVar[str] = "m/s"
+    recovery_s: ClassVar[float] = 0.0  # the next step's displacement starts afresh
 
     def __post_init__(self) -> None:
         self._check_shared()
@@ -75,83 +75,57 @@ class SpeedLimit(RolloutConstraint):
         if self.average not in ("step", "substep"):
             raise UnknownNameError(f"no average {self.average!r}; choose step or substep")
 
-
-class SpeedMemory(NamedTuple):
-    """The memory of every rollout, and the point at the last control step, m (None: there was none)."""
-
-    rollout: RolloutMemory
-    here: Array | None = None
-
-
-class BoundSpeedLimit(BoundRollout, of=SpeedLimit):
-    """SpeedLimit on a plant."""
-
-    spec: SpeedLimit
-
-    @property
-    def scale(self) -> float:
-        return self.spec.limit
-
-    def __init__(self, spec: SpeedLimit, plant: Plant) -> None:
-        super().__init__(spec, plant)
-        self._body = None if spec.body is None else self.plant.named("body", spec.body)
-        letters = spec.direction.strip("+-")
+    def setup(self, plant: Plant) -> None:
+        super().setup(plant)
+        self._body = None if self.body is None else self.plant.named("body", self.body)
+        letters = self.direction.strip("+-")
         self._axes = slice("xyz".index(letters[0]), "xyz".index(letters[-1]) + 1)
-        self._sign = {"+": 1.0, "-": -1.0}.get(spec.direction[0])
-        self._window = self.plant.substeps if self.spec.average == "step" else 1
-
-    def start(self) -> Memory:
-        return SpeedMemory(super().start())
+        self._sign = {"+": 1.0, "-": -1.0}.get(self.direction[0])
+        self._window = self.plant.substeps if self.average == "step" else 1
+        self.scale = self.limit
 
     def observe(self, memory: Memory) -> None:
-        self._before = memory.here
-        super().observe(memory.rollout)
-
-    def executed(self, control: Array) -> Memory:
-        return SpeedMemory(super().executed(control), self._here)
-
-    def _point(self, frames: Array, centres: Array) -> Array:
-        if self._body is None:
-            return np.asarray((self._shares @ centres)[..., self._axes])
-        return frames[..., self._body, self._axes]
-
-    def now(self) -> Array:
         if self._body is None:
             mass = self.plant.model.body_mass
             self._shares = mass / mass.sum()
         pose = self.plant.pose()
-        data = self.plant.published() if self.spec.average == "step" else None
+        data = self.plant.published() if self.average == "step" else None
         self._published = None if data is None else self._point(data.xpos, data.xipos).copy()
-        before, self._here = self._before, self._point(pose.xpos, pose.xipos).copy()
-        if before is None or self.spec.average == "substep":
-            # What the last substep shows; at a reset nothing else has moved yet that could be measured.
-            earlier = self.plant.substep_ago()
-            moved = self._here - self._point(earlier.frames[0], earlier.centres[0])
-            return self._left(moved[None], 1)
-        return self._left((self._here - before)[None], self.plant.substeps)
+        self._before, self._here = memory.get("here"), self._point(pose.xpos, pose.xipos).copy()
+        memory["here"] = self._here
+
+    def _point(self, frames: Array, centres: Array) -> Array:
+        if self._body is None:
+            return np.asarray((self._shares @ centres)[..., self._axes])
+        return np.asarray(frames[..., self._body, self._axes])
 
     def _left(self, displacements: Array, substeps: int) -> Array:
         """What is left below the limit, shape (...,), of displacements over so many substeps, shape (..., axes)."""
         velocity = displacements / (substeps * self.plant.control_dt / self.plant.substeps)
         if self._sign is not None:
-            return self.spec.limit - self._sign * velocity[..., 0]
-        return np.asarray(self.spec.limit - np.sqrt((velocity * velocity).sum(axis=-1)))
+            return np.asarray(self.limit - self._sign * velocity[..., 0])
+        return np.asarray(self.limit - np.sqrt((velocity * velocity).sum(axis=-1)))
 
-    def _violation(self, value: Array) -> Array:
-        return np.zeros(1)  # the next step's displacement starts afresh: there is no way back to allow for
-
-    def room(self, forecast: Forecast) -> Array:
-        poses = forecast.poses(self._window)
+    def h_along(self, path: MujocoTrajectory) -> Array:
+        """What is left below the limit, of both displacements where the published one counts, m/s."""
+        if path.control is None:
+            return self._now()
+        poses = path.poses(self._window)
         points = self._point(poses.frames, poses.centres)
         way = np.empty((len(points) + 1, 1 if self._published is None else 2, points.shape[1]))
         way[0, 0], way[1:, 0] = self._here, points
         if self._published is not None:
             way[0, 1] = self._published
-            way[1:, 1] = self._point(forecast.published_frames, forecast.published_centres)
+            way[1:, 1] = self._point(path.published_frames, path.published_centres)
         return self._left(way[1:] - way[:-1], self._window)
 
-
-_STILL_M = 1e-4  # what is at rest on springy contacts moves by less within a forecast
+    def _now(self) -> Array:
+        if self._before is None or self.average == "substep":
+            # What the last substep shows; at a reset nothing else has moved yet that could be measured.
+            earlier = self.plant.substep_ago()
+            moved = self._here - self._point(earlier.frames[0], earlier.centres[0])
+            return self._left(moved[None, None], 1)
+        return self._left((self._here - self._before)[None, None], self.plant.substeps)
 
 
 @dataclass
@@ -189,6 +163,7 @@ class Workspace(RolloutConstraint):
     max_decrease: float | None = None
 
     unit: ClassVar[str] = "m"
+    at_rest: ClassVar[float] = 1e-4
 
     def __post_init__(self) -> None:
         self._check_shared()
@@ -207,75 +182,36 @@ class Workspace(RolloutConstraint):
                 f"and a margin of {self.margin} m on each side"
             )
 
-
-class BoundWorkspace(BoundRollout, of=Workspace):
-    """Workspace on a plant."""
-
-    spec: Workspace
-
-    def __init__(self, spec: Workspace, plant: Plant) -> None:
-        super().__init__(spec, plant)
-        if not (self.spec.bodies or self.spec.sites or self.spec.geoms):
+    def setup(self, plant: Plant) -> None:
+        super().setup(plant)
+        if not (self.bodies or self.sites or self.geoms):
             there = ", ".join(self.plant.names("body"))
             wanted = "name the bodies, sites or geoms to keep inside"
             raise ConfigurationError(f"{wanted}; the bodies are {there}")
         m = self.plant.model
-        named = {"body": self.spec.bodies, "site": self.spec.sites, "geom": self.spec.geoms}
+        named = {"body": self.bodies, "site": self.sites, "geom": self.geoms}
         bodies, sites, geoms = ([self.plant.named(kind, n) for n in names] for kind, names in named.items())
         self._bodies = np.array([*bodies, *m.site_bodyid[sites], *m.geom_bodyid[geoms]], dtype=int)
         self._offsets = np.vstack([np.zeros((len(bodies), 3)), m.site_pos[sites], m.geom_pos[geoms]])
 
-    def _points(self, frames: Array, axes: Array) -> Array:
-        """World positions, shape (k, points, 3)."""
-        rotated = np.einsum("kpij,pj->kpi", axes[:, self._bodies], self._offsets)
-        return np.asarray(frames[:, self._bodies] + rotated)
+    def points(self, path: MujocoTrajectory) -> Array:
+        """World positions, shape (instants, points, 3), m."""
+        poses = path.poses()
+        rotated = np.einsum("kpij,pj->kpi", poses.axes[:, self._bodies], self._offsets)
+        return np.asarray(poses.frames[:, self._bodies] + rotated)
 
-    def _left(self, points: Array) -> Array:
-        """Room of every point to every bound and surface, shape (k, n)."""
+    def h_along(self, path: MujocoTrajectory) -> Array:
+        """Room of every point to every bound and surface, m."""
+        points = self.points(path)
         k = len(points)
-        low, high = np.isfinite(self.spec._low), np.isfinite(self.spec._high)
-        above, below = (points - self.spec._low)[:, :, low], (self.spec._high - points)[:, :, high]
+        low, high = np.isfinite(self._low), np.isfinite(self._high)
+        above, below = (points - self._low)[:, :, low], (self._high - points)[:, :, high]
         left = [above.reshape(k, -1), below.reshape(k, -1)]
         every = points.reshape(-1, 3)
-        for obstacle in self.spec.keep_out:
+        for obstacle in self.keep_out:
             surfaces = distances(obstacle, every, self.plant)
             left.append(surfaces.reshape(k, points.shape[1] * surfaces.shape[1]))
-        return np.concatenate(left, axis=1) - self.spec.radius
-
-    def now(self) -> Array:
-        pose = self.plant.pose()
-        points = self._points(pose.xpos[None], pose.xmat.reshape(1, -1, 3, 3))
-        return np.asarray(self._left(points)[0])
-
-    def room(self, forecast: Forecast) -> Array:
-        poses = forecast.poses()
-        return self._left(self._points(poses.frames, poses.axes))
-
-    def keeps_limit(self, control: Array) -> bool:
-        if not 0.0 <= self._least < self.spec.margin:
-            return False
-        left = self.room(self.plant.forecast(control, self.spec.horizon)).min(axis=0)
-        kept = self._outside + self.spec.margin - _STILL_M
-        return bool((left >= np.maximum(kept, 0.0)).all())
-
-    def draw(self) -> list[Mark]:
-        """The points; the edges of the box in which they stay, or what is near of its planes; the obstacles."""
-        spec, pose = self.spec, self.plant.pose()
-        inset = spec.margin + spec.radius
-        points = self._points(pose.xpos[None], pose.xmat.reshape(1, -1, 3, 3))[0]
-        found = [ball("way", p, max(spec.radius, 0.012)) for p in points]
-        low, high = spec._low + inset, spec._high - inset
-        if np.isfinite([low, high]).all():
-            found += edges("limit", low, high, 0.004)
-        else:
-            for end in (low, high):
-                for axis in np.flatnonzero(np.isfinite(end)):
-                    foot = points[0].copy()
-                    foot[axis] = end[axis]
-                    found.append(pad("keep out", foot, np.eye(3)[axis], 0.2))
-        for p in points:
-            found += obstacle_marks(spec.keep_out, self.plant, inset, p)
-        return found
+        return np.concatenate(left, axis=1) - self.radius
 
 
 def _corner(name: str, given: Sequence[float | None] | None) -> list[float | None] | None:

@@ -9,11 +9,11 @@ import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, name_list, positive
 from safe_wrappers.constraints.limits.joints import chain, driven_joints, refuse_uncovered, scalar_joints
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RolloutConstraint
 from safe_wrappers.control import barriers as of_arm
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
-from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS, SLIDE
 from safe_wrappers.plants.plant import Plant
 
@@ -92,16 +92,10 @@ class SingularityMargin(RolloutConstraint):
             raise ConfigurationError(f'directions is some of "xyz", each once; got {given!r}')
         self._rows = ["xyz".index(direction) for direction in given]
 
-
-class BoundSingularityMargin(BoundRollout, of=SingularityMargin):
-    """SingularityMargin on a plant."""
-
-    spec: SingularityMargin
-
-    def __init__(self, spec: SingularityMargin, plant: Plant) -> None:
-        super().__init__(spec, plant)
-        model, kind = self.plant.model, spec._kind
-        name = getattr(spec, kind)
+    def setup(self, plant: Plant) -> None:
+        super().setup(plant)
+        model, kind = self.plant.model, self._kind
+        name = getattr(self, kind)
         self._index, what = self.plant.named(kind, name), f"the {kind} {name!r}"
         body = self._index if kind == "body" else int(getattr(model, f"{kind}_bodyid")[self._index])
         carriers = sorted(chain(model, body))
@@ -114,30 +108,30 @@ class BoundSingularityMargin(BoundRollout, of=SingularityMargin):
         moving = np.linalg.norm(jacobians, axis=1).max(axis=0) > _STILL
         self._joints = [j for j, moves in zip(self._joints, moving, strict=True) if moves]
         jacobians = jacobians[..., moving]
-        task = f"directions={spec.directions!r}"
-        if len(self._joints) < len(spec._rows):
+        task = f"directions={self.directions!r}"
+        if len(self._joints) < len(self._rows):
             there = ", ".join(model.joint(j).name for j in self._joints) or "none"
             raise ConfigurationError(
-                f"{len(self._joints)} joints cannot move {what} in {len(spec._rows)} directions at once ({task}); "
+                f"{len(self._joints)} joints cannot move {what} in {len(self._rows)} directions at once ({task}); "
                 f"the joints are {there}"
             )
         # With as many joints as directions w is the determinant but for its sign, which turns at a singular pose.
-        self._signed, self._side = len(self._joints) == len(spec._rows), 1.0
+        self._signed, self._side = len(self._joints) == len(self._rows), 1.0
         found = of_arm.manipulability(jacobians)
         most = float(found.max())
         if most < _STILL:
             nowhere = "cannot be moved in all of these directions at once in any configuration"
             raise ConfigurationError(f"{what} {nowhere}: {task}")
-        if spec.threshold is not None:
-            self._threshold = spec.threshold
+        if self.threshold is not None:
+            self._threshold = self.threshold
         else:
-            assert spec.task_speed is not None and spec.rate_limit is not None
-            spec.validated = of_arm.validated_threshold(jacobians, spec.task_speed, spec.rate_limit)
-            self._threshold = spec.validated
-        if self._threshold * (1.0 + self.spec.margin) >= most:
+            assert self.task_speed is not None and self.rate_limit is not None
+            self.validated = of_arm.validated_threshold(jacobians, self.task_speed, self.rate_limit)
+            self._threshold = self.validated
+        if self._threshold * (1.0 + self.margin) >= most:
             raise ConfigurationError(
                 f"no configuration has a manipulability above {self._threshold:g} with a margin of "
-                f"{self.spec.margin:g} of it: the largest of {_SAMPLES} in the joints' ranges is {most:.4g}, half of "
+                f"{self.margin:g} of it: the largest of {_SAMPLES} in the joints' ranges is {most:.4g}, half of "
                 f"them are above {float(np.median(found)):.4g}"
             )
 
@@ -145,7 +139,7 @@ class BoundSingularityMargin(BoundRollout, of=SingularityMargin):
         """The joints that do the task, in the order of their ids; an error where they do not move the frame."""
         model = self.plant.model
         there = ", ".join(model.joint(j).name for j in self._carriers)
-        if self.spec.joints is None:
+        if self.joints is None:
             found = [j for j in driven_joints(model) if j in self._carriers]
             if not found:
                 wanted = f"no actuator drives a joint that moves {what}: name the joints that move it"
@@ -153,8 +147,8 @@ class BoundSingularityMargin(BoundRollout, of=SingularityMargin):
             remedy = "Name those that do the task: joints=[...]"
             refuse_uncovered(model, self._carriers, remedy, self.plant.has_acceleration)
             return found
-        ids = scalar_joints(self.plant, self.spec.joints)
-        for j, name in zip(ids, self.spec.joints, strict=True):
+        ids = scalar_joints(self.plant, self.joints)
+        for j, name in zip(ids, self.joints, strict=True):
             if j not in self._carriers:
                 wanted = f"the joint {name!r} does not move {what}"
                 raise ConfigurationError(f"{wanted}; those that do: {there}")
@@ -177,14 +171,14 @@ class BoundSingularityMargin(BoundRollout, of=SingularityMargin):
 
     def _jacobians(self, qpos: Array) -> Array:
         """The task's rows over the joints that do it, at finite positions (k, nq): shape (k, m, n)."""
-        model, data, of_frame = self.plant.model, self._data, _JACOBIANS[self.spec._kind]
+        model, data, of_frame = self.plant.model, self._data, _JACOBIANS[self._kind]
         found = np.empty((len(qpos), 3, model.nv))
         for q, linear in zip(qpos, found, strict=True):
             data.qpos[:] = q
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             of_frame(model, data, linear, None, self._index)
-        return found[:, self.spec._rows][..., model.jnt_dofadr[self._joints]]
+        return found[:, self._rows][..., model.jnt_dofadr[self._joints]]
 
     def _measure(self, qpos: Array) -> Array:
         """w, shape (k,), below zero beyond the singular pose; NaN where a position is not finite."""
@@ -197,23 +191,20 @@ class BoundSingularityMargin(BoundRollout, of=SingularityMargin):
             w[finite] = signed
         return w
 
-    def now(self) -> Array:
-        if self.plant.model.nmocap:
-            pose = self.plant.pose()
-            self._data.mocap_pos[:], self._data.mocap_quat[:] = pose.mocap_pos, pose.mocap_quat
-        self._side = 1.0
-        w = self._measure(self.plant.qpos[None])
-        if w[0] < 0.0:
-            self._side, w = -1.0, -w
-        return np.asarray(w / self._threshold - 1.0)
+    def h_along(self, path: MujocoTrajectory) -> Array:
+        """What w has above the threshold, in shares of it."""
+        if path.control is None:
+            if self.plant.model.nmocap:
+                pose = self.plant.pose()
+                self._data.mocap_pos[:], self._data.mocap_quat[:] = pose.mocap_pos, pose.mocap_quat
+            self._side = 1.0
+            self._side = -1.0 if self._measure(path.qpos)[0] < 0.0 else 1.0
+        return np.asarray(self._measure(path.qpos) / self._threshold - 1.0)[:, None]
 
-    def room(self, forecast: Forecast) -> Array:
-        return np.asarray(self._measure(forecast.qpos) / self._threshold - 1.0)[:, None]
-
-    def rows(self) -> HalfSpaces:
+    def rows(self) -> HalfSpaces | None:
         """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides."""
         if not (self._scalar and self.plant.has_acceleration):
-            return super().rows()
+            return None
         model, n = self.plant.model, len(self._carriers)
         places, dofs = model.jnt_qposadr[self._carriers], model.jnt_dofadr[self._carriers]
         speeds = self.plant.qvel[dofs]
@@ -222,10 +213,11 @@ class BoundSingularityMargin(BoundRollout, of=SingularityMargin):
         beside[:, places] += np.concatenate(
             [_STEP * np.eye(n), -_STEP * np.eye(n), along * np.outer([1, -1], speeds)]
         )
-        w = self._measure(beside) / self._threshold
+        w, now = self._measure(beside) / self._threshold, float(self._measure(self.plant.qpos[None])[0])
+        left = now / self._threshold - 1.0
         slope = (w[:n] - w[n : 2 * n]) / (2.0 * _STEP)
-        curvature = (w[-2] - 2.0 * (self._least + 1.0) + w[-1]) / along**2
+        curvature = (w[-2] - 2.0 * (left + 1.0) + w[-1]) / along**2
         a = 1.0 / (_DECAY_HOLDS * self.plant.control_dt)
-        left = 2.0 * a * (slope @ speeds) + a * a * (self._least - self.spec.margin)
+        decay = 2.0 * a * (slope @ speeds) + a * a * (left - self.margin)
         drift, effect = self.plant.acceleration
-        return HalfSpaces(-(slope @ effect[dofs])[None], np.array([slope @ drift[dofs] + curvature + left]))
+        return HalfSpaces(-(slope @ effect[dofs])[None], np.array([slope @ drift[dofs] + curvature + decay]))

@@ -212,6 +212,7 @@ class ContactForecast(NamedTuple):
     finite: (
         bool  # False where numbers left MuJoCo's bounds (it then resets the state): contacts are meaningless
     )
+    holds: int = 1  # control intervals
 
 
 class ContactReader:

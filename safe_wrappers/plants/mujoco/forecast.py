@@ -1,4 +1,4 @@
-"""A forecast: what a MuJoCo model does under a held control, and under braking after it."""
+"""The trajectory of a MuJoCo model under a held control, and under braking after it."""
 
 from typing import Final, NamedTuple
 
@@ -7,6 +7,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.plants.mujoco.model import Remade, control_range
+from safe_wrappers.plants.plant import Trajectory
 
 _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
@@ -24,24 +25,24 @@ class Poses(NamedTuple):
     centres: Array  # centres of mass, shape (k, nbody, 3), m
 
 
-class Forecast:
-    """The machine after every physics substep of a forecast.
+class MujocoTrajectory(Trajectory):
+    """The machine after every physics substep.
 
     Attributes:
-        control: The one that is held, shape (nu,).
         qpos, qvel: Positions, shape (k, nq), and velocities, shape (k, nv); NaN from the control interval on in which
             MuJoCo had to reset the state.
-        path: Both, shape (k, nq + nv).
+        states: Both, shape (k, nq + nv).
         published_frames, published_centres: `data.xpos` and `data.xipos` as MuJoCo leaves them at the end of every
             control interval, shapes (holds, nbody, 3), m. They lag behind the state: by one substep after Euler
             steps, to the last stage after Runge-Kutta steps.
         published: Both, shape (holds, 2, nbody, 3), m.
     """
 
-    def __init__(self, recorder: "Recorder", control: Array, path: Array, published: Array) -> None:
-        self._recorder, self.control, self.path, self.published = recorder, control, path, published
+    def __init__(self, recorder: "Recorder", control: Array | None, states: Array, published: Array) -> None:
+        super().__init__(control, states, max(1, len(published)))
+        self._recorder, self.published = recorder, published
         nq = recorder.nq
-        self.qpos, self.qvel = path[:, :nq], path[:, nq:]
+        self.qpos, self.qvel = states[:, :nq], states[:, nq:]
         self.published_frames, self.published_centres = published[:, 0], published[:, 1]
         self._poses: dict[int, Poses] = {}
 
@@ -51,12 +52,12 @@ class Forecast:
             self._poses[every] = self._recorder.poses(self.qpos[every - 1 :: every])
         return self._poses[every]
 
-    def first(self, horizon: int) -> "Forecast":
+    def first(self, horizon: int) -> "MujocoTrajectory":
         """Its first control intervals."""
-        if horizon == len(self.published):
+        if horizon == self.holds:
             return self
-        k = len(self.path) // len(self.published) * horizon
-        return Forecast(self._recorder, self.control, self.path[:k], self.published[:horizon])
+        k = len(self.states) // self.holds * horizon
+        return MujocoTrajectory(self._recorder, self.control, self.states[:k], self.published[:horizon])
 
 
 class Recorder(Remade):
@@ -84,8 +85,8 @@ class Recorder(Remade):
         self._low, self._high = control_range(model)
 
     def record(
-        self, control: Array, horizon: int, first: Forecast | None = None, euler: bool = False
-    ) -> Forecast:
+        self, control: Array, horizon: int, first: MujocoTrajectory | None = None, euler: bool = False
+    ) -> MujocoTrajectory:
         """Hold a control, shape (nu,), for one control interval; in the others each actuator brakes its own joints.
 
         The data starts at the present state and is left at the end, after `horizon` >= 1 control intervals. With
@@ -104,7 +105,7 @@ class Recorder(Remade):
         else:
             whole = 1
             mujoco.mj_copyData(data, m, self._held)
-            path[:n], published[:1] = first.path, first.published
+            path[:n], published[:1] = first.states, first.published
         if whole and horizon > 1:
             whole = (self._by_euler_steps if euler else self.simulate)(1, horizon, path, published)
         return self._forecast(control, path, published, whole)
@@ -113,7 +114,7 @@ class Recorder(Remade):
         """Called when the present state has changed: what is held belongs to another one."""
         self._held_after = b""
 
-    def sketch(self, control: Array, horizon: int) -> Forecast:
+    def sketch(self, control: Array, horizon: int) -> MujocoTrajectory:
         """A forecast as `record` makes it, but by Euler steps from the start; nothing is held."""
         path, published = self._empty(horizon)
         self._begin(control)
@@ -129,11 +130,11 @@ class Recorder(Remade):
         self.place(self._data)
         self.act(self._data, control)
 
-    def _forecast(self, control: Array, path: Array, published: Array, whole: int) -> Forecast:
+    def _forecast(self, control: Array, path: Array, published: Array, whole: int) -> MujocoTrajectory:
         if whole < len(published):
             # After a reset, MuJoCo's response to numbers out of bounds, all numbers may look plausible.
             path[whole * self.substeps :] = published[whole:] = np.nan
-        return Forecast(self, control.copy(), path, published)
+        return MujocoTrajectory(self, control.copy(), path, published)
 
     def _by_euler_steps(self, begin: int, end: int, path: Array, published: Array) -> int:
         if not self.is_runge_kutta:

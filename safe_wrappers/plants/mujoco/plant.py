@@ -17,7 +17,7 @@ from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
 from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
-from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
+from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Poses, Recorder
 from safe_wrappers.plants.mujoco.model import (
     DYNAMICS,
     PLACES,
@@ -185,8 +185,9 @@ class MujocoPlant(Plant):
         self._loaded = self._forwarded = False
         self._affine: tuple[Array, Array] | None = None
         self._recorder.forget()
-        self._forecasts: dict[tuple[bytes, bool], Forecast] = {}
+        self._forecasts: dict[tuple[bytes, bool], MujocoTrajectory] = {}
         self._contact_forecasts: dict[bytes, ContactForecast] = {}
+        self._present: _Present | None = None
 
     def observe(self) -> None:
         """Take the env's present state; everything else is computed on demand."""
@@ -234,7 +235,7 @@ class MujocoPlant(Plant):
         known = self._forecasts.get((key, False)) or self._forecasts.get((key, True))
         if known is None or self._delay_steps:
             return ""
-        state, end = np.concatenate([data.qpos, data.qvel]), known.path[self.substeps - 1]
+        state, end = np.concatenate([data.qpos, data.qvel]), known.states[self.substeps - 1]
         same = state.tobytes() == end.tobytes() or np.allclose(state, end, *_ROUNDING, equal_nan=True)
         return "" if same else f"the step ended {np.abs(state - end).max():.3g} from its forecast"
 
@@ -352,25 +353,33 @@ class MujocoPlant(Plant):
         ends = self.actuators.acting_range(*motion, self.control_dt)
         return ends if self.action_map is None else self.action_map.actions_between(*ends)
 
-    def forecast(self, control: Array, horizon: int = 1, euler: bool = False) -> Forecast:
+    def rollout(self, control: Array | None, horizon: int = 1, euler: bool = False) -> MujocoTrajectory:
         """A control, shape (nu,), held for one control interval, then every actuator brakes its own motion.
 
         `horizon` >= 1 counts all control intervals. Braking, with `euler` by Euler steps, is one way to continue, not
-        the best one. A forecast is kept until the next observation, so that constraints share it.
+        the best one. A trajectory is kept until the next observation, so that constraints share it.
         """
+        if control is None:
+            return self._now()
         key = control.tobytes()
         known = self._forecasts.get((key, euler))
-        if known is None or len(known.published) < horizon:
+        if known is None or known.holds < horizon:
             known = known or self._forecasts.get((key, not euler))
             self._load_to_step()
             known = self._recorder.record(control, horizon, known and known.first(1), euler)
             self._forecasts[key, euler] = known
         return known.first(horizon)
 
-    def sketch(self, control: Array, horizon: int) -> Forecast:
-        """A forecast by Euler steps alone, of little price where the model's are Runge-Kutta's; not kept."""
+    def _now(self) -> "_Present":
+        """The present state alone."""
+        if self._present is None:
+            self._present = _Present(self)
+        return self._present
+
+    def sketch(self, control: Array, horizon: int = 1) -> MujocoTrajectory:
+        """A trajectory by Euler steps alone, of little price where the model's are Runge-Kutta's; not kept."""
         known = self._forecasts.get((control.tobytes(), False))
-        if known is not None and len(known.published) >= horizon and not self._recorder.is_runge_kutta:
+        if known is not None and known.holds >= horizon and not self._recorder.is_runge_kutta:
             return known.first(horizon)
         self._load_to_step()
         return self._recorder.sketch(control, horizon)
@@ -414,9 +423,6 @@ class MujocoPlant(Plant):
         """The env's own data, whose derived quantities lag; None under a delay, when the state is predicted."""
         return None if self._delay_steps else self._source.data
 
-    def path(self, control: Array) -> list[Array]:
-        return list(self.forecast(control).path)
-
     def motion(self, kind: str, name: str) -> tuple[Array, Array]:
         """Position (3,), m, and velocity (3,), m/s, of a named frame's origin; much cheaper than `point`."""
         data = self.pose()
@@ -437,6 +443,18 @@ class MujocoPlant(Plant):
     def attribute(self, name: str) -> Any:
         found = getattr(self._raw, name, None)
         return found if found is not None else env_checks.read_attribute(self._env, name)
+
+
+class _Present(MujocoTrajectory):
+    """The present state alone, valid until the next observation."""
+
+    def __init__(self, plant: MujocoPlant) -> None:
+        super().__init__(plant._recorder, None, plant.state[None], np.empty((0, 2, 0, 3)))
+        self._plant = plant
+
+    def poses(self, every: int = 1) -> Poses:
+        pose = self._plant.pose()
+        return Poses(pose.xpos[None], pose.xmat.reshape(1, -1, 3, 3), pose.xipos[None])
 
 
 def _scale(model: mujoco.MjModel, mass: float, damping: float) -> None:

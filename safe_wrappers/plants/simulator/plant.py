@@ -169,15 +169,15 @@ class SimulatorPlant(RolloutPlant):
         self.exact = False
         return f"the env's step was not its simulation's: {found}"
 
-    def rollout(
+    def simulate(
         self,
         control: Array,
         horizon: int,
-        policy: Policy | None = None,
-        measure: Measure | None = None,
-        least: float = -np.inf,
-        until: Callable[[View], bool] | None = None,
-        between: bool = False,
+        policy: Policy | None,
+        measure: Measure | None,
+        least: float,
+        until: Callable[[View], bool] | None,
+        between: bool,
     ) -> Rollout:
 
         def simulated(env: gym.Env[Any, Any]) -> tuple[Rollout, float | None]:

@@ -1,12 +1,12 @@
-"""The constraints that `protect` puts on each known env, and the reasons for their numbers."""
+"""The constraints and plants that `protect` takes for each known env, and the reasons for their numbers."""
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 import gymnasium as gym
 import mujoco
+import numpy as np
 
 from safe_wrappers.constraints import (
     Box,
@@ -18,6 +18,7 @@ from safe_wrappers.constraints import (
     JointPositionLimit,
     JointSpeedLimit,
     Plane,
+    PredictiveShield,
     SpeedLimit,
     TrackedDiscs,
     Traction,
@@ -31,7 +32,9 @@ from safe_wrappers.envs.goal_robots import CAR
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADIUS
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.plants import MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.plants.mujoco.model import HINGE
+from safe_wrappers.plants.rollouts import View
 
 Env = gym.Env[Any, Any]
 Recommended = list[Constraint]
@@ -198,12 +201,18 @@ EULER_LOOK_AHEAD: Final = ("Hopper", "Walker2d")
 
 
 def _velocity(robot: str, margin: float = 0.02, horizon: int = 3) -> Callable[..., Recommended]:
-    body = None if robot == "Humanoid" else "torso"
-    direction = "xy" if robot in ("Ant", "Humanoid") else "+x"
     limit, share = SPEED_LIMITS[robot], LOOK_AHEAD_BELOW.get(robot)
-    below = None if share is None else share * limit
-    ahead = SpeedLimit(limit, body, direction, margin=margin, horizon=horizon, look_ahead_below=below)
-    return _fixed(replace(ahead, euler_look_ahead=robot in EULER_LOOK_AHEAD))
+    return _fixed(
+        SpeedLimit(
+            limit,
+            body=None if robot == "Humanoid" else "torso",
+            direction="xy" if robot in ("Ant", "Humanoid") else "+x",
+            margin=margin,
+            horizon=horizon,
+            look_ahead_below=None if share is None else share * limit,
+            euler_look_ahead=robot in EULER_LOOK_AHEAD,
+        )
+    )
 
 
 RECIPES: dict[str, Callable[..., Recommended]] = {
@@ -246,3 +255,141 @@ RECIPES: dict[str, Callable[..., Recommended]] = {
     **{robot: _velocity(robot) for robot in ("Hopper", "Walker2d", "Ant", "Humanoid")},
 }
 """By the env's id without its version, or the part of it before "_" (PointMaze_UMaze)."""
+
+
+def _cart_pole_h(x: Any) -> float:
+    return float(min(1.0 - abs(x[2]) / 0.15, 1.0 - abs(x[0]) / 2.0))
+
+
+def _balancing(x: Any) -> int:
+    # The gains are those of the linear quadratic regulator for weights (1, 0.1, 10, 0.1) and 0.01.
+    return int(0.12 * x[0] + 0.15 * x[1] + x[2] + 0.24 * x[3] > 0.0)
+
+
+def _lunar_lander(env: Env) -> Recommended:
+    from gymnasium.envs.box2d import lunar_lander
+
+    def h(view: View) -> float:
+        if view.env.game_over:
+            return -1.0
+        return float(min(0.6 - abs(view.observation[4]), 1.0 - abs(view.observation[0])))
+
+    def backup(view: View) -> Any:
+        return lunar_lander.heuristic(view.env, view.observation)  # type: ignore[no-untyped-call]
+
+    return [PredictiveShield(h, horizon=150, backup=backup, sees="view", candidates=6)]
+
+
+def _crouching(stiffness: float, damping: float, *target: float) -> Callable[[View], Any]:
+    """Feedback of angles and speeds of hips and knees to a posture in which a walker stands."""
+
+    def backup(view: View) -> Any:
+        angles, speeds = view.observation[[4, 6, 9, 11]], view.observation[[5, 7, 10, 12]]
+        return np.clip(stiffness * (np.array(target) - angles) - damping * speeds, -1.0, 1.0)
+
+    return backup
+
+
+def _upright_walker(view: View) -> float:
+    return -1.0 if view.env.game_over else float(0.8 - abs(view.observation[0]))
+
+
+def _panda_h(raw: Any) -> float:
+    at, low, high = raw.robot.get_ee_position(), [-0.2, -0.2, 0.02], [0.2, 0.2, 0.3]
+    return float(np.minimum(np.subtract(at, low), np.subtract(high, at)).min())
+
+
+def _highway(env: Env) -> Recommended:
+    # SLOWER, the last of its actions; or, with continuous ones, full braking straight on.
+    backup = 4 if isinstance(env.action_space, gym.spaces.Discrete) else np.array([-1.0, 0.0])
+    return [PredictiveShield("crashed", horizon=4, backup=[backup, "hold"], candidates=4)]
+
+
+def _kitchen_h(raw: Any) -> float:
+    return 1.0 - float(np.abs(raw.data.qvel[:7]).max())
+
+
+_WALKER: Final = _fixed(
+    PredictiveShield(
+        _upright_walker,
+        horizon=60,
+        # The best of 150 at random.
+        backup=[
+            _crouching(4.68, 0.31, 0.76, 0.49, -0.82, 0.82),
+            _crouching(5.80, 0.65, 0.66, 0.48, 0.30, 1.08),
+            _crouching(5.34, 1.00, 0.42, 1.05, -0.35, 0.53),
+        ],
+        sees="view",
+        candidates=6,
+    )
+)
+SHELF: Final[dict[str, Callable[..., Recommended]]] = {
+    # Its motor is weaker than gravity, but takes out energy: falling from the top it reaches 4.8 rad/s.
+    "Pendulum": _fixed(
+        PredictiveShield(
+            lambda x: 6.0 - abs(x[2]), horizon=40, backup=lambda x: [np.clip(-4.0 * x[2], -2.0, 2.0)]
+        )
+    ),
+    # An action changes the speed by its 0.0015-fold.
+    "MountainCarContinuous": _fixed(
+        PredictiveShield(
+            lambda x: 0.045 - abs(x[1]), horizon=60, backup=lambda x: [np.clip(-x[1] / 0.0015, -1.0, 1.0)]
+        )
+    ),
+    "CartPole": _fixed(PredictiveShield(_cart_pole_h, horizon=60, backup=_balancing)),
+    **dict.fromkeys(("LunarLander", "LunarLanderContinuous"), _lunar_lander),
+    **dict.fromkeys(("BipedalWalker", "BipedalWalkerHardcore"), _WALKER),
+    "PandaReach": _fixed(PredictiveShield(_panda_h, horizon=4, backup="zero", sees="env", margin=0.002)),
+    **dict.fromkeys(("highway", "highway-fast"), _highway),
+    # Its targets are clipped ahead of noisy measurements: no MujocoPlant forecasts that, a copy with the noise does.
+    "FrankaKitchen": _fixed(PredictiveShield(_kitchen_h, horizon=3, backup="zero", sees="env", margin=0.05)),
+    # 10 N on 1.1 kg of cart and pole is 9 m/s^2; the swinging pole takes up to a third of it.
+    "dm_control/cartpole": _fixed(
+        Clearance([Plane([-1.0], [1.0]), Plane([1.0], [-1.0])], bodies=["cart"], braking=6.0, margin=0.01)
+    ),
+    # What dm_control reports is the velocity at the end of a step. Over a physics substep the centre of mass moves by
+    # up to 0.18 m/s less (measured), since legs that turn at 50 rad/s bend its way.
+    "dm_control/walker": _fixed(SpeedLimit(1.0, None, "+x", margin=0.3, horizon=10, average="substep")),
+}
+"""For other packages' envs, with backups that were measured; dm_control's by the domain, without the task."""
+
+
+def _of_physics() -> Plant:
+    """The model and the data of dm_control's physics, in an env of shimmy's."""
+    return MujocoPlant(
+        model=lambda raw: raw._env.physics.model.ptr, data=lambda raw: raw._env.physics.data.ptr
+    )
+
+
+PLANTS: Final[dict[str, Callable[[], Plant]]] = {
+    "CartPole": lambda: SimulatorPlant(control_dt=0.02),
+    **dict.fromkeys(
+        ("LunarLander", "LunarLanderContinuous", "BipedalWalker", "BipedalWalkerHardcore"),
+        lambda: SimulatorPlant("fork", control_dt=1.0 / 50.0),
+    ),
+    "PandaReach": lambda: SimulatorPlant("fork", control_dt=0.04),  # 20 substeps of 2 ms
+    "FrankaKitchen": lambda: SimulatorPlant(control_dt=0.08),  # 40 substeps of 2 ms
+    **dict.fromkeys(("dm_control/cartpole", "dm_control/walker"), _of_physics),
+}
+"""Where it is not the default one: Box2D's worlds and PyBullet's server cannot be copied."""
+EVERY: Final = dict(sorted({**RECIPES, **SHELF}.items()))
+"""All recipes."""
+
+
+def family_of(env: Env) -> str:
+    """The env's id without version and kind of reward; of dm_control's the domain; "" without an id."""
+    return _family(env.spec.id) if env.spec is not None else ""
+
+
+def _family(env_id: str) -> str:
+    namespace, _, name = env_id.rpartition("/")
+    if namespace == "dm_control":
+        return f"{namespace}/{name.partition('-')[0]}"
+    return name.rpartition("-v")[0].removesuffix("Dense").removesuffix("Sparse")
+
+
+def recipe_of(env_id: str) -> str | None:
+    """The name of the recipe that `protect` has for an id, or None."""
+    family = _family(env_id)
+    robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
+    return next((name for name in (robot, robot.partition("_")[0]) if name in EVERY), None)

@@ -1,0 +1,365 @@
+"""The table of symptoms: how each is measured, from when on it counts, and which wrapper treats it."""
+
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.checks import Array
+from safe_wrappers.constraints import ImpactSpeedLimit, JointPositionLimit, PredictiveShield
+from safe_wrappers.constraints.limits.joints import driven_joints
+from safe_wrappers.control.vehicle import slip_ratio
+from safe_wrappers.diagnosis.recording import Env, NotMeasuredError, Recording, box
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants import SimulatorPlant
+from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.plants.mujoco.model import HINGE, fixed_bodies, weight_n
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.wrappers.presets import SlipLimiter, WholeBodyFilter
+from safe_wrappers.wrappers.protect import protect
+from safe_wrappers.wrappers.recipes import recipe_of
+
+PRESSED = 0.02
+"""Share of a joint's range by which it is beyond its stop."""
+RATE = 0.05
+"""Share of the range of commands by which the proposed handover lets them change in a control step."""
+SLIPS = 0.2
+"""Slip ratio from which on a wheel is beyond the peak of its traction on all usual grounds."""
+REGULARIZATION = 0.5
+"""m/s, as of `SlipLimiter`."""
+_LEVEL = 0.5
+"""Of the vertical part of an axle's direction: a wheel does not turn about a steep one."""
+_GEOM: Final = mujoco.mjtGeom
+_GROUND: Final = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
+
+
+class Evidence(NamedTuple):
+    """One measured number."""
+
+    name: str
+    value: float
+    unit: str
+
+
+Measured = tuple[float, list[Evidence]]
+"""A symptom's figure for one driver, in the symptom's unit, and further numbers."""
+
+
+class Treatment(NamedTuple):
+    """What helps.
+
+    Attributes:
+        code: How the wrapper is typed; "" where none can be tried.
+        wrap: Does the same to an env.
+        advice: What to do besides, or why no wrapper can be tried.
+    """
+
+    code: str
+    wrap: Callable[[Env], Env] | None
+    advice: str = ""
+
+
+class Symptom(NamedTuple):
+    """One row of the table of symptoms.
+
+    Attributes:
+        title: In words.
+        threshold: From which on it is a symptom, in `unit`.
+        unit: Of the figure; "share" is one of control steps.
+        measure: Of what one driver did; raises `NotMeasuredError`.
+        treatment: For the env of a recording.
+        policies_only: Random and attacking drivers have this symptom of themselves.
+    """
+
+    title: str
+    threshold: float
+    unit: str
+    measure: Callable[[Recording], Measured]
+    treatment: Callable[[Recording], Treatment]
+    policies_only: bool = False
+
+
+def _typed(arguments: dict[str, Any]) -> list[str]:
+    return [f"{name}={value!r}" for name, value in arguments.items()]
+
+
+def _wrapped(wrapper: Callable[..., Env], advice: str = "", **arguments: Any) -> Treatment:
+    """A wrapper of the package, or `protect`, with arguments whose `repr` is how they are typed."""
+    code = f"env = sw.{wrapper.__name__}({', '.join(['env', *_typed(arguments)])})"
+    return Treatment(code, lambda env: wrapper(env, **arguments), advice)
+
+
+def _filtered(
+    constraint: Callable[..., Any], advice: str = "", simulated: bool = False, **arguments: Any
+) -> Treatment:
+    """A filter with one constraint of `safe_wrappers.constraints`; arguments as of `_wrapped`."""
+    limit = f"sw.constraints.{constraint.__name__}({', '.join(_typed(arguments))})"
+    plant = ", plant=sw.SimulatorPlant()" if simulated else ""
+    return Treatment(
+        f"limit = {limit}\nenv = sw.CBFActionFilter(env, [limit]{plant})",
+        lambda env: CBFActionFilter(
+            env, [constraint(**arguments)], plant=SimulatorPlant() if simulated else None
+        ),
+        advice,
+    )
+
+
+def _is_protected_by_recipe(env: Env) -> bool:
+    """Whether `protect` has a recipe for the env, and accepts what is around it."""
+    if env.spec is None or recipe_of(env.spec.id) is None:
+        return False
+    try:
+        protect(env)
+    except ConfigurationError:
+        return False
+    return True
+
+
+# limits: declared costs, joints that press their stops, contacts with what is fixed
+
+
+def _beyond(recording: Recording) -> tuple[list[str], Array]:
+    """Driven joints with stops, and how far each is beyond them, as a share of its range, shape (k, joints)."""
+    model = recording.model
+    if model is None:
+        return [], np.zeros((len(recording.first), 0))
+    joints = [j for j in driven_joints(model) if model.jnt_limited[j]]
+    low, high = model.jnt_range[joints].T
+    position = recording.qpos[:, model.jnt_qposadr[joints]]
+    return [model.joint(j).name for j in joints], np.maximum(low - position, position - high) / (high - low)
+
+
+def _touches_fixed(recording: Recording) -> NDArray[np.bool_]:
+    """Whether the machine touches something fixed that is no ground, shape (k,)."""
+    model = recording.model
+    if model is None:
+        return np.zeros(len(recording.first), dtype=bool)
+    solid = fixed_bodies(model)[model.geom_bodyid] & ~np.isin(model.geom_type, _GROUND)
+    roots = model.body_rootid[model.jnt_bodyid[driven_joints(model)]]
+    machine = np.isin(model.body_rootid[model.geom_bodyid], roots) & ~solid
+    hit = np.outer(solid, machine) | np.outer(machine, solid)
+    return np.array([any(hit[pair] for pair in pairs) for pairs in recording.touching])
+
+
+def _measure_limits(recording: Recording) -> Measured:
+    cost = recording.of_info("cost")
+    judged = not np.isnan(cost).all()
+    if not judged and recording.model is None:
+        raise NotMeasuredError(
+            "the env reports no cost in info, and has no MuJoCo model whose limits could be read"
+        )
+    costs, hits = cost > 0.0, _touches_fixed(recording)
+    pressed = (_beyond(recording)[1] > PRESSED).any(axis=1)
+    evidence = [
+        Evidence("steps with a cost", float(costs.mean()) if judged else np.nan, "share"),
+        Evidence("steps with a driven joint pressed beyond its stop", float(pressed.mean()), "share"),
+        Evidence("steps in contact with something fixed, not the ground", float(hits.mean()), "share"),
+    ]
+    return float((costs | pressed | hits).mean()), evidence
+
+
+def _treat_limits(recording: Recording) -> Treatment:
+    if _is_protected_by_recipe(recording.env):
+        return _wrapped(protect)
+    names, beyond = _beyond(recording)
+    if (beyond > PRESSED).any():
+        pressed = [name for name, shares in zip(names, beyond.T, strict=True) if shares.max() > 0.0]
+        return _filtered(JointPositionLimit, joints=pressed, margin=0.0, horizon=recording.braking_horizon)
+    if (recording.of_info("cost") > 0.0).any():
+        advice = "Choose a backup that stops your machine, and a horizon that is as long as it takes."
+        return _filtered(PredictiveShield, advice, simulated=True, h="cost", horizon=20, backup="zero")
+    advice = "Say where the fixed things are: Workspace(keep_out=[...]), Clearance or PredictiveShield."
+    return Treatment("", None, advice)
+
+
+# command_steps: commands that spike
+
+
+def command_steps(recording: Recording) -> Array:
+    """The largest change of a command in each step, as a share of the range, shape (k,); 0 at an episode's start."""
+    low, high = box(recording.env.unwrapped)
+    commands = recording.executed / np.where(high > low, high - low, 1.0)
+    steps = np.abs(np.diff(commands, axis=0, prepend=commands[:1])).max(axis=1)
+    return np.asarray(np.where(recording.first, 0.0, steps))
+
+
+def _measure_steps(recording: Recording) -> Measured:
+    """The largest command steps, but for one in a hundred control steps."""
+    steps = command_steps(recording)
+    evidence = [Evidence("median command step", float(np.median(steps)), "of the range")]
+    return float(np.percentile(steps, 99.0)), evidence
+
+
+def _treat_steps(recording: Recording) -> Treatment:
+    """A handover of single actions that bounds the rate of commands."""
+    low, high = box(recording.env)
+    rate = float(f"{RATE * float((high - low).min()) / recording.control_dt:.4g}")
+    chunks = "If the policy gives chunks, pass them whole: ChunkHandover(env, chunk_size=..., execution_horizon=...)."
+    return _wrapped(ChunkHandover, chunks, chunk_size=1, execution_horizon=1, rate_limit=rate)
+
+
+# contact_forces: peak forces against the machine's weight
+
+
+def _measure_forces(recording: Recording) -> Measured:
+    """The largest force between two bodies above the usual one, in weights of all that moves."""
+    weight = weight_n(recording.needed_model)
+    forces = recording.of_info("contact/peak_force")
+    if np.isnan(forces).all():
+        raise NotMeasuredError("no ContactMonitor goes around this env: a step of its outer wrapper is many")
+    bad = recording.diverged | ~np.isfinite(np.column_stack([recording.qpos, recording.qvel])).all(axis=1)
+    if bad.any():
+        return np.inf, [Evidence("steps in which the simulation diverged", float(bad.sum()), "")]
+    recording.check_replays()
+    # What presses all the time, maybe where it cannot move, is no impact.
+    peak = max(float(np.nanmax(forces) - np.nanmedian(forces)), 0.0)
+    evidence = [
+        Evidence("largest force between two bodies, above the usual one", peak, "N"),
+        Evidence("weight of what moves", weight, "N"),
+        Evidence("deepest penetration", float(np.nanmax(recording.of_info("contact/penetration"))), "m"),
+    ]
+    return peak / weight, evidence
+
+
+def _treat_forces(recording: Recording) -> Treatment:
+    """`protect`, where it keeps the machine off what is fixed; else a limit of the pair that hit hardest."""
+    if recording.diverged.any():
+        advice = "The simulation diverged: a shorter timestep, softer contacts, or weaker actuators."
+        return Treatment("", None, advice)
+    if _touches_fixed(recording).any() and _is_protected_by_recipe(recording.env):
+        return _wrapped(protect)
+    forces = np.nan_to_num(recording.of_info("contact/peak_force"), nan=0.0)
+    k = int(np.argmax(forces))
+    depth, pair = float(recording.of_info("contact/penetration")[k]), recording.struck[k]
+    if pair is None or not depth > 0.0:
+        advice = "Limit the speed of what hits: ImpactSpeedLimit, or a lower speed of the whole machine."
+        return Treatment("", None, advice)
+    model = recording.needed_model
+    fixed = fixed_bodies(model)
+    names = sorted(pair, key=lambda name: bool(fixed[model.body(name).id]))
+    return _filtered(
+        ImpactSpeedLimit,
+        bodies=names[:1],
+        against=names[1:],
+        force_limit=float(f"{forces[k] / 3.0:.4g}"),
+        stiffness=float(f"{forces[k] / depth:.4g}"),
+        horizon=recording.braking_horizon,
+    )
+
+
+# wheel_slip: wheels that spin or lock
+
+
+def wheels(model: mujoco.MjModel) -> dict[int, float]:
+    """Driven joints that turn a round geom about a level axle without a stop; with its radius, m."""
+    found, data = {}, mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for j in driven_joints(model):
+        level = abs(data.xaxis[j, 2]) < _LEVEL
+        if model.jnt_type[j] != HINGE or model.jnt_limited[j] or not level or not model.joint(j).name:
+            continue
+        for g in np.flatnonzero(model.geom_bodyid == model.jnt_bodyid[j]):
+            axis = np.zeros(3)
+            mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), model.geom_quat[g])
+            touches = model.geom_contype[g] or model.geom_conaffinity[g]
+            off_axle = np.linalg.norm(np.cross(model.geom_pos[g] - model.jnt_pos[j], model.jnt_axis[j]))
+            cylinder = model.geom_type[g] == int(_GEOM.mjGEOM_CYLINDER)
+            aligned = cylinder and abs(axis @ model.jnt_axis[j]) > 0.99
+            round_geom = aligned or model.geom_type[g] == int(_GEOM.mjGEOM_SPHERE)
+            radius = float(model.geom_size[g, 0])
+            if touches and off_axle < 0.05 * radius and round_geom:
+                found[j] = radius
+    return found
+
+
+def slips(recording: Recording) -> Array:
+    """The slip ratio of each wheel after each step, shape (k, wheels)."""
+    model = recording.needed_model
+    rolling = wheels(model)
+    if not rolling:
+        raise NotMeasuredError("no driven joint turns a wheel")
+    ratio, velocity, data = np.zeros((len(recording.qpos), len(rolling))), np.zeros(6), mujoco.MjData(model)
+    for k in range(len(ratio)):
+        data.qpos[:], data.qvel[:] = recording.qpos[k], recording.qvel[k]
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            compute(model, data)
+        for i, (j, radius) in enumerate(rolling.items()):
+            body, axle = int(model.jnt_bodyid[j]), data.xaxis[j]
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+            ahead = np.array([axle[1], -axle[0]]) / max(np.hypot(axle[0], axle[1]), 1e-6)
+            rim = radius * float(velocity[:3] @ axle)
+            ratio[k, i] = slip_ratio(rim, float(ahead @ velocity[3:5]), REGULARIZATION)
+    return ratio
+
+
+def _measure_slip(recording: Recording) -> Measured:
+    worst = np.abs(slips(recording)).max(axis=1)
+    evidence = [
+        Evidence("95th percentile of the largest slip", float(np.percentile(worst, 95.0)), ""),
+        Evidence("largest slip", float(worst.max()), ""),
+    ]
+    return float((worst > SLIPS).mean()), evidence
+
+
+def _treat_slip(recording: Recording) -> Treatment:
+    model = recording.needed_model
+    return _wrapped(SlipLimiter, wheels=[model.joint(j).name for j in wheels(model)])
+
+
+# balance: feet that slide or tip
+
+
+def _measure_balance(recording: Recording) -> Measured:
+    """The share of steps with a foot at the edge of its friction cone, or outside of the support polygon."""
+    if recording.model is not None and wheels(recording.model):
+        raise NotMeasuredError("it rolls: its wheels are judged by their slip")
+    friction, zmp = recording.of_info("balance/friction_used"), recording.of_info("balance/zmp_margin")
+    if np.isnan(friction).all():
+        raise NotMeasuredError(
+            "no BalanceMonitor goes around this env: nothing stands on fixed ground by friction"
+        )
+    recording.check_replays()
+    if not ((friction == 0.0).any() or recording.terminated.any()):
+        raise NotMeasuredError(f"{name_of(recording.env)} never left the ground: it does not balance")
+    sliding, tipping = friction >= 1.0, zmp < 0.0
+    evidence = [
+        Evidence("steps with a contact at the edge of its friction cone", float(sliding.mean()), "share"),
+        Evidence("steps with the zero moment point outside the support", float(tipping.mean()), "share"),
+        Evidence("falls per 1,000 steps", 1e3 * float(recording.terminated.mean()), ""),
+    ]
+    return float((sliding | tipping).mean()), evidence
+
+
+SYMPTOMS: Final = {
+    "limits": Symptom(
+        "unsafe actions near obstacles or limits", 0.02, "share", _measure_limits, _treat_limits
+    ),
+    "command_steps": Symptom(
+        "commands that spike at switches or chunk seams",
+        0.2,
+        "of the range",
+        _measure_steps,
+        _treat_steps,
+        policies_only=True,
+    ),
+    "contact_forces": Symptom(
+        "impacts with large forces, or a simulation that diverges",
+        60.0,
+        "weights",
+        _measure_forces,
+        _treat_forces,
+    ),
+    "wheel_slip": Symptom("wheels that spin or lock", 0.05, "share", _measure_slip, _treat_slip),
+    "balance": Symptom(
+        "feet that slide or tip",
+        0.05,
+        "share",
+        _measure_balance,
+        lambda recording: _wrapped(WholeBodyFilter, joint_tolerance=None),
+        policies_only=True,
+    ),
+}
+"""By name."""

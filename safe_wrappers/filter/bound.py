@@ -1,0 +1,238 @@
+"""Bound: a constraint on one plant, as the filter asks it about controls. Written once, for all constraints."""
+
+import copy
+import warnings
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from safe_wrappers.checks import Array
+from safe_wrappers.control.numerics.projection import keeps_rows
+from safe_wrappers.control.numerics.shapes import NUMBERS, squashed
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.filter.linearize import Tangents, differences
+from safe_wrappers.plants.plant import Plant
+
+_KEPT = 10
+"""Control steps for which slopes are kept where controls are displacements; trajectories check what follows."""
+
+
+class Bound:
+    """A constraint on one plant: what is left of it in the observed state, and which controls it admits.
+
+    In every control step `observe` comes first, after the plant's; then the other methods, in any order; last
+    `executed`, whose memory `observe` takes in the next step.
+
+    From inside, an admitted control keeps `h >= margin` along its trajectory, and, with a `decay`, at least the share
+    of h that is not to be used up, as far as the constraint's backup keeps it. From outside it goes no farther out,
+    and comes back at the rate of `recovery_s`, as far as the backup does. So the backup is always admitted, and where
+    it ends at rest, what is left of an admitted trajectory is the backup of the next step: that is the proof of
+    constraints that promise "proved".
+
+    Args:
+        constraint: The specification, which is copied.
+        plant: Bound to its env.
+
+    Attributes:
+        spec: The copy.
+        memory: What the step has made of the episode's memory so far.
+        predicts: Whether h of the trajectory decides.
+        rows_decide: Whether the rows are the requirement, or a part of it: so where there is no h.
+        measures_state: Whether h says something of the present state.
+    """
+
+    memory: Memory
+
+    def __init__(self, constraint: Constraint, plant: Plant) -> None:
+        self.spec, self.plant = copy.copy(constraint), plant
+        self.spec.report, self.spec.memory = {}, {}
+        self.spec.setup(plant)
+        has_h = type(self.spec).h_along is not Constraint.h_along
+        self.predicts = has_h and self.spec.predicts
+        self.rows_decide = self.spec.rows_decide or not has_h
+        self.measures_state = has_h and self.spec.measures_state
+        self.max_decrease = self.spec.max_decrease
+        self._blank = dict(self.spec.report)
+
+    def forget_report(self) -> None:
+        """Put the info keys of the constraint back to those of a state about which nothing is known."""
+        self.spec.report = dict(self._blank)
+
+    def observe(self, memory: Memory) -> None:
+        """Take the plant's present state."""
+        spec = self.spec
+        self.memory = spec.memory = dict(memory)
+        self._rows: HalfSpaces | None = None
+        spec.observe(self.memory)
+        self._known: dict[bytes, Array] = {}
+        self._value = spec.h_along(spec.model.rollout(None)).min(axis=0)
+        self.least = float(self._value.min(initial=np.inf))
+        if not self.predicts:
+            return
+        self._needed: tuple[Array, Array] | None = None
+        self._outside = np.minimum(self._value - spec.margin, 0.0) if spec.recovery_s else self._value[:0]
+        self._is_outside = bool((self._outside < -spec.rounding).any())
+        keeps = self.plant.observation_id < memory.get("kept_until", 0) and not self._is_outside
+        self._tangents = Tangents(self.slacks, self._slopes, memory["slopes"] if keeps else None)
+        most = spec.max_decrease if self.max_decrease is not None else None
+        if most is not None:
+            recent = memory.get("recent", ())
+            fallen = max(recent, default=-np.inf) - self.least
+            if fallen > most + spec.rounding:
+                warnings.warn(
+                    f"{type(spec).__name__}: what is left of the limit fell by {fallen:.3g} {spec.unit} within "
+                    f"{len(recent)} control steps, farther than the declared max_decrease of {most:g}; from now "
+                    "on every control is forecast",
+                    stacklevel=2,
+                )
+                self.max_decrease = most = None
+        self._far = most is not None and self.least - most >= spec.margin + spec.rounding
+
+    def executed(self, control: Array) -> Memory:
+        """The memory after a control was executed in the observed state."""
+        memory, spec = self.memory, self.spec
+        memory["control"] = control
+        if self.predicts:
+            if self.max_decrease is not None:
+                memory["recent"] = (*memory.get("recent", ()), self.least)[-spec.horizon :]
+            if spec.info_keys:
+                spec.h_along(spec.model.rollout(control, spec.horizon))
+            if self._tangents.made and not (self.plant.has_acceleration or self._is_outside):
+                memory["slopes"] = self._tangents.slopes
+                memory["kept_until"] = self.plant.observation_id + _KEPT
+        return memory
+
+    def value(self) -> Array:
+        """h at the present state, margin not taken off, shape (k,); empty where nothing is measured or near."""  # noqa: D403
+        found: Array = self._value
+        return found
+
+    def feature_count(self, neighbours: int) -> int:
+        """How many `features` there are, at every state."""
+        return 2 + NUMBERS * neighbours if hasattr(self.spec, "surroundings") else 1
+
+    def features(self, neighbours: int) -> Array:
+        """What a learner may be shown of the observed state, in [-1, 1].
+
+        The first is the smallest h, squashed: `scale` is 0.5, and 1 is none at all. A constraint with obstacles adds
+        the `neighbours` nearest.
+        """
+        surroundings: Any = getattr(self.spec, "surroundings", None)
+        first = np.array([squashed(self.least, self.spec.scale)])
+        return first if surroundings is None else np.concatenate([first, surroundings(neighbours)])
+
+    def slacks(self, control: Array) -> Array:
+        """What the trajectory of a control, shape (m,), leaves of what is asked for, shape (n,); wanted >= 0."""
+        key = control.tobytes()
+        if key not in self._known:
+            self._known[key] = self._slacks(control)
+        return self._known[key]
+
+    def _slacks(self, control: Array) -> Array:
+        spec, gate = self.spec, self.spec.look_ahead_below
+        further = {"euler": True} if spec.euler_look_ahead else {}
+        if not self._is_outside and gate is not None and self.least >= gate:
+            held = self._of(spec.model.rollout(control, 1, **further))
+            if (held >= gate).all():
+                return held
+        return self._of(spec.model.rollout(control, spec.horizon, **further))
+
+    def _of(self, path: Any) -> Array:
+        """The slacks of a trajectory: from inside the least of every control interval, each of the k apart."""
+        left = self.spec.h_along(path) - self.spec.margin
+        least, end = self._asked()
+        if self._is_outside:
+            return np.concatenate([left.min(axis=0) - least, left[-1] - end])
+        held = left.reshape(path.holds, -1, left.shape[1]).min(axis=1)
+        return np.asarray((held - least if least.size else held).ravel())
+
+    def _asked(self) -> tuple[Array, Array]:
+        """What a trajectory is to leave at least on the way, and at its end, margin taken off."""
+        if self._needed is None:
+            spec, least, end = self.spec, self._outside, self._outside
+            if self._is_outside:
+                seconds = spec.horizon * self.plant.control_dt
+                end = least * np.exp(-seconds / spec.recovery_s)
+            elif spec.decay < 1.0:
+                least = (1.0 - spec.decay) * np.maximum(self._value - spec.margin, 0.0)
+            else:
+                least = least[:0]
+            backup = next(iter(spec.proposals(None)), None) if least.size else None
+            if backup is not None:
+                left = spec.h_along(spec.model.rollout(backup, spec.horizon)) - spec.margin
+                floor = -np.inf if self._is_outside else 0.0
+                least = np.minimum(least, np.maximum(left.min(axis=0), floor))
+                end = np.minimum(end, left[-1])
+            self._needed = least, end
+        return self._needed
+
+    def _slopes(self, control: Array) -> Array:
+        """How the slacks change with a control, shape (n, m), by differences.
+
+        Left out are those of the control intervals after the last one in which a bound is violated most.
+        """
+        spec, plant, needed = self.spec, self.plant, self.spec.horizon
+        if not self._is_outside and needed > 1:
+            left = self.slacks(control).reshape(needed, -1)
+            needed = int(np.where(left.min(axis=0) < 0.0, left.argmin(axis=0), 0).max()) + 1
+        box = plant.lower, plant.upper
+        return differences(lambda u: self._of(spec.model.sketch(u, needed)), control, *box)
+
+    def slack(self, control: Array) -> float:
+        """The least of what a control leaves; >= 0: kept. Minus infinity where a number is lost."""
+        if not self.predicts:
+            rows = self.rows()
+            return float((rows.offsets - rows.normals @ control).min(initial=np.inf))
+        least = float(self.slacks(control).min(initial=np.inf))
+        return least if least == least else -np.inf
+
+    def admits(self, control: Array) -> bool:
+        """Whether a control, shape (m,), held for one control interval, keeps the requirement."""
+        if self.rows_decide:
+            rows = self.rows()
+            if not keeps_rows(control, rows.normals, rows.offsets, self.plant.lower, self.plant.upper):
+                return False
+        return not self.predicts or self._far or self.slack(control) >= -self.spec.rounding
+
+    def keeps_limit(self, control: Array) -> bool:
+        """Inside the margin: whether a refused control keeps the limit, and loses no more of the margin.
+
+        Asked where no control is admitted. Such a control is executed without being reported as infeasible.
+        """
+        spec = self.spec
+        if not (self.predicts and spec.recovery_s and 0.0 <= self.least < spec.margin):
+            return False
+        left = spec.h_along(spec.model.rollout(control, spec.horizon)).min(axis=0)
+        return bool((left >= np.maximum(np.minimum(self._value, spec.margin) - spec.at_rest, 0.0)).all())
+
+    def rows(self) -> HalfSpaces:
+        """The half-spaces on the control.
+
+        Where controls are displacements, tangents about braking: a refused displacement may press the machine against
+        something, and then says little about others.
+        """
+        if self._rows is None:
+            rows = self.spec.rows()
+            if rows is None and self.predicts and not (self.plant.has_acceleration or self._far):
+                braking = getattr(self.spec.model, "braking", None)
+                rows = None if braking is None else self._tangents.about(braking())
+            self._rows = HalfSpaces.none(self.plant.lower.size) if rows is None else rows
+        return self._rows
+
+    def linearize(self, control: Array) -> HalfSpaces:
+        """The requirement linearised about a refused control; no rows: it cannot be."""
+        return self._tangents.about(control) if self.spec.smooth else HalfSpaces.none(control.size)
+
+    def candidates(self, control: Array) -> Iterable[Array]:
+        """Controls to try for a refused one before it is projected, the best first."""
+        return self.spec.proposals(control)
+
+    @property
+    def may_back_up(self) -> bool:
+        """Whether there may be a `backup`."""
+        return type(self.spec).proposals is not Constraint.proposals
+
+    def backup(self) -> Array | None:
+        """The control that the constraint knows to keep it best, or None."""
+        return next(iter(self.spec.proposals(None)), None)

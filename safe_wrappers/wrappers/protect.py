@@ -1,0 +1,127 @@
+"""protect: the recommended stack for a known env, in one call."""
+
+import difflib
+import inspect
+import textwrap
+from typing import Any, Final, overload
+
+import gymnasium as gym
+
+from safe_wrappers.constraints import JointSpeedLimit, PredictiveShield
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.plants.simulator.plant import SimulatorPlant
+from safe_wrappers.stack import refuse_order
+from safe_wrappers.wrappers.action_shield import ActionShield
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.recipes import EVERY, PLANTS, family_of, recipe_of
+from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, by_env, single_envs
+
+VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
+_LIMIT: Final = (
+    "These lines protect it",
+    "limit = sw.constraints.JointSpeedLimit(limit=4.0)  # rad/s, m/s; or another constraint",
+)
+_SHIELD: Final = (
+    "It can be simulated. Say by h(observation) what must stay positive, by backup(observation) which action keeps "
+    "it so, and by horizon how many steps to look ahead; then these lines protect it",
+    "shield = sw.constraints.PredictiveShield(h, horizon, backup)",
+)
+
+
+@overload
+def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter: ...
+@overload
+def protect(env: VectorEnv, **options: Any) -> VectorCBFActionFilter: ...
+def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilter | VectorCBFActionFilter:
+    """Wrap a known env, or a vector env of it, with the constraints that we recommend and test for it.
+
+    Args:
+        env: Made by `gymnasium.make`; its id without the version selects the recipe. Or a `SyncVectorEnv` of one id.
+        options: Those of `CBFActionFilter`, with `margin` added to the recipe's own. SafePointGoal also takes
+            `detour` (go around a hazard instead of stopping before it, default True) and `uncertainty` (of mass and
+            damping, a fraction, default 0); SafeCarGoal takes `detour`; Fetch takes `low` and `high` (corners of the
+            gripper's box, m), `keep_out` (obstacles for its fingers) and `table` (keep the fingers off it, default
+            True).
+
+    Raises:
+        UnsupportedEnvError: No env, or no recipe for it; the message has the lines that protect it by hand.
+        ConfigurationError: A layer inside that belongs outside, such as `RecordInterventions`.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.protect(gym.make("SafePointGoal1-v0"))
+    """
+    kind: Any = CBFActionFilter
+    if isinstance(env, gym.vector.VectorEnv):
+        kind, (single, *others) = VectorCBFActionFilter, single_envs(env)
+        ids = sorted({one.spec.id if one.spec is not None else "" for one in (single, *others)})
+        if len(ids) > 1:
+            raise UnsupportedEnvError(f"expected a vector env of one id, got {ids}; protect each env of it")
+        if isinstance(env.single_action_space, gym.spaces.Discrete):
+            raise UnsupportedEnvError(
+                f"discrete actions are shielded env by env, got {env!r}; protect each env of it: {by_env(env)}"
+            )
+    elif isinstance(env, gym.Env):
+        refuse_order(env, CBFActionFilter.layer, "protect")
+        kind, single = ActionShield if isinstance(env.action_space, gym.spaces.Discrete) else kind, env
+    else:
+        raise UnsupportedEnvError(f"expected one env, or a vector env, got {env!r}; {_of_no_env(env)}")
+    family, name = family_of(single), recipe_of(single.spec.id) if single.spec is not None else None
+    if name is None:
+        raise UnsupportedEnvError(_without_recipe(kind.__name__, single))
+    recipe = EVERY[name]
+    of_recipe, of_filter = ([*inspect.signature(takes).parameters] for takes in (recipe, CBFActionFilter))
+    known = [option for option in (*of_filter, *of_recipe) if option not in ("env", "constraints")]
+    for option in options:
+        if option not in known:
+            raise UnknownNameError(
+                f"protect has no option {option!r} for {family}; it has {', '.join(known)}"
+            )
+    constraints = recipe(single, **{n: options.pop(n) for n in of_recipe if n in options})
+    if family in PLANTS:
+        options.setdefault("plant", PLANTS[family]())
+    filtered: CBFActionFilter | VectorCBFActionFilter = kind(env, constraints, **options)
+    return filtered
+
+
+def _without_recipe(kind: str, single: gym.Env[Any, Any]) -> str:
+    """Lines that make the first filter that works, or why none does, and then the recipes of similar names.
+
+    A speed limit by MuJoCo's model, else a simulation of the env. Filters are made of `single` to be tried, and some
+    of them reset it; `kind` is how the filter is called.
+    """
+    shield: Constraint = PredictiveShield(lambda seen: 1.0, 2, "hold")
+    tried: list[tuple[tuple[str, str], Constraint, str]] = [
+        (_LIMIT, JointSpeedLimit(4.0), ""),
+        (_SHIELD, shield, ""),
+        (_SHIELD, shield, ', plant=sw.SimulatorPlant("fork")'),
+    ]
+    discrete = isinstance(single.action_space, gym.spaces.Discrete)
+    by_hand = ""
+    for (says, line), constraint, plant in tried[1:] if discrete else tried:
+        made: Any = ActionShield if discrete else CBFActionFilter
+        try:
+            made(single, [constraint], plant=SimulatorPlant("fork") if plant else None)
+        except Exception as error:  # whatever the step of an env raises that cannot be copied
+            why = error if isinstance(error, ConfigurationError) else f"{type(error).__name__}: {error}"
+            by_hand = f"A filter by hand is refused, too: {why}"
+        else:
+            code = (
+                f"import safe_wrappers as sw\n{line}\nenv = sw.{kind}(env, [{line.partition(' ')[0]}]{plant})"
+            )
+            by_hand = f"{says}:\n{textwrap.indent(code, '    ')}"
+            break
+    near = difflib.get_close_matches(family_of(single), EVERY, n=3, cutoff=0.5)
+    similar = f"\nRecipes of similar names: {', '.join(near)}" if near else ""
+    name = single.spec.id if single.spec is not None else repr(single.unwrapped)
+    return f"no recipe for {name}. {by_hand}{similar}"
+
+
+def _of_no_env(given: Any) -> str:
+    """What to write instead, where the argument is not an env."""
+    if isinstance(given, str):
+        return f"write protect(gym.make({given!r}))"
+    if hasattr(given, "num_envs"):
+        return f"protect each env of it: make_vec_env(..., n_envs={given.num_envs}, wrapper_class=sw.protect)"
+    return "write protect(gym.make(...))"
