@@ -15,7 +15,7 @@ from benchmarks.drivers import CROSSING, PATROLLED, Maker
 from benchmarks.drivers import DRIVERS as POINT_GOAL
 from benchmarks.judges import Judge, Replay, Reported, Worst
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
-from safe_wrappers.recipes import SHADOW_HAND_TIED
+from safe_wrappers.wrappers.recipes import SHADOW_HAND_TIED
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import safe_wrappers as sw
 from benchmarks import mujoco_drivers
 from benchmarks.drivers import Action, Driver, Maker, held
 from safe_wrappers.filter.bound import Bound
-from safe_wrappers.recipes import RECIPES
+from safe_wrappers.wrappers.recipes import RECIPES
 
 Array = np.ndarray
 

@@ -24,7 +24,7 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks.tables import keep, markdown, measured, options
 from safe_wrappers.plants import View
-from safe_wrappers.recipes import PLANTS
+from safe_wrappers.wrappers.recipes import PLANTS
 
 DRIVERS = ("random", "greedy", "attacking")
 _TRIED, _HELD = 8, 5

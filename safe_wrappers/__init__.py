@@ -15,7 +15,6 @@ from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 from safe_wrappers.plants import AnalyticPlant, IdentifiedPlant, MujocoPlant, Plant, SimulatorPlant
-from safe_wrappers.protect import protect
 from safe_wrappers.wrappers import faults, occlusion, teleop
 from safe_wrappers.wrappers.action_shield import ActionShield
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
@@ -26,6 +25,7 @@ from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.presets import SlipLimiter, WholeBodyFilter
+from safe_wrappers.wrappers.protect import protect
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
 from safe_wrappers.wrappers.stopping_budget import StoppingBudget

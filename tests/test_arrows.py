@@ -26,7 +26,7 @@ LAYERS = {
     "train": ROOT / "train",
 }
 COMMON = {"checks", "errors", "info"}
-"""Single modules at the top that every layer may use; `protect` and the package itself are the top."""
+"""Single modules at the top that every layer may use; the package itself is the top."""
 BELOW_WRAPPERS = {"control", "plants", "drawing", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
     "control": {"control", "checks", "errors"},
@@ -34,11 +34,11 @@ MAY_USE = {
     "drawing": {"plants", "drawing", *COMMON},
     "filter": {"control", "plants", "drawing", "filter", *COMMON},
     "constraints": {"control", "plants", "drawing", "filter", "constraints", *COMMON},
-    "wrappers": {"wrappers", *BELOW_WRAPPERS},
+    "wrappers": {"wrappers", "envs", *BELOW_WRAPPERS},
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
-    "diagnosis": {"wrappers", "diagnosis", "protect", "recipes", *BELOW_WRAPPERS},
+    "diagnosis": {"wrappers", "diagnosis", *BELOW_WRAPPERS},
     "envs": {"control", "constraints", "envs", *COMMON},
-    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "recipes", "", *BELOW_WRAPPERS},
+    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {
@@ -111,7 +111,7 @@ def test_heavy_libraries_stay_in_their_layers(layer):
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
 
 
-@pytest.mark.parametrize("name", ["__init__", "checks", "errors", "info", "protect", "serialize", "stack"])
+@pytest.mark.parametrize("name", ["__init__", "checks", "errors", "info", "serialize", "stack"])
 def test_the_top_imports_no_torch_and_no_training(name):
     found = imports(ROOT / "safe_wrappers" / f"{name}.py", "safe_wrappers")
     assert not {n.split(".")[0] for n in found} & {"torch", "stable_baselines3"}

@@ -159,7 +159,7 @@ def test_the_cars_outline_encloses_every_geom():
 def test_hulls_are_as_large_as_the_geoms():
     from safe_wrappers.envs.goal_env import HAZARD_RADIUS, VASE_HALF_SIZE
     from safe_wrappers.envs.goal_robots import POINT
-    from safe_wrappers.recipes import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
+    from safe_wrappers.wrappers.recipes import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
 
     assert POINT.radius <= POINT_HULL_RADIUS_M < POINT.radius + 1e-3
     assert np.hypot(VASE_HALF_SIZE, VASE_HALF_SIZE) <= VASE_HULL_RADIUS_M < np.sqrt(2) * VASE_HALF_SIZE + 1e-3

@@ -13,7 +13,7 @@ from rich.console import Console
 
 import safe_wrappers
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.recipes import EVERY, recipe_of
+from safe_wrappers.wrappers.recipes import EVERY, recipe_of
 
 from .config import parse_experiment, read_config
 from .config.algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY

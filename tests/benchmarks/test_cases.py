@@ -7,7 +7,7 @@ import safe_wrappers as sw
 from benchmarks.cases import HARD, PROTECTED
 from benchmarks.judges import Reported, Worst
 from safe_wrappers.constraints.limits.joints import scalar_joints
-from safe_wrappers.recipes import RECIPES
+from safe_wrappers.wrappers.recipes import RECIPES
 
 CASES = PROTECTED | HARD
 BLIND = ("random", "bang-bang", "pulse")

@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 import safe_wrappers as sw
-from safe_wrappers.recipes import EVERY, recipe_of
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import parse_experiment, read_config
 from safe_wrappers.train.config.algorithms import ALGORITHMS
 from safe_wrappers.train.init import _LISTS as LISTS
+from safe_wrappers.wrappers.recipes import EVERY, recipe_of
 
 
 def listed(capsys, *kinds):
