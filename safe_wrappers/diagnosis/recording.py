@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import mujoco
@@ -20,10 +20,6 @@ Env = gym.Env[Any, Any]
 Driver = Callable[[Any], Any]
 """Gives an action for an observation; one that has `reset()` is told so that an episode begins."""
 _DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
-PULSE_STEPS = 15
-"""For which the attacking driver holds a corner of the action space."""
-LONGEST_HORIZON = 60
-"""Control steps of a proposed horizon at most: each costs a forecast of as many."""
 
 
 class NotMeasuredError(Exception):
@@ -43,7 +39,7 @@ def attacking_driver(env: Env, seed: int) -> Driver:
     def actions() -> Iterator[Any]:
         while True:
             corner = np.where(rng.random(low.shape) < 0.5, low, high)
-            for _ in range(PULSE_STEPS):
+            for _ in range(15):
                 yield corner.astype(env.action_space.dtype)
 
     drawn = actions()
@@ -60,8 +56,7 @@ def policy_driver(policy: Any) -> Driver:
             "policy is a function of the observation, or has predict(observation, deterministic=True); "
             f"got {policy!r}"
         )
-    driver: Driver = policy
-    return driver
+    return cast(Driver, policy)
 
 
 def box(env: Env) -> tuple[Array, Array]:
@@ -139,7 +134,8 @@ class Recording:
         """Control steps in which the speeds that were seen are braked, by the changes of speed that were usual."""
         change = np.abs(np.diff(self.qvel, axis=0)).max(axis=1)[~self.first[1:]]
         usual = float(np.median(change)) if change.size else 0.0
-        return int(np.clip(np.ceil(np.abs(self.qvel).max() / max(usual, 1e-9)), 5, LONGEST_HORIZON))
+        # At most 60: each costs a forecast of as many.
+        return int(np.clip(np.ceil(np.abs(self.qvel).max() / max(usual, 1e-9)), 5, 60))
 
 
 class _Spy(gym.Wrapper[Any, Any, Any, Any]):

@@ -24,16 +24,9 @@ from safe_wrappers.wrappers.recipes import recipe_of
 
 PRESSED = 0.02
 """Share of a joint's range by which it is beyond its stop."""
-RATE = 0.05
-"""Share of the range of commands by which the proposed handover lets them change in a control step."""
-SLIPS = 0.2
-"""Slip ratio from which on a wheel is beyond the peak of its traction on all usual grounds."""
-REGULARIZATION = 0.5
-"""m/s, as of `SlipLimiter`."""
-_LEVEL = 0.5
-"""Of the vertical part of an axle's direction: a wheel does not turn about a steep one."""
-_GEOM: Final = mujoco.mjtGeom
-_GROUND: Final = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
+_PLANE, _FIELD, _SPHERE, _CYLINDER = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("PLANE", "HFIELD", "SPHERE", "CYLINDER")
+)
 
 
 class Evidence(NamedTuple):
@@ -137,7 +130,7 @@ def _touches_fixed(recording: Recording) -> NDArray[np.bool_]:
     model = recording.model
     if model is None:
         return np.zeros(len(recording.first), dtype=bool)
-    solid = fixed_bodies(model)[model.geom_bodyid] & ~np.isin(model.geom_type, _GROUND)
+    solid = fixed_bodies(model)[model.geom_bodyid] & ~np.isin(model.geom_type, (_PLANE, _FIELD))
     roots = model.body_rootid[model.jnt_bodyid[driven_joints(model)]]
     machine = np.isin(model.body_rootid[model.geom_bodyid], roots) & ~solid
     hit = np.outer(solid, machine) | np.outer(machine, solid)
@@ -194,9 +187,9 @@ def _measure_steps(recording: Recording) -> Measured:
 
 
 def _treat_steps(recording: Recording) -> Treatment:
-    """A handover of single actions that bounds the rate of commands."""
+    """A handover of single actions that lets commands change by 5 % of their range in a control step."""
     low, high = box(recording.env)
-    rate = float(f"{RATE * float((high - low).min()) / recording.control_dt:.4g}")
+    rate = float(f"{0.05 * float((high - low).min()) / recording.control_dt:.4g}")
     chunks = "If the policy gives chunks, pass them whole: ChunkHandover(env, chunk_size=..., execution_horizon=...)."
     return _wrapped(ChunkHandover, chunks, chunk_size=1, execution_horizon=1, rate_limit=rate)
 
@@ -258,19 +251,17 @@ def wheels(model: mujoco.MjModel) -> dict[int, float]:
     found, data = {}, mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for j in driven_joints(model):
-        level = abs(data.xaxis[j, 2]) < _LEVEL
-        if model.jnt_type[j] != HINGE or model.jnt_limited[j] or not level or not model.joint(j).name:
+        steep = abs(data.xaxis[j, 2]) >= 0.5
+        if model.jnt_type[j] != HINGE or model.jnt_limited[j] or steep or not model.joint(j).name:
             continue
         for g in np.flatnonzero(model.geom_bodyid == model.jnt_bodyid[j]):
             axis = np.zeros(3)
             mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), model.geom_quat[g])
             touches = model.geom_contype[g] or model.geom_conaffinity[g]
             off_axle = np.linalg.norm(np.cross(model.geom_pos[g] - model.jnt_pos[j], model.jnt_axis[j]))
-            cylinder = model.geom_type[g] == int(_GEOM.mjGEOM_CYLINDER)
-            aligned = cylinder and abs(axis @ model.jnt_axis[j]) > 0.99
-            round_geom = aligned or model.geom_type[g] == int(_GEOM.mjGEOM_SPHERE)
+            aligned = model.geom_type[g] == _CYLINDER and abs(axis @ model.jnt_axis[j]) > 0.99
             radius = float(model.geom_size[g, 0])
-            if touches and off_axle < 0.05 * radius and round_geom:
+            if touches and off_axle < 0.05 * radius and (aligned or model.geom_type[g] == _SPHERE):
                 found[j] = radius
     return found
 
@@ -291,17 +282,18 @@ def slips(recording: Recording) -> Array:
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
             ahead = np.array([axle[1], -axle[0]]) / max(np.hypot(axle[0], axle[1]), 1e-6)
             rim = radius * float(velocity[:3] @ axle)
-            ratio[k, i] = slip_ratio(rim, float(ahead @ velocity[3:5]), REGULARIZATION)
+            ratio[k, i] = slip_ratio(rim, float(ahead @ velocity[3:5]), 0.5)  # m/s, as of `SlipLimiter`
     return ratio
 
 
 def _measure_slip(recording: Recording) -> Measured:
+    """The share of steps with a slip above 0.2, beyond the peak of traction on all usual grounds."""
     worst = np.abs(slips(recording)).max(axis=1)
     evidence = [
         Evidence("95th percentile of the largest slip", float(np.percentile(worst, 95.0)), ""),
         Evidence("largest slip", float(worst.max()), ""),
     ]
-    return float((worst > SLIPS).mean()), evidence
+    return float((worst > 0.2).mean()), evidence
 
 
 def _treat_slip(recording: Recording) -> Treatment:

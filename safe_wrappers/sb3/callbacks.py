@@ -1,11 +1,9 @@
 """Callbacks: what the filter did in the log, a price on cost, a margin that changes."""
 
-from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
@@ -35,22 +33,17 @@ class InterventionCallback(BaseCallback):
     """
 
     def _on_step(self) -> bool:
-        log_steps(self.logger, self.locals["infos"])
         for info in self.locals["infos"]:
-            for key, value in info.get(keys.EPISODE_SUMMARY, {}).items():
+            for key in keys.KEYS.values():
+                number = key.number(info[key.name]) if key.log and key.name in info else np.nan
+                if not np.isnan(number):  # NaN is no report
+                    self.logger.record_mean(f"interventions/step_{key.log}", number)
+            for name, value in info.get(keys.EPISODE_SUMMARY, {}).items():
                 # SB3 already logs length and return of an episode as rollout/ep_len_mean and ep_rew_mean.
-                if key not in ("length", "return"):
-                    name = "rate" if key == "intervention_rate" else key
-                    self.logger.record_mean(f"interventions/{name}", float(value))
+                if name not in ("length", "return"):
+                    short = name.removeprefix("intervention_")
+                    self.logger.record_mean(f"interventions/{short}", float(value))
         return True
-
-
-def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:
-    """Adds one step of every env to the logger's running means; NaN is no report."""
-    for info in infos:
-        for key in keys.KEYS.values():
-            if key.log and key.name in info and (number := key.number(info[key.name])) == number:
-                logger.record_mean(f"interventions/step_{key.log}", number)
 
 
 class LagrangianMultiplier(BaseCallback):
@@ -108,7 +101,7 @@ class LagrangianMultiplier(BaseCallback):
         self._episode_cost = np.zeros(self.training_env.num_envs)
 
     def _on_step(self) -> bool:
-        infos: Sequence[dict[str, Any]] = self.locals["infos"]
+        infos = self.locals["infos"]
         if not all(keys.COST in info for info in infos):
             raise ConfigurationError(
                 "LagrangianMultiplier needs info['cost'] at every step: the goal and velocity tasks have it, and"
@@ -128,10 +121,6 @@ class LagrangianMultiplier(BaseCallback):
         self.model.lagrangian_multiplier = float(multiplier)  # type: ignore[attr-defined]
         self.logger.record("interventions/lagrangian_multiplier", multiplier)
         return True
-
-
-_STAIRS = 100
-"""A margin changes in so many equal steps: each binds the constraints anew."""
 
 
 class MarginCurriculum(BaseCallback):
@@ -170,7 +159,8 @@ class MarginCurriculum(BaseCallback):
 
     def margin(self, share: float) -> float:
         """The added margin when this share of the training's steps is done."""
-        done = min(int(_STAIRS * share / self.until + 1e-9), _STAIRS) / _STAIRS
+        # In a hundred steps: each binds the constraints anew.
+        done = min(int(100 * share / self.until + 1e-9), 100) / 100
         return (1.0 - done) * self.start + done * self.end
 
     def _on_training_start(self) -> None:

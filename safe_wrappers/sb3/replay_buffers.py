@@ -15,8 +15,6 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ActionError, ConfigurationError
 
 Values = NDArray[Any]
-Flags = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 Infos = list[dict[str, Any]]
 
 _SAME: Final = 1e-3  # two scaled actions that differ by less differ by rounding only, not by their unit
@@ -95,7 +93,6 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
             raise ConfigurationError("mode 'both' does not work with optimize_memory_usage; leave it out")
         super().__init__(buffer_size, observation_space, action_space, *args, **more)
         self.mode = mode
-        self._low, self._high = action_space.low, action_space.high
         if mode == "both":
             self.executed_actions = np.zeros_like(self.actions)
             self.task_rewards = np.zeros_like(self.rewards)
@@ -106,16 +103,17 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
     ) -> None:
         """Stores one step of every env; `action` is the policy's, scaled, and `infos` hold the executed one."""
         policy = action.reshape((self.n_envs, self.action_dim))
-        self._check(infos)
+        for at, info in enumerate(infos):
+            self._check(at, info)
         executed = self._scaled(infos, keys.EXECUTED_ACTION)
         if not np.isfinite(executed).all():
             raise ActionError(f"an executed action is not finite: {[i[keys.EXECUTED_ACTION] for i in infos]}")
-        finite: Flags = np.asarray(np.isfinite(policy).all(axis=1))
+        finite = np.asarray(np.isfinite(policy).all(axis=1))
         escaping = np.array([bool(info.get(keys.CBF_ESCAPING, False)) for info in infos])
         judged = finite & ~escaping
         chosen, given = policy[judged], self._scaled(infos, keys.PROPOSED_ACTION)[judged]
         if not (np.abs(chosen - given) < _SAME).all():
-            raise self._foreign(f"scaled to [-1, 1], the policy chose {chosen} and the filter got {given}")
+            raise _foreign(f"scaled to [-1, 1], the policy chose {chosen} and the filter got {given}")
         changed = np.array([bool(info[keys.CBF_INTERVENED]) for info in infos]) | escaping | ~finite
         # Unscaling and scaling again is not the identity in floating point: unchanged actions stay the policy's.
         executed = np.where(changed[:, None], executed, policy)
@@ -133,29 +131,27 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         if self.mode == "safe_action":
             return super().sample(batch_size, env)
         slots, envs, second = self._draw(batch_size)
-        rewards = np.where(second, self.task_rewards[slots, envs], self.rewards[slots, envs])
-        executed = self.executed_actions[slots, envs]
-        actions = np.where(second[:, None], executed, self.actions[slots, envs])
-        dones = self.dones[slots, envs] * (1 - self.timeouts[slots, envs])
+        at = slots, envs
+        rewards = np.where(second, self.task_rewards[at], self.rewards[at])
+        actions = np.where(second[:, None], self.executed_actions[at], self.actions[at])
+        dones = self.dones[at] * (1 - self.timeouts[at])
         kind: Any = DictReplayBufferSamples if isinstance(self, DictReplayBuffer) else ReplayBufferSamples
         return kind(
-            observations=self._observed(self.observations, slots, envs, env),
+            observations=self._observed(self.observations, at, env),
             actions=self.to_torch(actions),
-            next_observations=self._observed(self.next_observations, slots, envs, env),
+            next_observations=self._observed(self.next_observations, at, env),
             dones=self.to_torch(dones.reshape(-1, 1)),
             rewards=self.to_torch(self._normalize_reward(rewards.reshape(-1, 1), env)),
         )
 
-    def _observed(self, stored: Any, slots: Indices, envs: Indices, env: VecNormalize | None) -> Any:
+    def _observed(self, stored: Any, at: tuple[Values, Values], env: VecNormalize | None) -> Any:
         """A copy of the observations of some slots and envs, as SB3 takes them."""
-        if isinstance(stored, Mapping):
-            picked: Any = {key: part[slots, envs] for key, part in stored.items()}
-            seen: Any = self._normalize_obs(picked, env)
-            return {key: self.to_torch(value) for key, value in seen.items()}
-        single: Any = self._normalize_obs(stored[slots, envs], env)
-        return self.to_torch(single)
+        parts = isinstance(stored, Mapping)
+        picked: Any = {key: part[at] for key, part in stored.items()} if parts else stored[at]
+        seen: Any = self._normalize_obs(picked, env)
+        return {key: self.to_torch(part) for key, part in seen.items()} if parts else self.to_torch(seen)
 
-    def _draw(self, count: int) -> Indices:
+    def _draw(self, count: int) -> Values:
         """Slots, envs and which of the two transitions (1 is the executed one), shape (3, count), uniformly."""
         drawn = np.empty((3, 0), dtype=np.int64)
         while drawn.shape[1] < count:
@@ -168,38 +164,39 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
 
     def _scaled(self, infos: Infos, key: str) -> Values:
         """Actions from the infos as `policy.scale_action` makes them, (n_envs, nu), in its precision."""
-        given = np.array([np.asarray(info[key], dtype=self.action_space.dtype) for info in infos])
-        if given.shape[1:] != self.action_space.shape:
-            shapes = f"{given.shape[1:]}, the action space {self.action_space.shape}"
-            raise self._foreign(f"{key} has shape {shapes}")
-        scaled: Values = 2.0 * ((given - self._low) / (self._high - self._low)) - 1.0
+        space: Any = self.action_space
+        given = np.array([np.asarray(info[key], dtype=space.dtype) for info in infos])
+        if given.shape[1:] != space.shape:
+            raise _foreign(f"{key} has shape {given.shape[1:]}, the action space {space.shape}")
+        scaled: Values = 2.0 * ((given - space.low) / (space.high - space.low)) - 1.0
         return scaled.reshape((self.n_envs, self.action_dim))
 
-    def _check(self, infos: Infos) -> None:
-        for at, info in enumerate(infos):
-            for key in (keys.EXECUTED_ACTION, keys.PROPOSED_ACTION, keys.CBF_INTERVENED):
-                if key not in info:
-                    raise ConfigurationError(
-                        f"env {at} has no info[{key!r}]: ExecutedActionReplayBuffer needs a CBFActionFilter inside"
-                        " the env; without a filter use SB3's own ReplayBuffer"
-                    )
-            if self.mode == "both" and keys.ADAPTION_PENALTY not in info:
+    def _check(self, at: int, info: dict[str, Any]) -> None:
+        for key in (keys.EXECUTED_ACTION, keys.PROPOSED_ACTION, keys.CBF_INTERVENED):
+            if key not in info:
                 raise ConfigurationError(
-                    f"env {at} has no info[{keys.ADAPTION_PENALTY!r}]: mode 'both' stores a penalised"
-                    " transition; wrap the env in AdaptionPenalty(env, penalty=...), or use mode 'safe_action'"
+                    f"env {at} has no info[{key!r}]: ExecutedActionReplayBuffer needs a CBFActionFilter inside"
+                    " the env; without a filter use SB3's own ReplayBuffer"
                 )
-            if self.mode == "safe_action" and keys.ADAPTION_PENALTY in info:
-                raise ConfigurationError(
-                    f"env {at} has an AdaptionPenalty: mode 'safe_action' would charge it to the executed action,"
-                    " which is the safe one; use mode 'both', or take the wrapper away"
-                )
-
-    def _foreign(self, what: str) -> ConfigurationError:
-        return ConfigurationError(
-            f"the filter's actions are not the policy's ({what}): a wrapper outside the filter changes actions, so"
-            " the executed action is not in the policy's units; take that wrapper away (SB3 scales actions to [-1, 1]"
-            " itself), or learn from the policy's action (SB3's own ReplayBuffer)"
+        if (keys.ADAPTION_PENALTY in info) == (self.mode == "both"):
+            return
+        if self.mode == "both":
+            raise ConfigurationError(
+                f"env {at} has no info[{keys.ADAPTION_PENALTY!r}]: mode 'both' stores a penalised transition; wrap"
+                " the env in AdaptionPenalty(env, penalty=...), or use mode 'safe_action'"
+            )
+        raise ConfigurationError(
+            f"env {at} has an AdaptionPenalty: mode 'safe_action' would charge it to the executed action, which is"
+            " the safe one; use mode 'both', or take the wrapper away"
         )
+
+
+def _foreign(what: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"the filter's actions are not the policy's ({what}): a wrapper outside the filter changes actions, so the"
+        " executed action is not in the policy's units; take that wrapper away (SB3 scales actions to [-1, 1]"
+        " itself), or learn from the policy's action (SB3's own ReplayBuffer)"
+    )
 
 
 class ExecutedActionDictReplayBuffer(ExecutedActionReplayBuffer, DictReplayBuffer):

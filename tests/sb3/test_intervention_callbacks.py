@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,7 +12,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import InterventionCallback
-from safe_wrappers.sb3.callbacks import log_steps
 from safe_wrappers.wrappers.faults import RepeatedCommands
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
@@ -128,6 +129,9 @@ def test_without_recorder_the_step_values_are_logged(tmp_path):
 
 def test_a_step_without_a_judgement_does_not_hide_the_mean_of_the_others(tmp_path):
     logger = configure(str(tmp_path), ["tensorboard"])
-    log_steps(logger, [{keys.COST: 0.5}, {keys.COST: keys.NOT_JUDGED}, {keys.COST: 1.0}])
+    callback = InterventionCallback()
+    callback.model = SimpleNamespace(logger=logger)
+    callback.locals = {"infos": [{keys.COST: 0.5}, {keys.COST: keys.NOT_JUDGED}, {keys.COST: 1.0}]}
+    callback._on_step()
     assert logger.name_to_value["interventions/step_cost"] == 0.75
     logger.close()
