@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import EzPickle
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.estimation.tracks import Motion, Tracks
+from safe_wrappers.control.estimation import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 

@@ -7,8 +7,7 @@ from safe_wrappers.plants.identified import IdentifiedPlant, log_steps
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check
-from safe_wrappers.plants.rollouts import Rollout, RolloutPlant, View
-from safe_wrappers.plants.simulator.plant import SimulatorPlant
+from safe_wrappers.plants.simulator import Rollout, RolloutPlant, SimulatorPlant, View
 
 __all__ = [
     "AnalyticPlant",

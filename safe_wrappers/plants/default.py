@@ -11,7 +11,7 @@ from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.mujoco.binding import moves_by_displacement
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.simulator.plant import SimulatorPlant
+from safe_wrappers.plants.simulator import SimulatorPlant
 
 
 class PlantTemplate:

@@ -13,11 +13,11 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.copies import EnvCopier
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.binding import Accessed
 from safe_wrappers.plants.mujoco.forecast import RESETS, Recorder
 from safe_wrappers.plants.mujoco.model import control_range
-from safe_wrappers.plants.simulator.copies import EnvCopier
 
 _TRIALS: Final = 100
 _FEWEST: Final = 10  # of them that must not have diverged

@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.handover.curves import Motion
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import refuse_mapped
@@ -50,16 +49,16 @@ class InverseDynamics:
         self._at, self._dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._gear = model.actuator_gear[: model.nu, 0].copy()
 
-    def torques(self, motion: Motion) -> Array:
-        """N m (N for slides), shape (k, m), by `mj_inverse`: passive forces of the joints are counted."""
-        torques = np.zeros_like(motion.position)
+    def torques(self, positions: Array, velocities: Array, accelerations: Array) -> Array:
+        """N m (N for slides), all shape (k, m), by `mj_inverse`: passive forces of the joints are counted."""
+        torques = np.zeros_like(positions)
         self._observe()
         data = self._data
         for i in range(len(torques)):
-            self._place(motion.position[i])
+            self._place(positions[i])
             data.qvel[:] = data.qacc[:] = 0.0
-            data.qvel[self._dof] = motion.velocity[i] / self._gear
-            data.qacc[self._dof] = motion.acceleration[i] / self._gear
+            data.qvel[self._dof] = velocities[i] / self._gear
+            data.qacc[self._dof] = accelerations[i] / self._gear
             mujoco.mj_inverse(self._model, data)
             torques[i] = data.qfrc_inverse[self._dof]
         return torques

@@ -184,7 +184,6 @@ class MujocoPlant(Plant):
         """Called when the state or the model has changed."""
         self._loaded = self._forwarded = False
         self._affine: tuple[Array, Array] | None = None
-        self._recorder.forget()
         self._forecasts: dict[tuple[bytes, bool], MujocoTrajectory] = {}
         self._contact_forecasts: dict[bytes, ContactForecast] = {}
         self._present: _Present | None = None
@@ -262,6 +261,7 @@ class MujocoPlant(Plant):
 
     def _load(self) -> None:
         if not self._loaded:
+            self._recorder.forget()
             mujoco.mj_setState(self.model, self.data, self._snapshot, STATE)
             self._loaded, self._forwarded = True, False
 
@@ -364,9 +364,13 @@ class MujocoPlant(Plant):
         key = control.tobytes()
         known = self._forecasts.get((key, euler))
         if known is None or known.holds < horizon:
-            known = known or self._forecasts.get((key, not euler))
-            self._load_to_step()
-            known = self._recorder.record(control, horizon, known and known.first(1), euler)
+            first = known or self._forecasts.get((key, not euler))
+            if first is not None and self._recorder.goes_on(control):
+                first = first.first(1)
+            else:
+                first = None
+                self._load_to_step()
+            known = self._recorder.record(control, horizon, first, euler)
             self._forecasts[key, euler] = known
         return known.first(horizon)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.legged.support import CentroidalMomentum, centroidal_momentum
+from safe_wrappers.control.legged import CentroidalMomentum, centroidal_momentum
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.model import control_range, fixed_bodies, inertia, kinematics

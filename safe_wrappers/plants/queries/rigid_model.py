@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.handover.vibration import modes
+from safe_wrappers.control.bandwidth import modes
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
