@@ -48,11 +48,6 @@ evaluation: {{episodes: 20}}
 def init_command(path: Path, overrides: Sequence[str], console: Console) -> None:
     """Writes a commented config.
 
-    Args:
-        path: The file.
-        overrides: `env=ID` and `algorithm=NAME`.
-        console: Where it is told.
-
     Raises:
         ConfigurationError: The file exists, or what the config would say is refused: the env cannot be made, the
             algorithm does not fit it, or there is no recipe for it; the message has the lines that filter it then.
@@ -87,11 +82,7 @@ def init_command(path: Path, overrides: Sequence[str], console: Console) -> None
 
 
 def list_command(kinds: Sequence[str], console: Console) -> None:
-    """Prints what there is, of all kinds or of those that are named.
-
-    Raises:
-        UnknownNameError: There is no such kind.
-    """
+    """Prints what there is, of all kinds or of those that are named."""
     for kind in [check_name(kind, _LISTS, "list") for kind in kinds] or _LISTS:
         rows = _LISTS[kind]()
         console.print(f"[bold]{kind}[/bold] ({len(rows)})", highlight=False)

@@ -69,16 +69,7 @@ def make_stack(
     """Makes the task with all its layers, from the judge to SB3's Monitor.
 
     The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
-    which is inside of it.
-
-    Args:
-        env: The task.
-        action_filter: The filter around it.
-        learner: In training the arm's; in evaluation none, so that no return ever holds a penalty.
-        render_mode: As `gymnasium.make` takes it; None: as the config has it.
-
-    Raises:
-        ConfigurationError: The task or the filter refuses its settings.
+    which is inside of it. Evaluation has no `learner`, so that no return ever holds a penalty.
     """
     kwargs = env.kwargs if render_mode is None else {**env.kwargs, "render_mode": render_mode}
     task = make_env(env.id, kwargs)

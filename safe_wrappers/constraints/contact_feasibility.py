@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
-from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
+from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control import whole_body
 from safe_wrappers.control.contact import cone_excess
 from safe_wrappers.control.legged import support_distances
