@@ -6,8 +6,8 @@ import numpy as np
 import scipy.optimize
 
 import safe_wrappers as sw
+from safe_wrappers.control import projection
 from safe_wrappers.control import whole_body as conic_program
-from safe_wrappers.control.numerics import projection
 
 
 def test_a_control_beyond_the_action_s_dtype_is_cast_to_its_largest_number():

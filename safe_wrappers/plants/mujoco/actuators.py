@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.control.compiled import compiled
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, Remade, control_range
 
