@@ -151,8 +151,10 @@ class Bound:
         if self._is_outside:
             least, end = self._wanted()
             return np.concatenate([left.min(axis=0) - least, left[-1] - end])
-        holds, self._width = path.holds, left.shape[1]
-        held = left.min(axis=0) if holds == 1 else left.reshape(holds, -1, left.shape[1]).min(axis=1).ravel()
+        k, holds, self._width = len(left), path.holds, left.shape[1]
+        if k > holds:
+            left = left.reshape(holds, -1, self._width).min(axis=1)
+        held = left[0] if holds == 1 else left.ravel()
         return np.asarray(held - self._wanted()[0] if self.spec.decay < 1.0 else held)
 
     def _wanted(self) -> tuple[Array, Array]:

@@ -13,6 +13,8 @@ _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
 RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 """The warnings after which MuJoCo resets the state."""
+_NONE: Final = bytes(4 * (RESETS.stop - RESETS.start))
+"""The counts of these warnings where there was none."""
 _EULER: Final = int(mujoco.mjtIntegrator.mjINT_EULER)
 _MOTION: Final = int(mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL)
 
@@ -173,7 +175,7 @@ class Recorder(Remade):
             if euler:
                 mujoco.mj_kinematics(m, data)
             published[hold, 0], published[hold, 1] = frames, centres
-            if resets.any():
+            if resets.tobytes() != _NONE:
                 return hold
         return end
 
