@@ -88,7 +88,9 @@ class SafetyFilter:
         self.observe()
         if not self._loaded and self.margin == self.margin:
             for c in self.bound:  # compiles what a step may need
-                c.rows(), c.slack(self.last), c.backup()
+                c.rows(), c.backup()
+                if c.predicts:
+                    c.slack(self.last)
             self._loaded = True
 
     def take_over(self, before: "SafetyFilter") -> None:
