@@ -15,7 +15,7 @@ from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
-from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
+from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Poses, Recorder
 from safe_wrappers.plants.mujoco.model import (
@@ -128,7 +128,6 @@ class MujocoPlant(Plant):
         if moved or model is not source.model:
             self.data = mujoco.MjData(model)
         self.actuators = AffineActuators(model)
-        self._response = Response(model, self.data, self.actuators)
         lower, upper = of_model.control_range(model)
         if moved or not (np.array_equal(lower, self._range[0]) and np.array_equal(upper, self._range[1])):
             self._range = self.lower, self.upper = lower, upper
@@ -332,8 +331,7 @@ class MujocoPlant(Plant):
     def acceleration(self) -> tuple[Array, Array]:
         """`qacc = drift + effect @ u`: shapes (nv,) and (nv, nu)."""
         if self._affine is None:
-            self.forward()
-            self._affine = self._response.drift_and_effect()
+            self._affine = self.actuators.drift_and_effect(self.forward())
             if self.action_map is not None:
                 self._affine = self.action_map.per_action(*self._affine)
         return self._affine
@@ -346,10 +344,7 @@ class MujocoPlant(Plant):
         """
         if not self._clamped:
             return self.lower, self.upper
-        motion = self.actuators.motion_without_kinematics(self.qpos, self.qvel)
-        if motion is None:
-            data = self.forward()
-            motion = data.actuator_length, data.actuator_velocity
+        motion = self.actuators.motion(self.pose())
         ends = self.actuators.acting_range(*motion, self.control_dt)
         return ends if self.action_map is None else self.action_map.actions_between(*ends)
 
@@ -440,9 +435,10 @@ class MujocoPlant(Plant):
 
         The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
-        response = self.acceleration
+        drift, effect = self.acceleration
         p, jacobian = self.frames.jacobian(kind, name)
-        return p.copy(), *point_motion(jacobian, self.frames.jacobian_rate(kind, name), self.qvel, *response)
+        rate = self.frames.jacobian_rate(kind, name)
+        return p.copy(), jacobian @ self.qvel, jacobian @ drift + rate @ self.qvel, jacobian @ effect
 
     def attribute(self, name: str) -> Any:
         found = getattr(self._raw, name, None)
