@@ -18,7 +18,7 @@ from safe_wrappers.control.legged.whole_body import WholeBodySolution, WholeBody
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem, predicted_position_rows
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint, Memory
-from safe_wrappers.plants.mujoco.action_map import refuse_mapped
+from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
 from safe_wrappers.plants.mujoco.dynamics import equations_of_motion
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n

@@ -21,8 +21,8 @@ from safe_wrappers.control.handover.curves import Motion
 from safe_wrappers.control.handover.vibration import modes
 from safe_wrappers.control.legged.support import CentroidalMomentum, centroidal_momentum
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
+from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.model import (
     AT_A_JOINT,
     SCALAR_JOINTS,

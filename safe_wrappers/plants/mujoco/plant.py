@@ -14,7 +14,6 @@ from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
-from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Poses, Recorder
@@ -65,7 +64,7 @@ class MujocoPlant(Plant):
     _loaded = _forwarded = False
     lower: Array = np.zeros(0)  #: of the action, shape (nu,), once bound: ctrlrange, or -inf and inf
     upper: Array = np.zeros(0)
-    action_map: ActionMap | None = None
+    action_map: binding.ActionMap | None = None
 
     def __init__(
         self,
@@ -152,20 +151,17 @@ class MujocoPlant(Plant):
 
     def _new_recorder(self) -> Recorder:
         stepped = self.model, self.data, self.substeps
-        return Recorder(*stepped) if self.action_map is None else MappedRecorder(*stepped, self.action_map)
+        return (
+            Recorder(*stepped)
+            if self.action_map is None
+            else binding.MappedRecorder(*stepped, self.action_map)
+        )
 
     def _bind_actions(self, env: gym.Env[Any, Any]) -> None:
         """Find the bounds of the action, and the map from it to the control."""
-        self.action_map = None
-        are_controls = binding.actions_are_controls(env.action_space, self.lower, self.upper)
-        if are_controls and np.isfinite(self.lower).all():
-            return
-        binding.refuse_other_actions(env, self.lower, self.upper)
-        found = find_action_map(env, self._source, are_controls)
-        if are_controls and found.is_identity:
-            return
-        self.action_map = found
-        self.lower, self.upper = found.low, found.high
+        self.action_map = binding.action_map_of(env, self._source, self.lower, self.upper)
+        if self.action_map is not None:
+            self.lower, self.upper = self.action_map.low, self.action_map.high
 
     def controls(self, action: Array) -> Array:
         """The model's control that the env makes of an action, shapes (nu,)."""
