@@ -15,15 +15,6 @@ from safe_wrappers.info import COST, COST_SUBSTEP
 from .field import METADATA, TaskEnv
 from .layout import PLACE, Form, Given, parse_layout
 
-COST_FORCE: Final = "cost_force"
-"""float64: 1 if the wall or the clamp pushed with more than `FORCE_LIMIT` in this step, else 0."""
-CONTACT_FORCE: Final = "contact_force"
-"""float64, N: normal force of the wall on the tool in this step."""
-CLEARANCE: Final = "clearance"
-"""float64, m: between tool and clamp at the end of this step; negative inside it."""
-SWEPT: Final = "swept"
-"""float64, m: how far the tool was swept towards the clamp while it pressed, this episode."""
-
 WALL_X: Final = 0.2
 """Face of the wall, m: the tool's centre stays at smaller x."""
 CLAMP_Y: Final = 0.25
@@ -85,7 +76,8 @@ class TeleopContactEnv(TaskEnv):
 
     **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if the tool touched the clamp
     at the end of the step, which is one physics substep), ``cost_force`` (1.0 if a contact pushed with more than
-    40 N), ``contact_force``, ``clearance``, ``swept``.
+    40 N), ``contact_force`` (N, of the wall), ``clearance`` (m, of the tool from the clamp, negative inside),
+    ``swept`` (m, towards the clamp while it pressed, this episode).
 
     **Layout**: ``reset(options={"layout": {"tool": [x, y], "velocity": [vx, vy], "wanted_force": F}})``, any subset;
     place (0 to 0.1, -0.05 to 0 m) and wanted force (6 to 12 N) are sampled where they are not given, at rest.
@@ -202,10 +194,10 @@ class TeleopContactEnv(TaskEnv):
         return {
             COST: cost,
             COST_SUBSTEP: cost,
-            COST_FORCE: float(self._largest_force > FORCE_LIMIT),
-            CONTACT_FORCE: self._force,
-            CLEARANCE: self.clearance,
-            SWEPT: self._swept,
+            "cost_force": float(self._largest_force > FORCE_LIMIT),
+            "contact_force": self._force,
+            "clearance": self.clearance,
+            "swept": self._swept,
         }
 
     def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.projection import (
+from safe_wrappers.control.projection import (
     Projection,
     Status,
     cast_inside,

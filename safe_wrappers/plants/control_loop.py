@@ -5,7 +5,7 @@ import warnings
 from dataclasses import dataclass
 
 from safe_wrappers.checks import check_fields, non_negative, positive
-from safe_wrappers.control.watchdog.sampling import hold_lag_s, margin_left
+from safe_wrappers.control.bandwidth import phase_lag
 from safe_wrappers.errors import ConfigurationError, PhaseMarginWarning
 
 
@@ -64,9 +64,7 @@ class ControlLoop:
             ConfigurationError: A crossover at or above the Nyquist frequency, where a hold is no delay any more.
         """
         late = self.compute_s + delay_s + self.bus_s
-        return math.degrees(
-            margin_left(math.radians(self.phase_margin_deg), self.crossover, control_dt, late)
-        )
+        return math.degrees(math.radians(self.phase_margin_deg) - phase_lag(self.crossover, control_dt, late))
 
     def warn_if_short(self, control_dt: float, delay_s: float) -> None:
         """Warn if less is left than `warn_below_deg`.
@@ -79,11 +77,11 @@ class ControlLoop:
             return
         spare = math.radians(self.phase_margin_deg - self.warn_below_deg)
         parts = f"plant {delay_s:g} + compute {self.compute_s:g} + bus {self.bus_s:g} + half a hold"
-        late = self.compute_s + self.bus_s + delay_s + hold_lag_s(control_dt)
+        late = self.compute_s + self.bus_s + delay_s + 0.5 * control_dt
         message = (
             f"{left:.1f} degrees of phase margin are left of {self.phase_margin_deg:g}, which is less than "
             f"{self.warn_below_deg:g}: a loop that crosses over at {self.crossover:g} rad/s is {late:.4g} s late "
-            f"({parts} {hold_lag_s(control_dt):g}) and bears {spare / self.crossover:.4g} s; design it for at "
+            f"({parts} {0.5 * control_dt:g}) and bears {spare / self.crossover:.4g} s; design it for at "
             f"most {spare / late:.3g} rad/s, or shorten hold and delays"
         )
         warnings.warn(message, PhaseMarginWarning, stacklevel=3)

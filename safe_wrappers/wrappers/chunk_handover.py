@@ -9,8 +9,7 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import OF_NUMBERS, Array, numbers_of, settings_from, shown
-from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import BLENDS
+from safe_wrappers.control.handover import BLENDS, SeamCheck, SeamLimits
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant

@@ -9,10 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, positive, whole_number
-from safe_wrappers.control.handover.curves import hermite_spline
-from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import LOOK_BACK, Seam, join
-from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
+from safe_wrappers.control.handover import (
+    LOOK_BACK,
+    Seam,
+    SeamCheck,
+    SeamLimits,
+    hermite_spline,
+    join,
+    shortest_blend,
+    smoothstep,
+)
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.layer import whole_steps
 
@@ -44,7 +50,7 @@ class ChunkQueue:
     Args:
         space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
         control_dt: Control interval, s.
-        blend: A blend of `control/handover/seams.py`.
+        blend: A blend of `control/handover.py`.
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
         check: Of the machine's limits; None accepts all blends.
@@ -180,7 +186,7 @@ class ChunkQueue:
         shortest = 0.0 if self._check is None else self._check.shortest_fade(change)
         bounded = np.isfinite(self._rate_limit)
         if bounded.any():
-            shortest_by_rate = shortest_latched_blend(change[bounded], self._rate_limit[bounded])
+            shortest_by_rate = shortest_blend(change[bounded], self._rate_limit[bounded])
             shortest = max(shortest, float(shortest_by_rate.max()))
         return max(self._fewest, whole_steps(shortest, self._control_dt) - 1)
 

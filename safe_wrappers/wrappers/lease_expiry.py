@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive
-from safe_wrappers.control.handover.smoothstep import smoothstep
+from safe_wrappers.control.handover import smoothstep
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant

@@ -9,14 +9,14 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
-from safe_wrappers.control.estimation.dead_reckoning import (
+from safe_wrappers.control.dead_reckoning import (
     DeadReckoning,
     from_sensor,
     lever_arm_velocity,
     rigid_transform,
     to_sensor,
 )
-from safe_wrappers.control.estimation.tracks import Motion
+from safe_wrappers.control.estimation import Motion
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.mujoco.model import named
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight

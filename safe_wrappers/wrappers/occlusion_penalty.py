@@ -10,8 +10,7 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive, settings_from, true_or_false
-from safe_wrappers.control.estimation.observability import unobservable_directions
-from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
+from safe_wrappers.control.estimation import Tracks, largest_deviation, unobservable_directions
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import physics_steps
@@ -56,7 +55,7 @@ class OcclusionPenalty(LayerWrapper):
     ``occlusion/sigma`` (m, array), ``occlusion/penalty`` (float).
 
     Attributes:
-        tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead.
+        tracking: The `control.estimation.Tracks`: positions, velocities, covariances, and those ahead.
         track_names: One per track: the body's name, or the attribute's with an index.
         ego_motion: Where the sensor's body is taken to be (`position`, m, and `velocity`, m/s), if the sensor has an
             `Imu`; else None.

@@ -6,8 +6,8 @@ from typing import Any
 import mujoco
 
 from safe_wrappers.checks import non_negative
-from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility, Stance, SupportMargin
-from safe_wrappers.constraints.limits.joints import JointPositionLimit, refuse_uncovered_stops, stops
+from safe_wrappers.constraints.contact_feasibility import ContactFeasibility, Stance, SupportMargin
+from safe_wrappers.constraints.joints import JointPositionLimit, refuse_uncovered_stops, stops
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint

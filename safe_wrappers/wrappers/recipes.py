@@ -25,7 +25,7 @@ from safe_wrappers.constraints import (
     WallClearance,
     Workspace,
 )
-from safe_wrappers.constraints.limits.joints import driven_joints
+from safe_wrappers.constraints.joints import driven_joints
 from safe_wrappers.control.numerics.shapes import merged
 from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.envs.goal_robots import CAR

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
 from safe_wrappers.constraints.clearance import Clearance
-from safe_wrappers.control.watchdog.leases import longest_lease, longest_lease_of_room, round_trip_ceiling
+from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room, round_trip_ceiling
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint

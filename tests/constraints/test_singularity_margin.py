@@ -8,7 +8,7 @@ from asking import asked, bound
 from judged_loops import DRIVERS, Judge, Scene, drive
 
 import safe_wrappers as sw
-from safe_wrappers.control.filtering.manipulability import validated_threshold
+from safe_wrappers.control.barriers import validated_threshold
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.bound import Bound
 

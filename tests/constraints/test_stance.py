@@ -164,7 +164,7 @@ def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):
             problem = stance.problem(info["executed_action"])
             asked = np.clip(info["executed_action"], problem.lower, problem.upper)
             answer = stance.solve(type(problem)(**{**fields_of(problem), "nominal": asked}))
-            assert answer.residuals.cone < 1e-4 and answer.residuals.contact < 1e-3
+            assert answer.cone_error < 1e-4 and answer.contact_error < 1e-3
             # Rounded to float32 it may have to move again, and then the price of forces moves it too.
             assert np.abs(answer.control - asked).max() < 2e-3
             counts["same"] += 1

@@ -9,7 +9,7 @@ from judged_loops import Scene, flagged
 from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
-from safe_wrappers.control.legged.support import support_distances
+from safe_wrappers.control.legged import support_distances
 from safe_wrappers.errors import ConfigurationError
 
 HALF, HEIGHT, MASS = 0.2, 0.5, 5.0

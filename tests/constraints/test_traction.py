@@ -8,7 +8,7 @@ import pytest
 from vehicles import FULL, OPEN, Trolley, rover
 
 import safe_wrappers as sw
-from safe_wrappers.control.vehicle.slip import slip_ratio
+from safe_wrappers.control.vehicle import slip_ratio
 from safe_wrappers.envs.ground import MAGIC_FORMULA
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 

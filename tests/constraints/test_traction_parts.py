@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from vehicles import FULL, MOTORS, OPEN, Trolley, rover
 
 import safe_wrappers as sw
-from safe_wrappers.control.vehicle.slip import slip_ratio
+from safe_wrappers.control.vehicle import slip_ratio
 from safe_wrappers.envs.ground import MAGIC_FORMULA
 from safe_wrappers.errors import UnsupportedEnvError
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from safe_wrappers.control.vehicle.slip import slip_ratio
+from safe_wrappers.control.vehicle import slip_ratio
 from safe_wrappers.envs.ground import GROUNDS, MAGIC_FORMULA, SLOWEST, MagicFormula, tyre_force
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError

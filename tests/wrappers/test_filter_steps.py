@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.obstacles import Discs
-from safe_wrappers.control.numerics.projection import cast_inside
+from safe_wrappers.control.projection import cast_inside
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning"),

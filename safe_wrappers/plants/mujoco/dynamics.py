@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.handover.curves import Motion
-from safe_wrappers.control.handover.vibration import modes
-from safe_wrappers.control.legged.support import CentroidalMomentum, centroidal_momentum
+from safe_wrappers.control.bandwidth import modes
+from safe_wrappers.control.legged import CentroidalMomentum, centroidal_momentum
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
@@ -168,13 +167,13 @@ class InverseDynamics:
         self._at, self._dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._gear = model.actuator_gear[: model.nu, 0].copy()
 
-    def torques(self, motion: Motion) -> Array:
-        """N m (N for slides), shape (k, m), by `mj_inverse`: passive forces of the joints are counted."""
-        torques = np.zeros_like(motion.position)
-        for i, data in enumerate(self._placed(motion.position)):
+    def torques(self, positions: Array, velocities: Array, accelerations: Array) -> Array:
+        """N m (N for slides), all shape (k, m), by `mj_inverse`: passive forces of the joints are counted."""
+        torques = np.zeros_like(positions)
+        for i, data in enumerate(self._placed(positions)):
             data.qvel[:] = data.qacc[:] = 0.0
-            data.qvel[self._dof] = motion.velocity[i] / self._gear
-            data.qacc[self._dof] = motion.acceleration[i] / self._gear
+            data.qvel[self._dof] = velocities[i] / self._gear
+            data.qacc[self._dof] = accelerations[i] / self._gear
             mujoco.mj_inverse(self._model, data)
             torques[i] = data.qfrc_inverse[self._dof]
         return torques

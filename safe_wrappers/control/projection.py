@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.control.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
 
 _TOLERANCE: Final = 1e-9

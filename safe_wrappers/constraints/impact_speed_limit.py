@@ -9,7 +9,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array, name_list, positive
 from safe_wrappers.constraints.rollout import RolloutConstraint
-from safe_wrappers.control.contact.impact import peak_force, speed_limit
+from safe_wrappers.control.contact import peak_force, speed_limit
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -54,7 +54,7 @@ class ImpactSpeedLimit(RolloutConstraint):
     Best effort: along the held step of an executed control that is not flagged every first touch keeps the limit, for
     a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of geoms at a
     time. Not counted are friction, other contacts, joint stops, and the obstacles' own way during the forecast. The
-    physics step should be at most a tenth of `control.contact.impact.time_to_peak`.
+    physics step should be at most a tenth of `control.contact.time_to_peak`.
 
     Args:
         bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.

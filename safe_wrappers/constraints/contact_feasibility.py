@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
-from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
-from safe_wrappers.control.contact.friction_cone import cone_excess
-from safe_wrappers.control.legged import whole_body
-from safe_wrappers.control.legged.support import support_distances
-from safe_wrappers.control.legged.whole_body import WholeBodySolution, WholeBodyStatus
-from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem, predicted_position_rows
+from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
+from safe_wrappers.control import whole_body
+from safe_wrappers.control.contact import cone_excess
+from safe_wrappers.control.legged import support_distances
+from safe_wrappers.control.whole_body import (
+    WholeBodyProblem,
+    WholeBodySolution,
+    WholeBodyStatus,
+    predicted_position_rows,
+)
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
@@ -242,7 +246,7 @@ class Stance(Constraint, Model):
         if self.joint_tolerance is not None:
             position, speed = self.plant.qpos[self._qpos], self.plant.qvel[self._dofs]
             joints = self._dofs, position, speed, self._low, self._high
-            limits["acceleration_rows"], limits["acceleration_limits"] = predicted_position_rows(
+            limits["accelerations"] = predicted_position_rows(
                 *joints, self.plant.control_dt, self.plant.model.nv
             )
         limits |= {"contact_acceleration": acceleration, "breaking": ~pressing}
@@ -289,7 +293,7 @@ class Stance(Constraint, Model):
         problem = self.problem(control)
         if problem is None:
             return np.array([[-np.inf]])
-        forces, _ = whole_body.rigid_forces(problem, control)
+        forces = whole_body.rigid_forces(problem, control)
         missed = cone_excess(forces, problem.normals, problem.friction)
         left = -float(missed.max()) / weight_n(self.plant.model) if len(forces) else 0.0
         self.report[keys.WHOLE_BODY_CONE_MARGIN] = left

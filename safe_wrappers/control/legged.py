@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, finite_arrays
-from safe_wrappers.control.numerics.compiled import compiled, hypot
+from safe_wrappers.control.compiled import compiled, hypot
 
 COPLANAR_M = 0.01
 """m; the largest distance of coplanar contacts from their plane."""
