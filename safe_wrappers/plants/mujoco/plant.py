@@ -59,6 +59,7 @@ class MujocoPlant(Plant):
     """
 
     can_brake: ClassVar[bool] = True
+    _sends_controls: ClassVar[bool] = True  # an action says what the env's controls are
     model: mujoco.MjModel  #: the plant's own
     data: mujoco.MjData  #: likewise; at the present state only after `forward` or `pose`
     _loaded = _forwarded = False
@@ -217,20 +218,15 @@ class MujocoPlant(Plant):
             return f"a step took {passed:g} s of simulation instead of {self.control_dt:g} s"
         if self._dynamics.changed():
             return "the env's model changed during the step"
-        return self._other_control(data, sent) or self._other_state(data, sent)
-
-    def _other_control(self, data: mujoco.MjData, sent: Array) -> str:
         control = self.controls(sent)
-        same = data.ctrl.tobytes() == control.tobytes() or np.allclose(data.ctrl, control, *_ROUNDING)
-        return "" if same else f"the env was sent {control} and applied {data.ctrl}"
-
-    def _other_state(self, data: mujoco.MjData, sent: Array) -> str:
+        if self._sends_controls and not _same(data.ctrl, control):
+            return f"the env was sent {control} and applied {data.ctrl}"
         key = sent.tobytes()
         known = self._forecasts.get((key, False)) or self._forecasts.get((key, True))
         if known is None or self._delay_steps:
             return ""
         state, end = np.concatenate([data.qpos, data.qvel]), known.states[self.substeps - 1]
-        same = state.tobytes() == end.tobytes() or np.allclose(state, end, *_ROUNDING, equal_nan=True)
+        same = _same(state, end)
         return "" if same else f"the step ended {np.abs(state - end).max():.3g} from its forecast"
 
     def follow(self) -> None:
@@ -439,6 +435,11 @@ class MujocoPlant(Plant):
     def attribute(self, name: str) -> Any:
         found = getattr(self._raw, name, None)
         return found if found is not None else env_checks.read_attribute(self._env, name)
+
+
+def _same(one: Array, other: Array) -> bool:
+    """Whether they are equal up to rounding, NaN included."""
+    return one.tobytes() == other.tobytes() or np.allclose(one, other, *_ROUNDING, equal_nan=True)
 
 
 class _Present(MujocoTrajectory):
