@@ -14,8 +14,7 @@ from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
-from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
-from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
+from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Poses, Recorder
 from safe_wrappers.plants.mujoco.model import (
@@ -66,7 +65,7 @@ class MujocoPlant(Plant):
     _loaded = _forwarded = False
     lower: Array = np.zeros(0)  #: of the action, shape (nu,), once bound: ctrlrange, or -inf and inf
     upper: Array = np.zeros(0)
-    action_map: ActionMap | None = None
+    action_map: binding.ActionMap | None = None
 
     def __init__(
         self,
@@ -129,7 +128,6 @@ class MujocoPlant(Plant):
         if moved or model is not source.model:
             self.data = mujoco.MjData(model)
         self.actuators = AffineActuators(model)
-        self._response = Response(model, self.data, self.actuators)
         lower, upper = of_model.control_range(model)
         if moved or not (np.array_equal(lower, self._range[0]) and np.array_equal(upper, self._range[1])):
             self._range = self.lower, self.upper = lower, upper
@@ -154,20 +152,17 @@ class MujocoPlant(Plant):
 
     def _new_recorder(self) -> Recorder:
         stepped = self.model, self.data, self.substeps
-        return Recorder(*stepped) if self.action_map is None else MappedRecorder(*stepped, self.action_map)
+        return (
+            Recorder(*stepped)
+            if self.action_map is None
+            else binding.MappedRecorder(*stepped, self.action_map)
+        )
 
     def _bind_actions(self, env: gym.Env[Any, Any]) -> None:
         """Find the bounds of the action, and the map from it to the control."""
-        self.action_map = None
-        are_controls = binding.actions_are_controls(env.action_space, self.lower, self.upper)
-        if are_controls and np.isfinite(self.lower).all():
-            return
-        binding.refuse_other_actions(env, self.lower, self.upper)
-        found = find_action_map(env, self._source, are_controls)
-        if are_controls and found.is_identity:
-            return
-        self.action_map = found
-        self.lower, self.upper = found.low, found.high
+        self.action_map = binding.action_map_of(env, self._source, self.lower, self.upper)
+        if self.action_map is not None:
+            self.lower, self.upper = self.action_map.low, self.action_map.high
 
     def controls(self, action: Array) -> Array:
         """The model's control that the env makes of an action, shapes (nu,)."""
@@ -328,8 +323,7 @@ class MujocoPlant(Plant):
     def acceleration(self) -> tuple[Array, Array]:
         """`qacc = drift + effect @ u`: shapes (nv,) and (nv, nu)."""
         if self._affine is None:
-            self.forward()
-            self._affine = self._response.drift_and_effect()
+            self._affine = self.actuators.drift_and_effect(self.forward())
             if self.action_map is not None:
                 self._affine = self.action_map.per_action(*self._affine)
         return self._affine
@@ -342,10 +336,7 @@ class MujocoPlant(Plant):
         """
         if not self._clamped:
             return self.lower, self.upper
-        motion = self.actuators.motion_without_kinematics(self.qpos, self.qvel)
-        if motion is None:
-            data = self.forward()
-            motion = data.actuator_length, data.actuator_velocity
+        motion = self.actuators.motion(self.pose())
         ends = self.actuators.acting_range(*motion, self.control_dt)
         return ends if self.action_map is None else self.action_map.actions_between(*ends)
 
@@ -436,9 +427,10 @@ class MujocoPlant(Plant):
 
         The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
-        response = self.acceleration
+        drift, effect = self.acceleration
         p, jacobian = self.frames.jacobian(kind, name)
-        return p.copy(), *point_motion(jacobian, self.frames.jacobian_rate(kind, name), self.qvel, *response)
+        rate = self.frames.jacobian_rate(kind, name)
+        return p.copy(), jacobian @ self.qvel, jacobian @ drift + rate @ self.qvel, jacobian @ effect
 
     def attribute(self, name: str) -> Any:
         found = getattr(self._raw, name, None)
