@@ -48,11 +48,11 @@ class Status(StrEnum):
     """How a projection ended."""
 
     INACTIVE = "inactive"
-    """The nominal control satisfies everything; `control` is that control, bit for bit."""
+    """The nominal control satisfies everything; `control` is that one, bit for bit."""
     PROJECTED = "projected"
     """`control` is the closest admissible control, residual checked."""
     INFEASIBLE = "infeasible"
-    """No control in the box satisfies every row; `control` violates them least."""
+    """No control in the box satisfies everything; of rows, `control` violates them least."""
     FAILED = "failed"
     """No method gave an answer that passed the check; `control` is only inside the box."""
 
