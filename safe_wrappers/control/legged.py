@@ -13,9 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_arrays
+from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled, hypot
 
 COPLANAR_M = 0.01
@@ -26,7 +26,7 @@ _FACING = math.cos(0.05) - _ROUNDING
 """The cosine of the largest angle between their normals and the mean."""
 
 
-def support_distances(instant: ArrayLike, points: ArrayLike, normals: ArrayLike, forces: ArrayLike) -> Array:
+def support_distances(instant: NDArray[np.intp], points: Array, normals: Array, forces: Array) -> Array:
     """Distances, m, negative outside, where three or more contacts of one plane, not on a line, are pressed.
 
     One for each of these instants in turn; the others have none.
@@ -37,11 +37,9 @@ def support_distances(instant: ArrayLike, points: ArrayLike, normals: ArrayLike,
         normals: Unit normals, shape (n, 3).
         forces: On the robot, shape (n, 3), N.
     """
-    p, n, f = finite_arrays(points=points, normals=normals, forces=forces)
-    when = np.asarray(instant)
-    order = np.argsort(when, kind="stable")
-    each = np.split(order, np.flatnonzero(np.diff(when[order])) + 1)
-    found = np.array([_distance(p[these], n[these], f[these]) for these in each])
+    order = np.argsort(instant, kind="stable")
+    each = np.split(order, np.flatnonzero(np.diff(instant[order])) + 1)
+    found = np.array([_distance(points[these], normals[these], forces[these]) for these in each])
     return np.asarray(found[found != math.inf])
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, finite_array
-from safe_wrappers.control.contact import checked_friction, cone_excess, friction_pyramid, tangents
+from safe_wrappers.control.contact import cone_excess, friction_pyramid, tangents
 from safe_wrappers.control.projection import Status
 from safe_wrappers.errors import ConfigurationError
 
@@ -94,7 +94,8 @@ class WholeBodyProblem:
                 finite_array(name, value)
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
-        checked_friction(self.friction)
+        if not (self.friction >= 0.0).all():
+            raise ConfigurationError(f"friction must be 0 or more, got {self.friction}")
         opens = np.zeros(len(self.normals), bool) if self.breaking is None else self.breaking
         acceleration = 0.0 if self.contact_acceleration is None else self.contact_acceleration
         object.__setattr__(self, "stance", np.flatnonzero(~opens))
