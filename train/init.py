@@ -11,8 +11,8 @@ from typing import Final
 import gymnasium as gym
 from rich.console import Console
 
-import safe_wrappers
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.recipes import EVERY, recipe_of
 
 from .config import parse_experiment, read_config
@@ -107,10 +107,11 @@ def _envs() -> dict[str, str]:
 
 
 def _wrappers() -> dict[str, str]:
-    named = {name: getattr(safe_wrappers, name) for name in safe_wrappers.__all__}
+    package = importlib.import_module("safe_wrappers")
+    named = {name: getattr(package, name) for name in package.__all__}
     wrappers = gym.Wrapper | gym.vector.VectorWrapper
     found = {n: thing for n, thing in named.items() if inspect.isclass(thing) and issubclass(thing, wrappers)}
-    found |= {f"faults.{name}": thing for name, thing in safe_wrappers.faults.FAULTS.items()}
+    found |= {f"faults.{name}": thing for name, thing in FAULTS.items()}
     return {name: (inspect.getdoc(thing) or "").partition("\n")[0] for name, thing in sorted(found.items())}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array, name_list, positive
 from safe_wrappers.constraints.rollout import RolloutConstraint
-from safe_wrappers.control.contact import peak_force, speed_limit
+from safe_wrappers.control.contact import peak_force
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -33,15 +33,6 @@ class Contact(NamedTuple):
     def peak(self) -> Array:
         """Force by the deepest deflection, under a push that goes on, N."""
         return peak_force(*self[1:])
-
-    def left(self, limit: float) -> Array:
-        """What is left of a limit, N, to first order; in squares, nearly linear in the control."""
-        pressed = self.stiffness * self.deflection
-        # Beyond the limit the push would change its sign with that of the first factor.
-        push = np.where(pressed <= limit, self.push, -self.push)
-        share = self.speed / speed_limit(limit, self.mass, self.stiffness)
-        square = (limit - pressed) * (limit + pressed - 2.0 * push)
-        return np.asarray(square / (2.0 * limit) - 0.5 * limit * share**2)
 
 
 @dataclass
@@ -92,7 +83,6 @@ class ImpactSpeedLimit(RolloutConstraint):
         self._gaps = GeomGaps(self.plant, self.bodies, self.against)
         self._probe = mujoco.MjData(m)
         self._integration = np.zeros(mujoco.mj_stateSize(m, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
-        self._limit = self.force_limit - self.margin
         self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
         self._mobile = np.zeros((1, m.nv))
         self.scale = self.force_limit
@@ -149,7 +139,7 @@ class ImpactSpeedLimit(RolloutConstraint):
         return () if control is not None else (self.plant.braking(),)
 
     def h_along(self, path: MujocoTrajectory) -> Array:
-        """What every pair's contact leaves of the limit; without one as much as the gentlest, N."""
+        """What every pair's contact leaves of the limit; without one all of it, N."""
         if path.control is None:
             return self._now()
         k, pairs = len(path.qpos), len(self._gaps.pairs)
@@ -160,7 +150,7 @@ class ImpactSpeedLimit(RolloutConstraint):
             for instant in self._gaps.touched(self.plant, path, self._probe, pair):
                 touched.setdefault(instant, []).append(pair)
         soon = self.plant.substeps - 1
-        left = np.full((k, pairs), 0.5 * self._limit)
+        left = np.full((k, pairs), self.force_limit)
         judged: list[tuple[int, int]] = []
         contacts: list[Contact] = []
         for instant, those in touched.items():
@@ -172,8 +162,8 @@ class ImpactSpeedLimit(RolloutConstraint):
                 contacts.append(self.contact(pair))
         if judged:
             instants, those = np.transpose(judged)
-            left[instants, those] = _together(contacts).left(self._limit)
-        return left + self.margin
+            left[instants, those] = self.force_limit - _together(contacts).peak
+        return left
 
     def _now(self) -> Array:
         m, d = self.plant.model, self._probe
@@ -182,7 +172,7 @@ class ImpactSpeedLimit(RolloutConstraint):
         mujoco.mj_setState(m, d, self._integration, what)
         self.place(self.plant.qpos, self.plant.qvel, None)
         contacts = _together([self.contact(pair) for pair in range(len(self._gaps.pairs))])
-        there, left = contacts.gap <= self._gaps.touch, contacts.left(self._limit) + self.margin
+        there, left = contacts.gap <= self._gaps.touch, self.force_limit - contacts.peak
         # Only a contact that is there counts; before it, how it will be is the forecast's to say.
         return np.where(there, left, np.maximum(left, 0.0))[None]
 

@@ -4,9 +4,9 @@ from safe_wrappers.plants.analytic import AnalyticPlant
 from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.identified import IdentifiedPlant, log_steps
+from safe_wrappers.plants.mujoco.dynamics import RigidModelCheck, rigid_model_check
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check
 from safe_wrappers.plants.simulator import Rollout, RolloutPlant, SimulatorPlant, View
 
 __all__ = [
