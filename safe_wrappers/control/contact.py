@@ -23,6 +23,8 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, whole_number
 
+Numbers = Array | float
+
 
 def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
     """The part of each force along its normal, shape (...), below 0 where it pulls, and the rest, (..., 3), N.
@@ -82,23 +84,18 @@ def friction_pyramid(
     return np.concatenate([sides, np.broadcast_to(-n, (*sides.shape[:-2], 3))[..., None, :]], axis=-2)
 
 
-def complementarity_residuals(gap: ArrayLike, force: ArrayLike) -> tuple[Array, Array]:
+def complementarity_residuals(gap: Numbers, force: Numbers) -> tuple[Array, Array]:
     """Violations of `gap >= 0` and of `gap * force = 0`, shapes (...), 0 where they hold: m and N m.
 
     The gap is a signed distance, m, shape (...), negative where the bodies penetrate; the force is along the normal,
     N, shape (...), positive where it pushes the bodies apart. Compliant contacts, MuJoCo's among them, violate the
     law by design.
     """
-    g = np.asarray(gap, dtype=np.float64)
-    return np.maximum(-g, 0.0), np.abs(g * force)
+    return np.maximum(np.negative(gap), 0.0), np.abs(gap * force)
 
 
 def peak_force(
-    speed: ArrayLike,
-    mass: ArrayLike,
-    stiffness: ArrayLike,
-    push: ArrayLike = 0.0,
-    deflection: ArrayLike = 0.0,
+    speed: Numbers, mass: Numbers, stiffness: Numbers, push: Numbers = 0.0, deflection: Numbers = 0.0
 ) -> Array:
     """The largest force of a contact, shape (...), N: `v sqrt(k m)`, with a push `p + sqrt((k x - p)^2 + k m v^2)`.
 
@@ -109,22 +106,22 @@ def peak_force(
         push: p, a force that goes on, N.
         deflection: x, how deep the contact is already, m.
     """
-    m, k, p = np.asarray(mass), np.asarray(stiffness), np.asarray(push)
-    return np.asarray(p + np.hypot(k * deflection - p, np.maximum(speed, 0.0) * np.sqrt(k * m)))
+    pressed, struck = stiffness * deflection - push, np.maximum(speed, 0.0) * np.sqrt(stiffness * mass)
+    return np.asarray(push + np.hypot(pressed, struck))
 
 
-def speed_limit(force: ArrayLike, mass: ArrayLike, stiffness: ArrayLike) -> Array:
+def speed_limit(force: Numbers, mass: Numbers, stiffness: Numbers) -> Array:
     """The approach speed whose `peak_force` is F, `F / sqrt(k m)`, shape (...), m/s, of F (N), m (kg) and k (N/m)."""
-    return np.asarray(force / np.sqrt(np.multiply(stiffness, mass)))
+    return np.asarray(force / np.sqrt(stiffness * mass))
 
 
-def time_to_peak(mass: ArrayLike, stiffness: ArrayLike) -> Array:
+def time_to_peak(mass: Numbers, stiffness: Numbers) -> Array:
     """From the first touch to the peak without braking, a quarter of a period, shape (...), s, of m (kg), k (N/m)."""
-    return np.asarray(np.pi / 2.0 * np.sqrt(np.divide(mass, stiffness)))
+    return np.asarray(np.pi / 2.0 * np.sqrt(mass / stiffness))
 
 
 def braked_deflection(
-    speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, braking: ArrayLike, latency: ArrayLike = 0.0
+    speed: Numbers, mass: Numbers, stiffness: Numbers, braking: Numbers, latency: Numbers = 0.0
 ) -> Array:
     """The first peak of the deflection when a brake works against it, shape (...), m.
 
@@ -138,7 +135,7 @@ def braked_deflection(
         braking: Constant deceleration a >= 0 of brakes alone, without the contact's own, m/s^2.
         latency: From the touch to the brake's action, at least 0, s.
     """
-    late, root = np.asarray(latency, dtype=np.float64), np.sqrt(np.divide(mass, stiffness))
+    late, root = np.asarray(latency, dtype=np.float64), np.sqrt(mass / stiffness)
     free, b = np.maximum(speed, 0.0) * root, braking * root**2
     in_time = (late < np.pi / 2.0 * root) & (free > 0.0)
     # (x_max + b)^2 - b^2, divided rather than subtracted: for a strong brake the difference cancels.

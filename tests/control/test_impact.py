@@ -106,8 +106,8 @@ def test_a_drop_in_mujoco_has_the_peak_force_of_its_spring():
 
 
 def test_residuals_are_zero_for_ideal_contacts_and_name_what_is_missed():
-    ideal = complementarity_residuals([0.3, 0.0, 0.0], [0.0, 0.0, 50.0])
+    ideal = complementarity_residuals(np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 50.0]))
     assert all((r == 0.0).all() for r in ideal)
-    missed = complementarity_residuals([-0.002, 0.1, 0.0], [40.0, 5.0, -3.0])
+    missed = complementarity_residuals(np.array([-0.002, 0.1, 0.0]), np.array([40.0, 5.0, -3.0]))
     assert missed[0].tolist() == [0.002, 0.0, 0.0]
     np.testing.assert_allclose(missed[1], [0.08, 0.5, 0.0])
