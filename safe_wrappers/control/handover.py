@@ -235,13 +235,7 @@ def hermite_spline(positions: Array, spacing: float) -> PPoly:
 
 
 def knot_torque_step(inertia: Array, spacing: float, positions: Array) -> Array:
-    """Torque steps M(q) dq'' at the inner knots of `hermite_spline`, N m, shape (k - 2, m).
-
-    Args:
-        inertia: Matrices M, one per inner knot, shape (k - 2, m, m), kg m^2.
-        spacing: From one knot to the next, s.
-        positions: Shape (k, m), rad.
-    """
+    """Torque steps M(q) dq'' at the inner knots of `hermite_spline`, N m, shape (k - 2, m), for M (k - 2, m, m)."""
     bend = hermite_spline(positions, spacing).derivative(2)
     at_starts, at_ends = bend.c[-1], np.polyval(bend.c, spacing)
     jumps = at_starts[1:] - at_ends[:-1]
@@ -355,21 +349,13 @@ class SeamCheck:
         return bool((np.abs(torque) <= self._torque * _ROUNDING).all() and slow.all())
 
     def bears_knots(self, knots: Array, spacing: float) -> bool:
-        """Whether the torque steps at a cubic spline's knots, M times the acceleration's, keep the torque's slew.
-
-        Args:
-            knots: Positions, shape (k, m).
-            spacing: From one to the next, s.
-        """
+        """Whether torque steps at the knots (k, m) of a cubic spline, `spacing` s apart, keep the torque's slew."""
         if self._inertia is None or len(knots) < 3:
             return True
         steps = knot_torque_step(self._inertia(knots[1:-1]), spacing, knots)
         return bool((self._slew * self._control_dt * _ROUNDING >= np.abs(steps)).all())
 
     def shortest_fade(self, change: Array) -> float:
-        """Duration of the shortest smoothstep between two held commands that keeps the limits but those of torque, s.
-
-        The change is |u_new - u_prior|, shape (m,).
-        """
+        """The shortest smoothstep, s, that changes a held command by (m,) within the limits but those of torque."""
         spans = [shortest_blend(change, bound, d) for d, bound in self._bounds.items()]
         return float(np.max(spans, initial=0.0))

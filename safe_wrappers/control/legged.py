@@ -29,13 +29,8 @@ _FACING = math.cos(0.05) - _ROUNDING
 def support_distances(instant: NDArray[np.intp], points: Array, normals: Array, forces: Array) -> Array:
     """Distances, m, negative outside, where three or more contacts of one plane, not on a line, are pressed.
 
-    One for each of these instants in turn; the others have none.
-
-    Args:
-        instant: To which instant each contact belongs, whole numbers, shape (n,); in any order.
-        points: Shape (n, 3), m.
-        normals: Unit normals, shape (n, 3).
-        forces: On the robot, shape (n, 3), N.
+    One for each of these instants in turn; the others have none. Contacts are given by the number of their instant,
+    shape (n,), in any order, their points, m, unit normals and forces on the robot, N, shape (n, 3) each.
     """
     order = np.argsort(instant, kind="stable")
     each = np.split(order, np.flatnonzero(np.diff(instant[order])) + 1)
@@ -129,14 +124,7 @@ class CentroidalMomentum(NamedTuple):
 def centroidal_momentum(
     masses: Array, positions: Array, velocities: Array, angular_momenta: Array
 ) -> CentroidalMomentum:
-    """Of n parts together.
-
-    Args:
-        masses: Shape (n,), kg, their sum positive.
-        positions: Of the parts' own centres of mass, shape (n, 3), m.
-        velocities: Of the same points, shape (n, 3), m/s.
-        angular_momenta: Of the parts about them, shape (n, 3), kg m^2/s.
-    """
+    """Of n parts together: masses (n,), kg, their centres, m, and velocities, m/s, and angular momenta about these."""
     total = float(masses.sum())
     com, momenta = masses @ positions / total, masses[:, None] * velocities
     # Relative to the centre of mass; the velocities need no such shift, since sum m (p - c) = 0.
