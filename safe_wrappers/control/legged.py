@@ -124,7 +124,7 @@ class CentroidalMomentum(NamedTuple):
 def centroidal_momentum(
     masses: Array, positions: Array, velocities: Array, angular_momenta: Array
 ) -> CentroidalMomentum:
-    """Of n parts together: masses (n,), kg, their centres, m, and velocities, m/s, and angular momenta about these."""
+    """Of n parts together: masses (n,), kg, their centres, m, velocities, m/s, and angular momenta about these."""
     total = float(masses.sum())
     com, momenta = masses @ positions / total, masses[:, None] * velocities
     # Relative to the centre of mass; the velocities need no such shift, since sum m (p - c) = 0.
