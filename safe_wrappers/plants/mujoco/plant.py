@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array, non_negative
+from safe_wrappers.control.bandwidth import ControlLoop
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
-from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
