@@ -17,7 +17,7 @@ from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import SafeActionSearch, Stage
-from safe_wrappers.plants.default import default_plant, own_plant
+from safe_wrappers.plants import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from, plain_data
@@ -122,8 +122,10 @@ class CBFActionFilter(LayerWrapper):
 
     @property
     def constraints(self) -> list[Constraint]:
-        """The constraints, on their plant, with the added margin."""
-        return [c.spec for c in self.filter.bound]
+        """The constraints with the added margin, as given but for what they found on the plant."""
+        for given, bound in zip(self.filter.constraints, self.filter.bound, strict=True):
+            vars(given).update({k: v for k, v in vars(bound.spec).items() if k in ("promise", "validated")})
+        return list(self.filter.constraints)
 
     def _filter(self, margin: float) -> SafetyFilter:
         of_actions = self._low, self._high, self._dtype, self._search

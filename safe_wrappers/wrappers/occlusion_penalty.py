@@ -14,7 +14,7 @@ from safe_wrappers.control.estimation import Tracks, largest_deviation, unobserv
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import physics_steps
-from safe_wrappers.plants.queries.line_of_sight import LineOfSight
+from safe_wrappers.plants.mujoco.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng

@@ -17,8 +17,7 @@ from safe_wrappers.errors import ConfigurationError, SafeWrappersError, Unsuppor
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.filter.engine import SafetyFilter
-from safe_wrappers.plants import MujocoPlant
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants import MujocoPlant, default_plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.cost_function import CostFunction, refuse_own_cost
 from safe_wrappers.wrappers.faults import FAULTS
@@ -181,7 +180,7 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         judging: The filter around the same task, whose constraints are used; it is never stepped.
 
     Raises:
-        ConfigurationError: It is no CBFActionFilter, one of them has no h (`value`), or the filter
+        ConfigurationError: It is no CBFActionFilter, one of them has no h (`h_along`), or the filter
             has a plant of the user's own with a delay, which does not see the present state.
     """
 
@@ -195,9 +194,9 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         its_filter: SafetyFilter = judging.get_wrapper_attr("filter")
         for constraint in its_filter.bound:
             if not constraint.measures_state:
+                kind = type(constraint.spec).__name__
                 raise ConfigurationError(
-                    f"env.judge: {type(constraint.spec).__name__} has no h (`value`) and cannot judge; use env.cost: "
-                    "module:function"
+                    f"env.judge: {kind} has no h (`h_along`) and cannot judge; use env.cost: module:function"
                 )
         self._plant = its_filter.plant
         self._constraints = its_filter.bound

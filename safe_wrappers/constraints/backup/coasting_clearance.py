@@ -14,9 +14,9 @@ from safe_wrappers.constraints.backup.base import DetourClearance
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline, nearest_discs
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.mujoco.coasting import Coasting, Course
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant, Trajectory
-from safe_wrappers.plants.queries.coasting import Coasting, Course
 
 _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
 _WAY_OUT_M = 1e-3  # gain of clearance that is asked for where zero control leaves less than the margin
@@ -36,7 +36,7 @@ class CoastingClearance(DetourClearance):
     best.
 
     Proved, for obstacles that stand still, and as far as `margin` covers the forecast's error: from a state whose way
-    to rest is clear (`value` >= 0) there is always an admissible control, and every physics substep is clear.
+    to rest is clear (h >= 0) there is always an admissible control, and every physics substep is clear.
 
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.
