@@ -130,7 +130,6 @@ class FieldEnv(TaskEnv):
     def step(  # type: ignore[override]
         self, action: NDArray[np.floating[Any]]
     ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """As `TaskEnv.step`."""
         self._before = self._goal_distance()
         return super().step(action)
 

@@ -174,7 +174,6 @@ class FlexJointReachEnv(TaskEnv):
         self.data.mocap_pos[0, :2] = self._target
 
     def reset_model(self) -> Array:
-        """Draw a start and a target, return the observation."""
         inner, outer = _TARGET_RADII
         radius = math.sqrt(self.np_random.uniform(inner**2, outer**2))
         angle = self.np_random.uniform(-math.pi, math.pi)
@@ -196,7 +195,6 @@ class FlexJointReachEnv(TaskEnv):
         return self._reward_dist + self._reward_ctrl
 
     def observe(self) -> Array:
-        """Observation of the state as it is now: also right after `set_state` or `place_target`."""
         qpos, qvel = self.data.qpos, self.data.qvel
         motors = qpos[MOTORS]
         angles = [np.cos(motors), np.sin(motors), qvel[MOTORS], -qpos[SPRINGS], -qvel[SPRINGS]]

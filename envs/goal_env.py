@@ -103,7 +103,6 @@ class SafeGoalEnv(FieldEnv):
 
     hazard_radius: Final = HAZARD_RADIUS
     goal_radius = GOAL_RADIUS
-    vase_half_size: Final = VASE_HALF_SIZE
 
     def __init__(self, robot: Robot, level: int, **kwargs: Any) -> None:
         if level not in range(len(LEVELS)):
@@ -155,7 +154,6 @@ class SafeGoalEnv(FieldEnv):
         return parse_layout(options, {"agent": POSE, "goal": PLACE, "hazards": hazards, "vases": vases})
 
     def reset_model(self) -> Array:
-        """Sample what the options left open, place everything, return the observation."""
         level = self.level
         counts = {"hazards": level.hazards, "vases": level.vases}
         self._apply(**place_objects(self.np_random, level.half_extent, KEEPOUTS, counts, self._given))
@@ -263,12 +261,10 @@ class SafeGoalEnv(FieldEnv):
         self.set_state(qpos, np.zeros(self.model.nv))
 
     def place_goal(self, goal: Array) -> None:
-        """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
         super().place_goal(goal)
         self.data.mocap_pos[0, 2] = _GOAL_Z
 
     def observe(self) -> Array:
-        """Observation of the state as it is now: also right after `set_state`."""
         targets = self._targets
         targets[len(targets) - self._n_vases :] = self.vase_positions
         relative = self.robot.relative(targets, self.data.qpos)

@@ -29,12 +29,7 @@ def places(at_most: int) -> Form:
 
 
 def layout_option(options: Mapping[str, Any] | None, keys: Collection[str]) -> Given:
-    """The layout among `reset`'s options, its keys checked, as given; empty when there is none.
-
-    Raises:
-        UnknownNameError: An unknown key in the layout, or an option that looks like a misspelt ``"layout"``.
-        ConfigurationError: The layout is no mapping.
-    """
+    """The layout among `reset`'s options, its keys checked, as given; empty when there is none."""
     options = options or {}
     for key in options:
         if key != "layout" and difflib.get_close_matches(str(key), ["layout"], cutoff=0.7):

@@ -168,7 +168,6 @@ class OccludedCrossingEnv(FieldEnv):
         return parsed
 
     def reset_model(self) -> Array:
-        """Sample what the options left open, place everything, return the observation."""
         layout = _sample_layout(self.np_random, self._given)
         # A stream of the cars' own: a goal reached, and so the next one drawn, must not change their way.
         self._cars_random = np.random.default_rng(self.np_random.integers(2**63))
@@ -190,7 +189,6 @@ class OccludedCrossingEnv(FieldEnv):
         return math.isfinite(float(self.data.qpos.sum() + self.data.qvel.sum()))
 
     def observe(self) -> Array:
-        """Observation of the state as it is now: also right after `set_state`."""
         x, y, heading = self.data.qpos[:3].tolist()
         vx, vy, yaw_rate = self.data.qvel[:3].tolist()
         goal_x, goal_y = self._targets[0].tolist()

@@ -156,19 +156,8 @@ class SafeRoverEnv(FieldEnv):
         """The grounds of this episode: the truth that no driver may see."""
         return self._grounds
 
-    @property
-    def wheel_loads(self) -> Array:
-        """Load F_z of each wheel, shape (4,), N."""
-        return np.array(self.data.userdata)
-
     def ground_under(self, wheel: str) -> str:
-        """Name of the ground under a wheel now.
-
-        Raises:
-            UnknownNameError: There is no such wheel.
-        """
-        if wheel not in WHEELS:
-            raise UnknownNameError(f"unknown wheel {wheel!r}: valid wheels are {', '.join(WHEELS)}")
+        """Name of the ground under a wheel now; `ValueError` for no wheel."""
         return self._grounds.at(*self.data.xpos[self._tyres.bodies[WHEELS.index(wheel)], :2].tolist())
 
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
@@ -180,7 +169,6 @@ class SafeRoverEnv(FieldEnv):
         return {**found, "speed": float(found["speed"])}
 
     def reset_model(self) -> Array:
-        """Sample what the options left open, place everything, return the observation."""
         # Patches lie anywhere, under whatever stands there, the icy ones on top.
         rng, given = self.np_random, self._given
         placed = place_objects(rng, HALF_EXTENT, KEEPOUTS, {"hazards": HAZARDS}, given)
@@ -216,7 +204,6 @@ class SafeRoverEnv(FieldEnv):
         return rolled_over(self.data.qpos[3:7])
 
     def observe(self) -> Array:
-        """Observation of the state as it is now: also right after `set_state`."""
         data = self.data
         vx, vy, _, _, _, yaw_rate, ax, ay, _ = data.sensordata[4:13].tolist()
         heading = self.agent_heading

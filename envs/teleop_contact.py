@@ -126,11 +126,6 @@ class TeleopContactEnv(TaskEnv):
         return np.array(self.data.qvel)
 
     @property
-    def commanded_position(self) -> Array:
-        """The commanded velocities' integral, dragged along where the spring slips; shape (2,), m."""
-        return np.array(self.data.mocap_pos[0, :2])
-
-    @property
     def clearance(self) -> float:
         """Between tool and clamp, m."""
         return CLAMP_Y - TOOL_RADIUS - float(self.data.qpos[1])
@@ -167,7 +162,6 @@ class TeleopContactEnv(TaskEnv):
         return given
 
     def reset_model(self) -> Array:
-        """Draw what the options left open."""
         drawn = self.np_random.uniform(*np.transpose([_START_X, _START_Y, _WANTED]))
         self._wanted = float(self._given.get("wanted_force", drawn[2]))
         self.set_state(self._given.get("tool", drawn[:2]), self._given.get("velocity", np.zeros(2)))
@@ -184,7 +178,6 @@ class TeleopContactEnv(TaskEnv):
         return bool(np.isfinite(observation).all())
 
     def observe(self) -> Array:
-        """Observation of the state as it is now."""
         data = self.data
         tool = [*data.qpos.tolist(), *data.qvel.tolist(), *self._coupling(data.ctrl)]
         return np.array([*tool, self._force, self.clearance, self._wanted])

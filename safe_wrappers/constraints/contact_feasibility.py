@@ -22,12 +22,12 @@ from safe_wrappers.control.whole_body import (
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint, Memory
-from safe_wrappers.plants.mujoco.action_map import refuse_mapped
+from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
+from safe_wrappers.plants.mujoco.dynamics import equations_of_motion
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Model, Plant, Trajectory
-from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
 _EDGES = 8  # of the pyramids inside the friction cones
 _SETTLE_S = 0.05  # time constant in which what still moves at a contact is to come to rest, s

@@ -14,9 +14,9 @@ from safe_wrappers.checks import Array, name_list, non_negative, positive
 from safe_wrappers.control.vehicle import FrictionEstimate, slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.plants.mujoco.driven_wheels import DrivenWheels
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
 
 _CAUTION = 0.5  # standard deviations of the believed peak's slip by which the limit stays below it
 _NOISE = 0.02  # standard deviation of a measured friction coefficient while the slip stands still

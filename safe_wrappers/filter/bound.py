@@ -192,11 +192,12 @@ class Bound:
 
     def slack(self, control: Array) -> float:
         """The least of what a control leaves; >= 0: kept. Minus infinity where a number is lost."""
-        if not self.predicts:
+        if self.predicts:
+            left = self.slacks(control)
+        else:
             rows = self.rows()
-            return float((rows.offsets - rows.normals @ control).min(initial=np.inf))
-        left = self.slacks(control)
-        least = float(left[0] if left.size == 1 else left.min(initial=np.inf))
+            left = rows.offsets - rows.normals @ control
+        least = float(left.min(initial=np.inf))
         return least if least == least else -np.inf
 
     def admits(self, control: Array) -> bool:
@@ -205,7 +206,11 @@ class Bound:
             rows = self.rows()
             if not keeps_rows(control, rows.normals, rows.offsets, self.plant.lower, self.plant.upper):
                 return False
-        return not self.predicts or self._far or self.slack(control) >= -self.spec.rounding
+        return (
+            not self.predicts
+            or self._far
+            or bool(self.slacks(control).min(initial=0.0) >= -self.spec.rounding)
+        )
 
     def keeps_limit(self, control: Array) -> bool:
         """Inside the margin: whether a refused control keeps the limit, and loses no more of the margin.

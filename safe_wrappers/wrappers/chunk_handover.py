@@ -12,9 +12,9 @@ from safe_wrappers.checks import OF_NUMBERS, Array, numbers_of, settings_from, s
 from safe_wrappers.control.handover import BLENDS, SeamCheck, SeamLimits
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.default import own_plant
+from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
-from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
+from safe_wrappers.plants.mujoco.dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data, plain_numbers

@@ -12,7 +12,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants import default_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside

@@ -11,7 +11,7 @@ from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.control.handover import smoothstep
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.default import own_plant
+from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data

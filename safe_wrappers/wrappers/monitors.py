@@ -22,8 +22,8 @@ from safe_wrappers.plants.mujoco.contacts import (
     can_touch_the_world,
     chosen_bodies,
 )
+from safe_wrappers.plants.mujoco.dynamics import MomentumReader
 from safe_wrappers.plants.mujoco.model import fixed_bodies
-from safe_wrappers.plants.queries.floating_base import MomentumReader
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
 

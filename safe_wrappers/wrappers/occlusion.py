@@ -18,8 +18,8 @@ from safe_wrappers.control.dead_reckoning import (
 )
 from safe_wrappers.control.estimation import Motion
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.plants.mujoco.line_of_sight import LineOfSight
 from safe_wrappers.plants.mujoco.model import named
-from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_numbers
 
 __all__ = ["Imu", "Sensor", "Track"]

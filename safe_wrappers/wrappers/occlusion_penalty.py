@@ -13,8 +13,8 @@ from safe_wrappers.checks import Array, non_negative, positive, settings_from, t
 from safe_wrappers.control.estimation import Tracks, largest_deviation, unobservable_directions
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import read_attribute
-from safe_wrappers.plants.mujoco.binding import control_interval
-from safe_wrappers.plants.queries.line_of_sight import LineOfSight
+from safe_wrappers.plants.mujoco.binding import physics_steps
+from safe_wrappers.plants.mujoco.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng
@@ -114,7 +114,7 @@ class OcclusionPenalty(LayerWrapper):
         parts = {"tracks": plain_data(self.tracks), "sensor": plain_data(self.sensor)}
         self._record(arguments, **parts, **plain, observe=self.observe)
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
-        self._control_dt = control_interval(raw)
+        self._control_dt = physics_steps(raw) * float(raw.model.opt.timestep)
         self._matrix, self._noise = self.sensor.matrices(self._d)
         self._noise_root = np.linalg.cholesky(self._noise)
         self._look_at(raw.model)

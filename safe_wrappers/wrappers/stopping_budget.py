@@ -14,7 +14,7 @@ from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room,
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants import default_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
 from safe_wrappers.wrappers.layer import Env

@@ -9,7 +9,7 @@ from oracles import in_cone
 
 from safe_wrappers.control.legged import centroidal_momentum
 from safe_wrappers.control.whole_body import WholeBodyProblem, solve_cone, solve_pyramid
-from safe_wrappers.plants.queries.floating_base import MomentumReader, contact_points, equations_of_motion
+from safe_wrappers.plants.mujoco.dynamics import MomentumReader, contact_points, equations_of_motion
 
 ZOO = """
 <mujoco>

@@ -17,8 +17,7 @@ from safe_wrappers.errors import ConfigurationError, SafeWrappersError, Unsuppor
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.filter.engine import SafetyFilter
-from safe_wrappers.plants import MujocoPlant
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants import MujocoPlant, default_plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.cost_function import CostFunction, refuse_own_cost
 from safe_wrappers.wrappers.faults import FAULTS

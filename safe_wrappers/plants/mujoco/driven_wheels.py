@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle import Wheel
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.mujoco.action_map import refuse_mapped
+from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
