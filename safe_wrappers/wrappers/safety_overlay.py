@@ -35,6 +35,7 @@ ESTIMATE: Final = (0.55, 0.3, 0.8, 0.35)
 MOST_MARKS: Final = 500
 """Of one frame. Gymnasium's scene has room for 1000 shapes, the model's own among them."""
 
+_PIECES: Final = 30  # the most of one way
 _THIN: Final = 0.012  # m: half the width of a line
 _FLOOR: Final = 0.02  # m: the height at which what has no height is drawn, just above a floor at 0
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -153,6 +154,7 @@ def marks_of(spec: Any) -> list[Mark]:
     radius = getattr(spec, "radius", 0.0)
     inset = spec.margin + spec.state_error + radius
     way = _spatial(spec.points(spec.model.rollout(None))) if hasattr(spec, "points") else np.zeros((1, 0, 3))
+    way = way[np.unique(np.linspace(0, len(way) - 1, _PIECES + 1, dtype=int))]
     found = [line for j in range(way.shape[1]) for line in _lines(WAY, way[:, j])]
     found += [mark("SPHERE", WAY, point, [max(radius, _THIN), 0.0, 0.0]) for point in way[-1]]
     obstacles = [one for name in ("obstacles", "keep_out", "untouched") for one in getattr(spec, name, ())]

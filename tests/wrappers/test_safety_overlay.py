@@ -13,7 +13,7 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.safety_overlay import MOST_MARKS
+from safe_wrappers.wrappers.safety_overlay import KEEP_OUT, LIMIT, MOST_MARKS, WAY
 
 TASK = "SafePointGoal1-v0"
 RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
@@ -69,6 +69,34 @@ def test_observations_rewards_infos_and_random_numbers_are_those_without_it(task
     bare, intervened = episode(task, False)
     assert episode(task, True)[0] == bare
     assert intervened or "Rover" in task
+
+
+@pytest.mark.parametrize("task", list(STRAIGHT))
+def test_every_disc_has_a_ring_where_the_margin_begins(task):
+    env = sw.SafetyOverlay(sw.protect(gym.make(task, render_mode="rgb_array")))
+    env.reset(seed=0)
+    centers = env.unwrapped.hazard_positions
+    rods = [mark for mark in env.marks() if mark["rgba"] == LIMIT]
+    ends = [mark["pos"] - mark["size"][2] * mark["mat"].reshape(3, 3)[:, 2] for mark in rods]
+    rings = np.reshape(ends, (len(centers), -1, 3))[..., :2]
+    radii = np.linalg.norm(rings - centers[:, None], axis=2)
+    np.testing.assert_allclose(radii, 0.2 + env.get_wrapper_attr("constraints")[0].margin)
+    np.testing.assert_allclose(rings.mean(axis=1), centers, atol=1e-9)
+
+
+def test_planes_are_moved_by_what_is_kept_free():
+    keep = sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"], radius=0.1, margin=0.05, state_error=0.01)
+    env = gym.make("InvertedPendulum-v5", render_mode="rgb_array")
+    env = sw.SafetyOverlay(sw.CBFActionFilter(env, [keep]))
+    env.reset(seed=0)
+    env.step(np.array([3.0], np.float32))
+    left, right, point = (
+        mark for colour in (KEEP_OUT, WAY) for mark in env.marks() if mark["rgba"] == colour
+    )
+    np.testing.assert_allclose([left["pos"][0], right["pos"][0]], [-0.74, 0.74])
+    for pad in (left, right):
+        np.testing.assert_allclose(np.abs(pad["mat"].reshape(3, 3)[:, 2]), [1.0, 0.0, 0.0], atol=1e-12)
+    assert point["pos"][0] == env.unwrapped.data.qpos[0] and point["size"][0] == 0.1
 
 
 class Renderer:
