@@ -249,7 +249,6 @@ _UNITS: Final = {
     "torque": "N m",
     "torque_slew": "N m/s",
 }
-_DERIVATIVES: Final = {"velocity": 1, "acceleration": 2, "jerk": 3}
 
 
 @dataclass(frozen=True)
@@ -313,11 +312,8 @@ class SeamCheck:
         inertia: Callable[[Array], Array] | None = None,
     ) -> None:
         self._control_dt, self._torques, self._inertia = control_dt, torques, inertia
-        every = {name: limits.of(name, controls) for name in _UNITS}
-        self._bounds = {
-            d: every[name] for name, d in _DERIVATIVES.items() if getattr(limits, name) is not None
-        }
-        self._torque, self._slew = every["torque"], every["torque_slew"]
+        self._bounds = [limits.of(name, controls) for name in ("velocity", "acceleration", "jerk")]
+        self._torque, self._slew = limits.of("torque", controls), limits.of("torque_slew", controls)
 
     def accepts(self, sent: Array, new: Array, steps: int) -> bool:
         """Whether a quintic of `join` that bridges `steps` commands keeps all limits up to its end.
@@ -325,7 +321,7 @@ class SeamCheck:
         Torques are judged at every quarter of a control step, and where an acceleration is largest or smallest.
         """
         curve = bridge(sent, new, steps, self._control_dt)
-        if any((peaks(curve, d) > bound * _ROUNDING).any() for d, bound in self._bounds.items()):
+        if any((peaks(curve, d) > bound * _ROUNDING).any() for d, bound in enumerate(self._bounds, 1)):
             return False
         if self._torques is None:
             return True
@@ -345,5 +341,4 @@ class SeamCheck:
 
     def shortest_fade(self, change: Array) -> float:
         """The shortest smoothstep, s, that changes a held command by (m,) within the limits but those of torque."""
-        spans = [shortest_blend(change, bound, d) for d, bound in self._bounds.items()]
-        return float(np.max(spans, initial=0.0))
+        return float(np.max([shortest_blend(change, bound, d) for d, bound in enumerate(self._bounds, 1)]))
