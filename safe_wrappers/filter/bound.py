@@ -129,19 +129,18 @@ class Bound:
     def slacks(self, control: Array) -> Array:
         """What the trajectory of a control, shape (m,), leaves of what is asked for, shape (n,); wanted >= 0.
 
-        In time: the least of every control interval, each of the k apart; from outside see `_of`. What is lost in the
-        first interval is not looked at further, nor what leaves as much there as `look_ahead_below`.
+        In time: the least of every control interval, each of the k apart; from outside see `_of`.
         """
         key = control.tobytes()
         known = self._known.get(key)
         if known is None:
-            spec, gate, horizon = self.spec, self.spec.look_ahead_below, self.spec.horizon
+            spec, gate = self.spec, self.spec.look_ahead_below
             further = {"euler": True} if spec.euler_look_ahead else {}
-            known = self._of(spec.model.rollout(control, horizon if self._is_outside else 1, **further))
-            if horizon > 1 and not self._is_outside and known.min(initial=np.inf) >= -spec.rounding:
-                enough = gate is not None and self.least >= gate and bool((known >= gate).all())
-                if not enough:
-                    known = self._of(spec.model.rollout(control, horizon, **further))
+            if gate is not None and not self._is_outside and self.least >= gate:
+                held = self._of(spec.model.rollout(control, 1, **further))
+                known = held if bool((held >= gate).all()) else None
+            if known is None:
+                known = self._of(spec.model.rollout(control, spec.horizon, **further))
             self._known[key] = known
         return known
 
@@ -151,9 +150,9 @@ class Bound:
         if self._is_outside:
             least, end = self._wanted()
             return np.concatenate([left.min(axis=0) - least, left[-1] - end])
-        k, holds, self._width = len(left), path.holds, left.shape[1]
-        if k > holds:
-            left = left.reshape(holds, -1, self._width).min(axis=1)
+        holds = path.holds
+        if len(left) > holds:
+            left = left.reshape(holds, -1, left.shape[1]).min(axis=1)
         held = left[0] if holds == 1 else left.ravel()
         return np.asarray(held - self._wanted()[0] if self.spec.decay < 1.0 else held)
 
@@ -189,7 +188,7 @@ class Bound:
         """
         spec, plant, needed = self.spec, self.plant, self.spec.horizon
         if not self._is_outside and needed > 1:
-            left = self.slacks(control).reshape(-1, self._width)
+            left = self.slacks(control).reshape(needed, -1)
             needed = int(np.where(left.min(axis=0) < 0.0, left.argmin(axis=0), 0).max()) + 1
         box = plant.lower, plant.upper
         return differences(lambda u: self._of(spec.model.sketch(u, needed)), control, *box)

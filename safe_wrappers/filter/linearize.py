@@ -90,7 +90,6 @@ class Tangents:
             self.made, self._secants = self.made + 1, 0
         else:
             self._secants += known is not None
-        slopes = slopes[: slacks.size]  # of a control that is lost early there are fewer slacks
         self.slopes, self._control, self._slacks = slopes, control, slacks[: len(slopes)]
         if not guessed:
             return tangent_rows(self._slacks, control, slopes)
@@ -98,9 +97,8 @@ class Tangents:
 
     def _corrected(self, slopes: Array, step: Array, slacks: Array) -> Array | None:
         """The slopes after a secant update; None: it cannot be made, or they are not those of what is violated."""
-        k = min(len(slopes), slacks.size)
-        slopes = slopes[:k]
-        unexplained = slacks[:k] - self._slacks[:k] - slopes @ step
+        k = len(slopes)
+        unexplained = slacks[:k] - self._slacks - slopes @ step
         square = float(step @ step)
         if not (square > 0.0 and np.isfinite(unexplained).all() and slacks[:k].min() < 0.0):
             return None
