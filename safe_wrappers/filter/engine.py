@@ -88,10 +88,7 @@ class SafetyFilter:
         self.last = np.clip(np.zeros_like(self._low), self._low, self._high)
         self.observe()
         if not self._loaded and self.margin == self.margin:
-            _ = (
-                self.plant.acting_range if self.plant.has_acceleration else None
-            )  # compiles what a step may need
-            for c in self.bound:
+            for c in self.bound:  # compiles what a step may need
                 c.rows(), c.backup()
                 if c.predicts:
                     c.slack(self.last)

@@ -169,7 +169,7 @@ def test_a_filter_decides_as_on_the_twin(constraint):
             env.unwrapped.data.qvel,
         )
         twin.unwrapped.data.qacc_warmstart[:] = env.unwrapped.data.qacc_warmstart
-    assert changed > 5
+    assert changed >= 5  # the speed limit on impact acts while the arm approaches, then it rests
 
 
 class Relative(Machine):
