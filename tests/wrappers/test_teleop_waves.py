@@ -5,11 +5,10 @@ import pytest
 from teleop_worlds import Energies, ceiling, channel, clamp, place
 
 import safe_wrappers as sw
-from safe_wrappers.control.teleop.wave_line import WaveLine
+from safe_wrappers.control.teleop import WaveLine
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 from safe_wrappers.wrappers import teleop_coding as codings
-from safe_wrappers.wrappers.teleop import Packet
-from safe_wrappers.wrappers.teleop_coding import Up, WaveCoding
+from safe_wrappers.wrappers.teleop_coding import Packet, WaveCoding
 
 B = 40.0
 NETWORKS = {
@@ -200,7 +199,7 @@ def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
     for sequence in range(14):
         wave = waves.near(np.array([0.5]))  # sqrt(2 b) v = 1 sqrt(W): half a watt
         waves.sent(True, sequence, wave, False)
-        flow, _ = waves.far([Packet(sequence, Up(None, 0.0, wave))], Up(None, 0.0, wave))
+        flow, _ = waves.far([Packet(sequence, None, 0.0, wave)], Packet(sequence, None, 0.0, wave))
         # At first it resists with 5 N although it said 0; then as it says.
         machine.true = np.array([5.0 if sequence == 0 else 0.0])
         back, taken = waves.settle(flow, None, True)
