@@ -71,7 +71,7 @@ _MATTER = {
     " BoundEscapeClearance.backup min/max",
     "control/backup/point_decision.py": "backup not; _stopped_at not",
     "constraints/predictive_shield.py": "BoundPredictiveShield.plan not; BoundPredictiveShield._after not",
-    "wrappers/action_shield.py": "ActionShield.step not; ActionShield.action_masks not",
+    "wrappers/presets.py": "ActionShield.step not; ActionShield.action_masks not",
     "wrappers/stopping.py": "BoundBudget.longest_time not; BoundBudget.can_stop_after not",
     "wrappers/lease_expiry.py": (
         "LeaseExpiry.step not; LeaseExpiry._accepted not; LeaseExpiry._grant min/max; Admission.admits not"

@@ -29,7 +29,6 @@ from safe_wrappers.wrappers.layer import (
     CommandReceiver,
     Env,
     LayerWrapper,
-    Reset,
     Step,
     WrapperRng,
     receiver_inside,
@@ -59,17 +58,16 @@ class Chunk(NamedTuple):
 class ChunkHandover(LayerWrapper, CommandReceiver):
     """Executes action chunks that come late, over seams that keep a rate limit.
 
-    The action space becomes the chunk, shape (H, m). One `step(chunk)` is `execution_horizon` control steps (fewer
-    where the episode ends); rewards are summed up. A chunk's entry j is meant for the j-th control step after its
-    observation; with an `inference_delay` of d it takes over at its entry d, over a blend. Without a left-over of
-    the chunk before the fallback acts. With `chunk_size=1, execution_horizon=1` it takes actions (m,), too.
+    The action space becomes the chunk, shape (H, m). One `step(chunk)` is `execution_horizon` control steps, whose
+    rewards are summed up. A chunk's entry j is meant for the j-th control step after its observation; with an
+    `inference_delay` of d it takes over at its entry d, over a blend. Without a left-over the fallback acts. With
+    `chunk_size=1, execution_horizon=1` it takes actions (m,), too.
 
-    **What it guarantees.** With `rate_limit`, the commands that it sends in neighbouring control steps of an episode
-    differ by at most `rate_limit` times the control interval in every component, whatever the chunks; commands that
-    are held back for it are counted (`handover/limited`). A chunk with an entry that is not finite is refused as a
-    whole. Entries outside the action box are clipped to it. **What it does not.** A filter
-    inside may have to break the limit. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter`
-    belong inside.
+    **What it guarantees.** With `rate_limit`, neighbouring commands of an episode differ by at most `rate_limit`
+    times the control interval in every component, whatever the chunks (`handover/limited` counts those held back). A
+    chunk with an entry that is not finite is refused as a whole; entries outside the action box are clipped. **What
+    it does not.** A filter inside may have to break the limit. It does not check that a chunk is safe: `LeaseExpiry`
+    and `CBFActionFilter` belong inside.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -86,13 +84,11 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         limits: Of the machine, which every "quintic" keeps between its ends, too: it is stretched until it does, or
             its chunk is refused.
 
-    Info, at every step (see `safe_wrappers.info`): ``handover/peak_jerk``, ``handover/starved``,
-    ``handover/limited``, ``handover/refused``, ``action/clipped``. The inner layers' info is merged
-    over the control steps.
+    Info, at every step: ``handover/peak_jerk``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
+    ``action/clipped``; that of the layers inside is merged over the control steps (`safe_wrappers.info`).
 
     Raises:
-        ConfigurationError: Sizes that do not fit together, a time or limit that is not positive, nothing to blend
-            over.
+        ConfigurationError: Sizes that do not fit together, a time or limit that is not positive, nothing to blend.
         ActionError: A chunk of the wrong shape; the env was not stepped.
 
     Example:
@@ -105,8 +101,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     """
 
     layer: ClassVar = Layer.HANDOVER
-
-    _executed: list[Array]
 
     def __init__(
         self,
@@ -134,13 +128,13 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         plain: dict[str, Any] = {"blend_time": blend_time, "rate_limit": rate_limit, "control_dt": control_dt}
         plain = {name: plain_numbers(value) for name, value in plain.items()}
         delays = delay[0] if delay[0] == delay[1] else list(delay)
-        counts = {
+        plain |= {
             "chunk_size": H,
             "execution_horizon": s,
             "inference_delay": delays,
             "steps_per_entry": apart,
         }
-        self._record(arguments, plant=plant, limits=plain_data(limits), **counts, **plain)
+        self._record(arguments, plant=plant, limits=plain_data(limits), **plain)
         self.chunk_size, self.execution_horizon, self.blend = H, s, blend
         self.control_dt = check_timing(env, plain["control_dt"])
         self._delay, self._apart, self._controls = delay, apart, space.shape[0]
@@ -155,48 +149,41 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rates, self._check)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
-        self._start()
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env and forget all chunks; the delays' random numbers start anew with a seed."""
-        self.started = False
-        observation, info = self.env.reset(seed=seed, options=options)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._random.reset(self.env, seed)
         self._fallback.reset()
         self._queue.reset()
-        self._start()
-        info.update(self._measured([], False, 0.0))
-        self.started = True
-        return observation, info
+        self._executed: list[Array] = []
+        self._observed_s, self._clipped, self._refused = 0.0, 0.0, False
+        self._starved = self._limited = 0
+        info.update(self._measured())
+        return observation
 
     def step(self, action: Any) -> Step:
         """Execute the next `execution_horizon` control steps, with this chunk from when it is there."""
         self._refuse_without_reset()
         chunk = self._checked(action)
-        clipped = self._clipped(chunk)
-        refused = not self._submit(chunk)
-        total: Any = 0.0
-        infos, commands = [], []
-        terminated = truncated = False
-        for _ in range(self.execution_horizon):
-            command = self._queue.next(self._admits, self._fallback.command)
-            refused |= command.refused
-            if self._inside is not None:
-                observed_s = None if command.observed < 0 else command.observed * self.control_dt
-                self._inside.set_observation_time(observed_s)
-            observation, reward, terminated, truncated, info = self.env.step(command.control)
-            executed = np.array(info.get(keys.EXECUTED_ACTION, command.control), dtype=np.float64)
-            self._fallback.executed(executed)
-            self._executed.append(executed)
-            total += float(reward)
-            infos.append(dict(info))  # the env may use the same one again
-            commands.append(command)
-            if terminated or truncated:
-                break
+        self._clipped = self._beyond(chunk)
+        self._refused = not self._submit(chunk)
+        answer = self._make_steps(self.execution_horizon, self._control_step)
         self._observed_s = self.now_s
-        info = keys.merged(infos)
-        info.update(self._measured(commands, refused, clipped))
-        return observation, total, terminated, truncated, info
+        answer[4].update(self._measured())
+        return answer
+
+    def _control_step(self) -> Step:
+        command = self._queue.next(self._admits, self._fallback.command)
+        self._refused |= command.refused
+        self._starved += command.starved
+        self._limited += command.limited
+        if self._inside is not None:
+            observed_s = None if command.observed < 0 else command.observed * self.control_dt
+            self._inside.set_observation_time(observed_s)
+        answer = self.env.step(command.control)
+        executed = np.array(answer[4].get(keys.EXECUTED_ACTION, command.control), dtype=np.float64)
+        self._fallback.executed(executed)
+        self._executed.append(executed)
+        return answer
 
     @property
     def now_s(self) -> float:
@@ -260,11 +247,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         observed = math.floor(self._observed_s / self.control_dt + SAME_STEP)
         return self._queue.submit(upsampled(chunk, self._apart), observed, self._queue.now + delay)
 
-    def _start(self) -> None:
-        self._observed_s = 0.0
-        self._executed = []
-
-    def _clipped(self, chunk: Array) -> float:
+    def _beyond(self, chunk: Array) -> float:
         """By how much the entry left the action space that left it farthest; the first chunk is warned of."""
         space: Any = self.action_space
         finite = np.where(np.isfinite(chunk), chunk, 0.0)
@@ -275,36 +258,30 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             self._warn_once("clipped", f"{message}; its entries are clipped to it")
         return clipped
 
-    def _measured(self, commands: list[Command], refused: bool, clipped: float) -> dict[str, Any]:
+    def _measured(self) -> dict[str, Any]:
+        """The info of the control steps since the last call."""
         executed = np.array(self._executed).reshape(-1, self._controls)
         peak = float(np.abs(np.diff(executed, axis=0)).max(initial=0.0)) / self.control_dt
-        self._executed = self._executed[-1:]
-        limited = sum(c.limited for c in commands)
-        if limited:
+        if self._limited:
             message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
             self._warn_once("limited", message)
-        return {
+        report = {
             keys.HANDOVER_PEAK_JERK: peak,
-            keys.HANDOVER_STARVED: sum(c.starved for c in commands),
-            keys.HANDOVER_LIMITED: limited,
-            keys.HANDOVER_REFUSED: refused,
-            keys.ACTION_CLIPPED: clipped,
+            keys.HANDOVER_STARVED: self._starved,
+            keys.HANDOVER_LIMITED: self._limited,
+            keys.HANDOVER_REFUSED: self._refused,
+            keys.ACTION_CLIPPED: self._clipped,
         }
+        self._executed, self._starved, self._limited = self._executed[-1:], 0, 0
+        return report
 
 
 class ChunkQueue:
     """Which command comes next, counted in control steps.
 
     A chunk that was observed at step k and is there at step t is consumed from its entry t - k on. A chunk of one has
-    no left-over to blend with: only a change to and from the fallback is faded over.
-
-    Args:
-        space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
-        control_dt: Control interval, s.
-        blend: A blend of `control/handover/seams.py`.
-        fewest: A blend takes at least so many control steps.
-        rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
-        check: Of the machine's limits; None accepts all blends.
+    no left-over to blend with: only a change to and from the fallback is faded over. `fewest` is of a blend's control
+    steps; `rate_limit` of every component, shape (m,), action units per second, infinite for none.
     """
 
     def __init__(
@@ -321,20 +298,18 @@ class ChunkQueue:
         step = np.asarray(rate_limit * control_dt)
         # The difference of two commands, divided by the interval again, must not come out above the limit.
         self._step = np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)
-        dtype: Any = space.dtype
-        self._dtype = np.dtype(dtype)
-        largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
+        self._dtype: Any = np.dtype(space.dtype)
+        largest = min(float(np.finfo(self._dtype).max), float(np.finfo(np.float32).max))
         self._low = np.maximum(np.asarray(space.low, np.float64), -largest)
         self._high = np.minimum(np.asarray(space.high, np.float64), largest)
-        self._none = np.zeros((0, self._low.size))
         self.reset()
 
     def reset(self) -> None:
         """A new episode: nothing sent, nothing planned."""
         self.now = 0
         self._observed = -1
-        self._sent = self._none
-        self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
+        self._sent = self._plan = np.zeros((0, self._low.size))
+        self._limited = np.zeros(0, dtype=bool)
         self._coming: list[Chunk] = []
         self._starved: bool | None = None
         self._fade: tuple[Array, int, int] | None = None  # the latched command, steps, done
@@ -355,10 +330,8 @@ class ChunkQueue:
     def next(self, admits: Callable[[Array], bool], fallback: Callable[[], Array]) -> Command:
         """The command of this control step.
 
-        Args:
-            admits: Whether a chunk that has arrived may take over, by its commands from this control step on, shape
-                (h, m).
-            fallback: Called when nothing is planned; returns a finite control of shape (m,).
+        `admits` says whether a chunk may take over, by its commands from now on (h, m); `fallback` is called when
+        nothing is planned.
         """
         refused = seam = False
         for chunk in reversed([c for c in self._coming if c.due <= self.now]):
@@ -455,12 +428,9 @@ def _sizes(
     chunk_size: Any, execution_horizon: Any, inference_delay: Any, steps_per_entry: Any
 ) -> tuple[int, int, tuple[int, int], int]:
     """The counts as the user gave them, the delay as least and most, or an error that says what would fit."""
-    given = {
-        "chunk_size": chunk_size,
-        "execution_horizon": execution_horizon,
-        "steps_per_entry": steps_per_entry,
-    }
-    entries, horizon, apart = (whole_number(name, count, 1, "control steps") for name, count in given.items())
+    given = {"chunk_size": chunk_size, "execution_horizon": execution_horizon}
+    entries, horizon = (whole_number(name, count, 1, "control steps") for name, count in given.items())
+    apart = whole_number("steps_per_entry", steps_per_entry, 1, "control steps")
     if entries == 1 and apart > 1:
         raise ConfigurationError(f"steps_per_entry = {apart}: one entry leads to no other")
     both = inference_delay if isinstance(inference_delay, list | tuple) else [inference_delay] * 2

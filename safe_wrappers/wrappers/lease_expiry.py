@@ -21,7 +21,7 @@ from safe_wrappers.plants.mujoco.model import control_range
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.layer import Env, Reset, Step, action_array, whole_steps
+from safe_wrappers.wrappers.layer import Env, Step, action_array, whole_steps
 from safe_wrappers.wrappers.stopping import (
     BoundBudget,
     CommandGate,
@@ -60,8 +60,8 @@ class LeaseExpiry(CommandGate):
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
 
-    Info, at every step: ``lease/remaining_s`` (float), ``lease/refused``, ``lease/braking``
-    (bool); without a filter inside ``executed_action`` and ``action/clipped`` (float).
+    Info, at every step: ``lease/remaining_s`` (float), ``lease/refused``, ``lease/braking`` (bool); without a filter
+    inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
         ConfigurationError: A missing or negative bound or time, a clearance that is neither, or a wrong order.
@@ -124,26 +124,17 @@ class LeaseExpiry(CommandGate):
         self._budget = BoundBudget(budget, env, plant)
         self._fallback = FallbackController(env, fallback, plant, self._budget.bound)
         self._admission = None if motion_limits is None else Admission(env, motion_limits, self._low.size)
-        self._start({})
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; no command is in force."""
-        self.started = False
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._start(info)
-        self._budget.observe()
-        info[keys.LEASE_REMAINING_S] = 0.0
-        info[keys.LEASE_REFUSED] = info[keys.LEASE_BRAKING] = False
-        self.started = True
-        return observation, info
-
-    def _start(self, info: dict[str, Any]) -> None:
-        super()._start(info)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._until_s = self._newest_s = -math.inf
         self._command = self._rest()
         self._executed: Array | None = None
         self._braking = self._chunk_refused = False
         self._blend: tuple[Array, int] | None = None  # from what, and how many of its steps are done
+        self._budget.observe()
+        info[keys.LEASE_REMAINING_S] = 0.0
+        info[keys.LEASE_REFUSED] = info[keys.LEASE_BRAKING] = False
+        return super()._begin(observation, info, seed)
 
     def step(self, action: Any) -> Step:
         """Execute the action under its lease, the command in force under its own, or the fallback."""

@@ -21,14 +21,14 @@ from safe_wrappers.control.estimation.dead_reckoning import (
 )
 from safe_wrappers.control.estimation.observability import unobservable_directions
 from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.mujoco.model import named
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, mujoco_env
 
 __all__ = ["Imu", "Sensor", "Track"]
 
@@ -226,9 +226,9 @@ class Track:
     Args:
         bodies: Name of a body, or a pattern ("car*", "car[012]") for every body that fits, in the model's order.
         published: Instead of bodies: name of an attribute of the env, positions of shape (k, 2) or (k, 3), m.
-        acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds
-            q t^3 / 3 to the variance of a position. A number, or one per coordinate (0 along a coordinate that does
-            not wander). It has no default.
+        acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds q t^3
+            / 3 to the variance of a position. A number, or one per coordinate (0 along a coordinate that does not
+            wander). It has no default.
         reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
         mean_velocity: m/s, one per coordinate; None: zeros.
         start_position_std: m, a number or one per coordinate.
@@ -360,9 +360,7 @@ class OcclusionPenalty(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
-        raw: Any = env.unwrapped
-        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
-            raise UnsupportedEnvError(f"OcclusionPenalty needs MuJoCo's .model and .data; {raw} has none")
+        raw = mujoco_env(env, "OcclusionPenalty")
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
         self.tracks = [settings_from(Track, track, "a track") for track in tracks]
@@ -450,9 +448,8 @@ class OcclusionPenalty(LayerWrapper):
                 positions[which, : points.shape[1]] = points
         return positions, velocities
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env, start every track from its initial fix, and look once."""
-        observation, info = self.env.reset(seed=seed, options=options)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        """Start every track from its initial fix, and look once."""
         self._random.reset(self.env, seed)
         if self._sight.model is not self._raw.model:
             names = self._look_at(self._raw.model)
@@ -466,7 +463,7 @@ class OcclusionPenalty(LayerWrapper):
         self._start()
         info.update(self._look())
         info[keys.OCCLUSION_PENALTY] = 0.0
-        return self._observed(observation), info
+        return self._observed(observation)
 
     def step(self, action: Any) -> Step:
         """Step the env with the action as it is, and look."""

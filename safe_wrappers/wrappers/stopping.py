@@ -269,14 +269,14 @@ class CommandGate(LayerWrapper, CommandReceiver):
         self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))
         self._filtered = filter_inside(env) is not None  # then the filter reports what was executed
 
-    def _start(self, info: dict[str, Any]) -> None:
-        """Begin an episode, in which nothing has been executed yet."""
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._steps_done, self._observed_s, self._clipped = 0, 0.0, 0.0
         if self._fallback is not None:
             self._fallback.reset()
         if not self._filtered:
             info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
             info[keys.ACTION_CLIPPED] = 0.0
+        return observation
 
     def _boxed(self, control: Any) -> Array:
         """Clipped to the action box, shape (m,)."""

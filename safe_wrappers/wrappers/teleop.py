@@ -19,7 +19,7 @@ from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.faults import OnOffProcess, probability
-from safe_wrappers.wrappers.layer import SAME_STEP, Env, Reset, Step, WrapperRng, action_array
+from safe_wrappers.wrappers.layer import SAME_STEP, Env, Step, WrapperRng, action_array
 from safe_wrappers.wrappers.stopping import (
     BoundBudget,
     CommandGate,
@@ -293,21 +293,17 @@ class TeleopChannel(CommandGate):
             self._fallback = FallbackController(env, fallback, plant)
             self._watch = RoundTripWatch(limit, env, plant, self.control_dt, self._same_s)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; nothing is on its way, and the links' random numbers start anew with a seed."""
-        self.started = False
-        observation, info = self.env.reset(seed=seed, options=options)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._up.reset(self.env, seed)
         self._down.reset(self.env, seed, copy.deepcopy(observation))
-        self._start(info)
+        observation = super()._begin(observation, info, seed)
         if self._watch is not None:
             self._watch.reset()
         self._coding.reset(observation)
         self._lost = 0
         self._images = [0.0]  # when the image was taken that was shown after each step
         self._report(info, 0.0)
-        self.started = True
-        return observation, info
+        return observation
 
     def step(self, action: Any) -> Step:
         """Send the action, step the env with what has arrived, and return what has come back."""

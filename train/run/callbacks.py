@@ -10,7 +10,7 @@ from typing import Final
 from stable_baselines3.common.callbacks import BaseCallback
 
 from safe_wrappers import info as keys
-from safe_wrappers.wrappers.record_interventions import COLUMNS
+from safe_wrappers.wrappers.recording import COLUMNS
 
 from ..files import append_row, read_rows, write_rows
 from ..processes import Progress, RunStoppedError

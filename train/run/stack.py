@@ -21,8 +21,8 @@ from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.cost_function import refuse_own_cost
 from safe_wrappers.wrappers.faults import FAULTS
+from safe_wrappers.wrappers.recording import refuse_own_cost
 
 from ..config import NAIVE, ArmConfig, EnvConfig, FilterConfig, LearnerConfig, check_env_id
 from ..config.types import check_name
