@@ -11,7 +11,7 @@ to brake for the wall; its commands are lost in outages (`safe_wrappers.wrappers
 without the lease.
 
 Worst cases. The policy dies right after a lease was granted, with every reading too long by the whole bound, every
-delay used up and brakes not a bit better than declared: once under the lease of `control/watchdog/leases.py`, once
+delay used up and brakes not a bit better than declared: once under the lease of `control/watchdog.py`, once
 under one that is 5 % longer. Clearances are drawn so that a lease is a whole number of control steps, at least 20.
 """
 
@@ -30,7 +30,7 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks.tables import keep, markdown, measured, options, total
 from safe_wrappers.checks import Array
-from safe_wrappers.control.watchdog.leases import longest_lease
+from safe_wrappers.control.watchdog import longest_lease
 from safe_wrappers.wrappers.faults import Outages
 
 PHYSICS_S, SUBSTEPS = 0.002, 10

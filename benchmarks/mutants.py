@@ -60,7 +60,7 @@ _MATTER = {
     "filter/search.py": "SafeActionSearch.decide not; SafeActionSearch._decide not;"
     " SafeActionSearch._nearby not; SafeActionSearch._search not; SafeActionSearch.relinearize not",
     "filter/linearize.py": "Tangents._corrected not",
-    "control/numerics/projection.py": "_judge comparison; project_unchecked not",
+    "control/projection.py": "_judge comparison; project_unchecked not",
     "constraints/rollout.py": "BoundRollout._back_inside min/max; BoundRollout.rows not;"
     " BoundSlacks.slack min/max",
     "constraints/backup/base.py": "BoundDetourClearance.executed arithmetic; BoundDetourClearance._kept_side not",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.plants.simulator.copies import EnvCopier
+from safe_wrappers.plants.copies import EnvCopier
 
 Score = Callable[[Array], float]
 Search = Callable[[Score, Array, np.random.Generator], Array]

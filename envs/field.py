@@ -18,9 +18,6 @@ from safe_wrappers.info import GOALS_REACHED
 
 from .layout import Given
 
-GOAL_MET: Final = "goal_met"
-"""bool: this step reached the goal (a new one stands already)."""
-
 ASSETS: Final = Path(__file__).parent / "assets"
 """Where the models are."""
 METADATA: Final[dict[str, Any]] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}
@@ -104,7 +101,7 @@ class FieldEnv(TaskEnv):
     """Base of tasks in which a robot, whose first two coordinates are its x and y in m, drives to goals.
 
     **Reward**: distance to the goal gained in a control step (m), plus 1 on coming within `goal_radius` of it; then a
-    new goal is sampled and the episode goes on.
+    new goal is sampled and the episode goes on; ``info["goal_met"]`` says that this step reached one.
     """
 
     metadata: dict[str, Any] = {**METADATA, "render_fps": 50}  # noqa: RUF012 (Gymnasium's)
@@ -133,7 +130,6 @@ class FieldEnv(TaskEnv):
     def step(  # type: ignore[override]
         self, action: NDArray[np.floating[Any]]
     ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """As `TaskEnv.step`."""
         self._before = self._goal_distance()
         return super().step(action)
 
@@ -148,7 +144,7 @@ class FieldEnv(TaskEnv):
         return reward
 
     def _get_reset_info(self) -> dict[str, Any]:
-        return {GOAL_MET: self._goal_met, GOALS_REACHED: self._goals_reached}
+        return {"goal_met": self._goal_met, GOALS_REACHED: self._goals_reached}
 
     def _begin(self, goal: Array, *objects: Array) -> None:
         """A new episode: no goal reached, and what the lidars see stands at these centres, shapes (n, 2), m."""

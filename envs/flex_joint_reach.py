@@ -1,7 +1,6 @@
 """Reaching with elastic joints: torque steps ring, so a policy's seams show as vibration."""
 
 import math
-from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
@@ -12,17 +11,6 @@ from safe_wrappers.checks import Array
 from safe_wrappers.info import COST, COST_SUBSTEP, IS_SUCCESS
 
 from .field import METADATA, TaskEnv
-
-VIBRATION_ENERGY: Final = "vibration_energy"
-"""float64, J: the largest boundary-layer energy at the ends of this control step's physics substeps."""
-DEFLECTION: Final = "deflection"
-"""float64, rad: the largest angle between a motor and its link at the ends of this control step's substeps."""
-TRACKING_ERROR: Final = "tracking_error"
-"""float64, m: from the fingertip to the target that this step was to reach, at the step's end."""
-REWARD_DIST: Final = "reward_dist"
-"""float64: the reward's share for the distance."""
-REWARD_CTRL: Final = "reward_ctrl"
-"""float64: the reward's share for the torque."""
 
 SUCCESS_RADIUS: Final = 0.03
 """m."""
@@ -44,7 +32,6 @@ SPRINGS: Final = slice(1, None, 2)
 """The springs' coordinates."""
 
 
-@dataclass(frozen=True, eq=False)
 class FlexibleArm:
     """The constants of the planar two-link arm and its joints; the link angles are q0 and, relative to it, q1.
 
@@ -61,20 +48,8 @@ class FlexibleArm:
         joint_damping: Across the springs, shape (2,), N m s/rad.
     """
 
-    inertia: float
-    coupling: float
-    forearm: float
-    lengths: Array
-    rotor_inertia: Array
-    stiffness: Array
-    motor_damping: Array
-    joint_damping: Array
-
-    @classmethod
-    def of_model(cls, model: mujoco.MjModel) -> "FlexibleArm":
-        """Read them from the model: the links' inertia from its mass matrix in two poses."""
-        data = mujoco.MjData(model)
-        found = []
+    def __init__(self, model: mujoco.MjModel) -> None:
+        data, found = mujoco.MjData(model), []
         for angle in (0.0, math.pi / 2.0):
             data.qpos[:] = 0.0, 0.0, angle, 0.0
             mujoco.mj_forward(model, data)
@@ -83,16 +58,14 @@ class FlexibleArm:
                 mujoco.mj_mulM(model, data, column, unit)
             found.append(columns[SPRINGS, SPRINGS])  # no rotor's inertia acts on the springs' coordinates
         straight, bent = found
-        return cls(
-            inertia=float(bent[0, 0]),
-            coupling=float(straight[0, 1] - bent[0, 1]),
-            forearm=float(bent[1, 1]),
-            lengths=np.array([model.body("forearm").pos[0], model.site("fingertip").pos[0]]),
-            rotor_inertia=model.dof_armature[MOTORS].copy(),
-            stiffness=model.jnt_stiffness[SPRINGS].copy(),
-            motor_damping=model.dof_damping[MOTORS].copy(),
-            joint_damping=model.dof_damping[SPRINGS].copy(),
-        )
+        self.inertia = float(bent[0, 0])
+        self.coupling = float(straight[0, 1] - bent[0, 1])
+        self.forearm = float(bent[1, 1])
+        self.lengths = np.array([model.body("forearm").pos[0], model.site("fingertip").pos[0]])
+        self.rotor_inertia = model.dof_armature[MOTORS].copy()
+        self.stiffness = model.jnt_stiffness[SPRINGS].copy()
+        self.motor_damping = model.dof_damping[MOTORS].copy()
+        self.joint_damping = model.dof_damping[SPRINGS].copy()
 
     def fingertip(self, q: Array) -> Array:
         """Position of the fingertip at link angles, shape (..., 2), in the plane; shape (..., 2), m."""
@@ -155,10 +128,11 @@ class FlexJointReachEnv(TaskEnv):
     between 0.2 and 0.55 m from the base. An episode never terminates; `gymnasium.make` truncates it after
     200 steps.
 
-    **Info**, at every step and at reset: ``vibration_energy`` (J; see `FlexibleArm.vibration_energy`),
-    ``deflection`` (rad), ``tracking_error`` (m), ``is_success``, ``reward_dist``, ``reward_ctrl``, and ``cost``
-    with its equal ``cost_substep``: 1.0 if a spring carried more than `TORQUE_RATING` at the end of any physics
-    substep of the step, else 0.0. At reset they judge the start state.
+    **Info**, at every step and at reset: ``vibration_energy`` (J; see `FlexibleArm.vibration_energy`) and
+    ``deflection`` (rad, between a motor and its link), the largest at the ends of the step's physics substeps;
+    ``tracking_error`` (m, from the fingertip to the target at the step's end), ``is_success``, the reward's shares
+    ``reward_dist`` and ``reward_ctrl``, and ``cost`` with its equal ``cost_substep``: 1.0 if a spring carried more
+    than `TORQUE_RATING` at the end of any substep, else 0.0. At reset they judge the start state.
 
     Args:
         kwargs: Passed to `gymnasium.envs.mujoco.MujocoEnv`.
@@ -177,7 +151,7 @@ class FlexJointReachEnv(TaskEnv):
     def __init__(self, **kwargs: Any) -> None:
         EzPickle.__init__(self, **kwargs)
         super().__init__("flex_joint_reach.xml", _FRAME_SKIP, 14, _CAMERA, **kwargs)
-        self.arm = FlexibleArm.of_model(self.model)
+        self.arm = FlexibleArm(self.model)
         self._rating = np.array(TORQUE_RATING)
         self._full_torque = self.model.actuator_ctrlrange[:, 1].copy()
         self._target = np.array(self.data.mocap_pos[0, :2])
@@ -200,7 +174,6 @@ class FlexJointReachEnv(TaskEnv):
         self.data.mocap_pos[0, :2] = self._target
 
     def reset_model(self) -> Array:
-        """Draw a start and a target, return the observation."""
         inner, outer = _TARGET_RADII
         radius = math.sqrt(self.np_random.uniform(inner**2, outer**2))
         angle = self.np_random.uniform(-math.pi, math.pi)
@@ -222,7 +195,6 @@ class FlexJointReachEnv(TaskEnv):
         return self._reward_dist + self._reward_ctrl
 
     def observe(self) -> Array:
-        """Observation of the state as it is now: also right after `set_state` or `place_target`."""
         qpos, qvel = self.data.qpos, self.data.qvel
         motors = qpos[MOTORS]
         angles = [np.cos(motors), np.sin(motors), qvel[MOTORS], -qpos[SPRINGS], -qvel[SPRINGS]]
@@ -231,12 +203,12 @@ class FlexJointReachEnv(TaskEnv):
     def _get_reset_info(self) -> dict[str, Any]:
         cost = float(self._overloaded)
         return {
-            VIBRATION_ENERGY: self._energy,
-            DEFLECTION: self._deflection,
-            TRACKING_ERROR: self._distance,
+            "vibration_energy": self._energy,
+            "deflection": self._deflection,
+            "tracking_error": self._distance,
             IS_SUCCESS: self._distance <= SUCCESS_RADIUS,
-            REWARD_DIST: self._reward_dist,
-            REWARD_CTRL: self._reward_ctrl,
+            "reward_dist": self._reward_dist,
+            "reward_ctrl": self._reward_ctrl,
             COST: cost,
             COST_SUBSTEP: cost,
         }

@@ -18,11 +18,6 @@ from .field import ASSETS, FieldEnv
 from .goal_robots import CAR, LIDAR_BINS, POINT, Robot, pseudo_lidar
 from .layout import PLACE, POSE, Given, parse_layout, place_goal_beside, place_objects, places
 
-COST_HAZARDS: Final = "cost_hazards"
-"""float: 1 if the robot's centre is inside a hazard's disc at the end of the step, else 0."""
-COST_VASES: Final = "cost_vases"
-"""float: 1 if a vase is touched or moves at the end of the step, else 0 (always 0 below level 2)."""
-
 GOAL_RADIUS: Final = 0.3
 """Distance from the goal's centre at which it counts as reached, m."""
 HAZARD_RADIUS: Final = 0.2
@@ -82,8 +77,9 @@ class SafeGoalEnv(FieldEnv):
     **Reward**: distance to the goal gained in this step (m), plus 1 on coming within 0.3 m of it, clipped
     at 10. Then a new goal is sampled and the episode goes on: `terminated` is never true.
 
-    **Info**, at every step and at reset: ``cost`` (1.0 if `cost_hazards` or `cost_vases`), ``cost_hazards``,
-    ``cost_vases``, ``cost_substep``, ``goal_met``, ``goals_reached``. `cost` is judged at the end of the
+    **Info**, at every step and at reset: ``cost`` (1.0 if `cost_hazards` or `cost_vases`), ``cost_hazards`` (1.0 if
+    the robot's centre is inside a hazard's disc), ``cost_vases`` (1.0 if a vase is touched or moves, at level 2),
+    ``cost_substep``, ``goal_met``, ``goals_reached``. `cost` is judged at the end of the
     control step, as Safety-Gymnasium publishes it; `cost_substep` after every physics substep, so it also
     sees a hazard's edge cut between two control steps (``cost <= cost_substep``). At reset they judge the
     start state.
@@ -107,7 +103,6 @@ class SafeGoalEnv(FieldEnv):
 
     hazard_radius: Final = HAZARD_RADIUS
     goal_radius = GOAL_RADIUS
-    vase_half_size: Final = VASE_HALF_SIZE
 
     def __init__(self, robot: Robot, level: int, **kwargs: Any) -> None:
         if level not in range(len(LEVELS)):
@@ -159,7 +154,6 @@ class SafeGoalEnv(FieldEnv):
         return parse_layout(options, {"agent": POSE, "goal": PLACE, "hazards": hazards, "vases": vases})
 
     def reset_model(self) -> Array:
-        """Sample what the options left open, place everything, return the observation."""
         level = self.level
         counts = {"hazards": level.hazards, "vases": level.vases}
         self._apply(**place_objects(self.np_random, level.half_extent, KEEPOUTS, counts, self._given))
@@ -185,8 +179,8 @@ class SafeGoalEnv(FieldEnv):
         return {
             COST: float(self._in_hazard or self._vase_hit),
             COST_SUBSTEP: float(self._violated),
-            COST_HAZARDS: float(self._in_hazard),
-            COST_VASES: float(self._vase_hit),
+            "cost_hazards": float(self._in_hazard),
+            "cost_vases": float(self._vase_hit),
             **super()._get_reset_info(),
         }
 
@@ -267,12 +261,10 @@ class SafeGoalEnv(FieldEnv):
         self.set_state(qpos, np.zeros(self.model.nv))
 
     def place_goal(self, goal: Array) -> None:
-        """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
         super().place_goal(goal)
         self.data.mocap_pos[0, 2] = _GOAL_Z
 
     def observe(self) -> Array:
-        """Observation of the state as it is now: also right after `set_state`."""
         targets = self._targets
         targets[len(targets) - self._n_vases :] = self.vase_positions
         relative = self.robot.relative(targets, self.data.qpos)

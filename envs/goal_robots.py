@@ -87,7 +87,6 @@ class WheeledCar(Hull):
     """
 
     def place(self, qpos: Array, pose: Array) -> None:
-        """Stand upright on the floor with the driving direction along the pose's heading."""
         x, y, heading = pose.tolist()
         half = (heading + _QUARTER_TURN) / 2.0
         qpos[:7] = x, y, _HEIGHT, math.cos(half), 0.0, 0.0, math.sin(half)
@@ -98,7 +97,6 @@ class WheeledCar(Hull):
         return math.atan2(-rotation[1, 1], -rotation[0, 1])
 
     def sensors(self, data: mujoco.MjData) -> Array:
-        """The sensors, and the caster's quaternion as a rotation matrix."""
         readings = data.sensordata
         return np.concatenate([readings[:_DIRECT], _rotation(readings[_DIRECT : _DIRECT + 4]).ravel()])
 

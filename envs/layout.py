@@ -29,16 +29,7 @@ def places(at_most: int) -> Form:
 
 
 def layout_option(options: Mapping[str, Any] | None, keys: Collection[str]) -> Given:
-    """The layout among `reset`'s options, its keys checked, as given; empty when there is none.
-
-    Args:
-        options: `reset`'s options; never changed. Those other than ``"layout"`` belong to wrappers.
-        keys: What a layout may have.
-
-    Raises:
-        UnknownNameError: An unknown key in the layout, or an option that looks like a misspelt ``"layout"``.
-        ConfigurationError: The layout is no mapping.
-    """
+    """The layout among `reset`'s options, its keys checked, as given; empty when there is none."""
     options = options or {}
     for key in options:
         if key != "layout" and difflib.get_close_matches(str(key), ["layout"], cutoff=0.7):
@@ -71,11 +62,7 @@ def parse_layout(options: Mapping[str, Any] | None, forms: Mapping[str, Form]) -
 
 
 def numbers(value: Any, key: str, form: Form) -> Array:
-    """Finite numbers of a form.
-
-    Raises:
-        ConfigurationError: Anything else.
-    """
+    """Finite numbers of a form."""
     words, shape = form
     try:
         array = np.array(value, dtype=np.float64)
@@ -101,15 +88,9 @@ def place_goal_beside(
     keepouts: Mapping[str, float],
     standing: Mapping[str, Array],
 ) -> Array:
-    """Place the next goal, shape (2,), m.
+    """Place the next goal, shape (2,), m, in the field [-half_extent, half_extent]^2, m, beside centres by name.
 
     A crowded scenario must not end an episode with an error: where no try is clear, the clearest is taken.
-
-    Args:
-        rng: Source of randomness.
-        half_extent: The field is [-half_extent, half_extent]^2, m.
-        keepouts: By name, the "goal"'s among them, m.
-        standing: Centres of everything else, by name, shapes (n, 2), m.
     """
     return _clearest(rng, half_extent, keepouts["goal"], *_circles(keepouts, standing))[0]
 
@@ -123,15 +104,9 @@ def place_objects(
 ) -> dict[str, Array]:
     """Place the objects that do not stand yet, kind by kind, and turn the robot anywhere.
 
-    An object with keepout k is drawn uniformly from the field shrunk by k, until it is at least k + k' away
-    from every object placed before.
-
-    Args:
-        rng: Source of randomness.
-        half_extent: The field is [-half_extent, half_extent]^2, m.
-        keepouts: By name, m; in the order in which kinds are placed; "agent" and "goal" among them.
-        counts: How many of each kind; one where nothing is said.
-        given: What stands: counted as placed first, and kept.
+    An object with keepout k is drawn uniformly from the field [-half_extent, half_extent]^2 shrunk by k, until it is
+    at least k + k' away from every object placed before, m. `keepouts` are in the order in which kinds are placed,
+    `counts` one where nothing is said; what is `given` stands and is kept.
 
     Returns:
         Centres by name, shapes (n, 2), m; of the goal shape (2,), of the agent its pose, shape (3,), m and rad.

@@ -9,24 +9,37 @@ import numpy as np
 from gymnasium.utils import EzPickle
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.estimation.tracks import Motion, Tracks
+from safe_wrappers.control.estimation import Motion, Tracks
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
-from .crossing_layout import (
-    CARS,
-    CARS_PER_LANE,
-    CROSSING_GOAL_RADIUS,
-    LANE_CENTRES,
-    PILLAR_RADIUS,
-    PILLARS,
-    ROBOT_RADIUS,
-    parse_crossing_layout,
-    sample_crossing_goal,
-    sample_crossing_layout,
-)
 from .field import FieldEnv
-from .layout import Given
-from .traffic import CAR_ACCELERATION_NOISE, CAR_MEAN_SPEED, CAR_TIME_CONSTANT_S, Traffic
+from .layout import PLACE, POSE, Form, Given, parse_layout
+from .traffic import CAR_ACCELERATION_NOISE, CAR_MEAN_SPEED, CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
+
+FIELD: Final = (4.0, 3.5)
+"""The field is ``|x| <= 4``, ``|y| <= 3.5``, m: rails keep the robot in it."""
+LANE_CENTRES: Final = (-0.8, 0.8)
+"""Their y, m: the first lane leads towards +x, the second towards -x."""
+CARS_PER_LANE: Final = 3
+CARS: Final = 2 * CARS_PER_LANE
+PILLARS: Final = 4
+"""Two on the lower pavement, then two on the upper one."""
+ROBOT_RADIUS: Final = 0.2
+PILLAR_RADIUS: Final = 0.35
+GOAL_RADIUS: Final = 0.3
+"""Distance from the goal's centre at which it counts as reached, m."""
+
+_PAVEMENT: Final = 2.9  # m: |y| of starts and goals
+_AGENT_REACH: Final = 2.0  # m: |x|
+_GOAL_REACH: Final = 2.5
+_PILLAR_REACH: Final = 3.0
+_PILLAR_BAND: Final = (1.8, 2.0)  # m: |y|
+_PILLAR_SPACING: Final = 1.5  # m between the centres of two on one side: the robot fits through
+_CAR_START: Final = (-7.0, -2.0)  # m: the first of a lane, seen along it
+_CAR_GAPS: Final = (5.0, 8.0)  # m between the centres of one and the next
+_SPARE: Final = 0.05  # m between the robot and a pillar, at least
+_TRIES: Final = 1000
 
 CAR_BODIES: Final = tuple(f"car{i}" for i in range(CARS))
 """The cars' bodies and joints, in the order of every array of six: the first three drive towards +x."""
@@ -37,6 +50,12 @@ _FRAME_SKIP: Final = 4
 _CARS: Final = slice(3, 3 + CARS)  # coordinates: robot x, y, heading, then the cars' x
 _CONTACT_SQUARED: Final = (CAR_RADIUS + ROBOT_RADIUS) ** 2
 _CAMERA: Final = {"distance": 10.0, "elevation": -60.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
+_FORMS: Final[dict[str, Form]] = {
+    "agent": POSE,
+    "goal": PLACE,
+    "cars": (f"[[x, v], ...] of {CARS} cars", (CARS, 2)),
+    "pillars": (f"[[x, y], ...] of {PILLARS} pillars", (PILLARS, 2)),
+}
 
 
 class OccludedCrossingEnv(FieldEnv):
@@ -92,7 +111,7 @@ class OccludedCrossingEnv(FieldEnv):
     robot_radius: Final = ROBOT_RADIUS
     car_radius: Final = CAR_RADIUS
     pillar_radius: Final = PILLAR_RADIUS
-    goal_radius = CROSSING_GOAL_RADIUS
+    goal_radius = GOAL_RADIUS
     car_bodies: Final = CAR_BODIES
     lane_centres: Final = LANE_CENTRES
 
@@ -143,11 +162,13 @@ class OccludedCrossingEnv(FieldEnv):
         return self._tracks
 
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
-        return parse_crossing_layout(options)
+        parsed = parse_layout(options, _FORMS)
+        if "agent" in parsed:
+            _check_agent(parsed["agent"][:2], parsed.get("pillars", np.zeros((0, 2))))
+        return parsed
 
     def reset_model(self) -> Array:
-        """Sample what the options left open, place everything, return the observation."""
-        layout = sample_crossing_layout(self.np_random, self._given)
+        layout = _sample_layout(self.np_random, self._given)
         # A stream of the cars' own: a goal reached, and so the next one drawn, must not change their way.
         self._cars_random = np.random.default_rng(self.np_random.integers(2**63))
         self._apply(**layout)
@@ -162,13 +183,12 @@ class OccludedCrossingEnv(FieldEnv):
         self._judge(self.data.qpos[None, :2], self.data.qpos[None, _CARS])
 
     def _next_goal(self) -> Array:
-        return sample_crossing_goal(self.np_random, self.agent_position, self._pillars)
+        return _sample_goal(self.np_random, self.agent_position, self._pillars)
 
     def _is_finite(self, observation: Array) -> bool:
         return math.isfinite(float(self.data.qpos.sum() + self.data.qvel.sum()))
 
     def observe(self) -> Array:
-        """Observation of the state as it is now: also right after `set_state`."""
         x, y, heading = self.data.qpos[:3].tolist()
         vx, vy, yaw_rate = self.data.qvel[:3].tolist()
         goal_x, goal_y = self._targets[0].tolist()
@@ -222,3 +242,83 @@ class OccludedCrossingEnv(FieldEnv):
         qpos[:3] = agent
         qpos[_CARS], qvel[_CARS] = cars.T
         self.set_state(qpos, qvel)
+
+
+def _check_agent(place: Array, pillars: Array) -> None:
+    room = np.array(FIELD) - ROBOT_RADIUS
+    if (np.abs(place) > room).any():
+        raise ConfigurationError(
+            f"layout 'agent' must stand inside the rails, |x| <= {room[0]:g} and |y| <= {room[1]:g};"
+            f" got {place.tolist()}"
+        )
+    if _slack(place, pillars) < 0.0:
+        raise ConfigurationError(
+            f"layout 'agent' stands in a pillar: its centre must be {ROBOT_RADIUS + PILLAR_RADIUS:g} m or more"
+            f" from each pillar's; got {place.tolist()} and pillars {pillars.tolist()}"
+        )
+
+
+def _sample_layout(rng: np.random.Generator, given: Given) -> dict[str, Array]:
+    """Sample what is missing of a layout; given parts are kept as they are.
+
+    The robot starts on the lower pavement and faces the road; the goal lies on the other side. In each lane the first
+    car is 2 to 7 m before the field's middle and each next one 5 to 8 m behind; speeds are drawn from their
+    stationary distribution.
+    """
+    parts = dict(given)
+    if "agent" not in parts:
+        place = _sample_clear(rng, _AGENT_REACH, -_PAVEMENT, given.get("pillars", np.zeros((0, 2))))
+        parts["agent"] = np.append(place, 0.5 * np.pi)
+    if "pillars" not in parts:
+        parts["pillars"] = _sample_pillars(rng, parts["agent"], given.get("goal"))
+    if "goal" not in parts:
+        parts["goal"] = _sample_goal(rng, parts["agent"][:2], parts["pillars"])
+    if "cars" not in parts:
+        parts["cars"] = _sample_cars(rng)
+    return parts
+
+
+def _sample_goal(rng: np.random.Generator, agent: Array, pillars: Array) -> Array:
+    """Sample a goal, shape (2,), m, on the pavement across the road, where the robot fits between the pillars.
+
+    Four pillars leave at least 0.2 of the 5 m free, so there is a place wherever they stand.
+    """
+    side = _PAVEMENT if agent[1] <= 0.0 else -_PAVEMENT
+    return _sample_clear(rng, _GOAL_REACH, side, pillars)
+
+
+def _sample_clear(rng: np.random.Generator, reach: float, y: float, pillars: Array) -> Array:
+    for _ in range(_TRIES):
+        point = np.array([rng.uniform(-reach, reach), y])
+        if _slack(point, pillars) >= _SPARE:
+            return point
+    raise ConfigurationError(
+        f"no room for the robot at y = {y:g}, |x| <= {reach:g}: layout 'pillars' {pillars.tolist()} cover it;"
+        " give other pillars, or 'agent' too"
+    )
+
+
+def _sample_pillars(rng: np.random.Generator, agent: Array, goal: Array | None) -> Array:
+    """Pillars beside the robot, and beside the goal if that stands already."""
+    taken = agent[None, :2] if goal is None else np.stack([agent[:2], goal])
+    while True:  # robot and goal stand in the way of at most 2.4 m of the 12
+        x = rng.uniform(-_PILLAR_REACH, _PILLAR_REACH, PILLARS)
+        y = rng.uniform(*_PILLAR_BAND, PILLARS) * (-1.0, -1.0, 1.0, 1.0)
+        pillars = np.stack([x, y], axis=1)
+        apart = min(abs(x[0] - x[1]), abs(x[2] - x[3]))
+        if apart >= _PILLAR_SPACING and min(_slack(point, pillars) for point in taken) >= _SPARE:
+            return pillars
+
+
+def _sample_cars(rng: np.random.Generator) -> Array:
+    first = rng.uniform(*_CAR_START, (2, 1))
+    gaps = rng.uniform(*_CAR_GAPS, (2, CARS_PER_LANE - 1))
+    along = np.concatenate([first, first - np.cumsum(gaps, axis=1)], axis=1)
+    speeds = rng.normal(CAR_MEAN_SPEED, CAR_SPEED_STD, (2, CARS_PER_LANE))
+    directions = np.array([[1.0], [-1.0]])
+    return np.stack([(directions * along).ravel(), (directions * speeds).ravel()], axis=1)
+
+
+def _slack(point: Array, pillars: Array) -> float:
+    """Room between the robot at a point and the nearest pillar, m; negative inside."""
+    return float(np.hypot(*(pillars - point).T).min(initial=np.inf)) - ROBOT_RADIUS - PILLAR_RADIUS

@@ -10,7 +10,7 @@ from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.estimation.tracks import Motion, Tracks
+from safe_wrappers.control.estimation import Motion, Tracks
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
 from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
@@ -87,7 +87,7 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     them in orange, which the renderer adds (`MarkingRenderer`).
 
     **Attributes**: `patrol_positions` and `patrol_velocities`, shape (2, 2), m and m/s; `patrol_tracks` (a
-    `control.estimation.tracks.Tracks`): the same as tracks that are known exactly now. `agent_position`,
+    `control.estimation.Tracks`): the same as tracks that are known exactly now. `agent_position`,
     `agent_velocity`.
 
     **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if ball and patrol overlapped

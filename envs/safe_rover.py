@@ -10,23 +10,16 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
 from safe_wrappers.checks import Array
-from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP, SPIN_OUT
 
 from .field import FieldEnv
 from .goal_robots import LIDAR_BINS, pseudo_lidar
-from .ground import Ground, Patch, Tyres, rolled_over
-from .layout import Given, place_goal_beside
-from .rover_layout import HALF_EXTENT, KEEPOUTS, parse_rover_layout, sample_rover_layout
+from .ground import GROUNDS, Ground, Patch, Tyres, rolled_over
+from .layout import PLACE, POSE, Form, Given, layout_option, numbers, place_goal_beside, place_objects, places
 
 WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
 """The wheels' joints, bodies and geoms, in the order of every array of four."""
-SLIP: Final = "slip"
-"""float64, shape (4,): longitudinal slip of each wheel at the end of the step (`control.vehicle.slip.slip_ratio`)."""
-SLIP_MAX: Final = "slip_max"
-"""float64: largest size of any loaded wheel's longitudinal slip at the ends of this step's physics substeps."""
-YAW_RATE_ERROR: Final = "yaw_rate_error"
-"""float64, rad/s: how far the yaw rate was at most from the one that steering angle and speed ask for."""
 
 SPIN_OUT_SLIP: Final = 0.5
 """Longitudinal slip from which on a wheel has spun out, or locked."""
@@ -36,6 +29,25 @@ ROVER_HAZARD_RADIUS: Final = 0.3
 """Radius of a hazard's disc, m: the chassis's centre must stay outside."""
 WHEELBASE: Final = 0.5
 """Between the axles, m."""
+HALF_EXTENT: Final = 4.0
+"""The field is the square [-4, 4]^2, m: objects are sampled in it; the rover may leave it."""
+HAZARDS: Final = 6
+"""Hazards in a sampled layout, and the most in a given one."""
+SAMPLED_GROUNDS: Final = ("wet", "wet", "wet", "wet", "ice", "ice", "ice", "ice")
+"""Grounds of the patches in a sampled layout; as many are the most in a given one."""
+KEEPOUTS: Final = {"agent": 0.7, "goal": 0.5, "hazards": 0.4}
+"""m; patches have none."""
+
+_PATCH_RADII: Final = (0.6, 1.0)  # m, uniform
+_PATCH_KEYS: Final = ("ground", "center", "radius")
+_FORMS: Final[dict[str, Form]] = {
+    "agent": POSE,
+    "goal": PLACE,
+    "hazards": places(HAZARDS),
+    "speed": ("a number of m/s", ()),
+}
+LAYOUT_KEYS: Final = ("agent", "goal", "hazards", "patches", "ground", "speed")
+"""What the rover's ``reset(options={"layout": {...}})`` understands."""
 
 _FRAME_SKIP: Final = 5
 _LIDAR_RANGE: Final = 12.0  # m: across the field
@@ -72,8 +84,9 @@ class SafeRoverEnv(FieldEnv):
     is sampled and the episode goes on.
 
     **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if the chassis's centre was
-    inside a hazard's disc at the end of any physics substep), ``slip``, ``slip_max``, ``spin_out``,
-    ``yaw_rate_error``, ``goal_met``, ``goals_reached``. At reset they judge the start state.
+    inside a hazard's disc at the end of any physics substep), ``slip`` (longitudinal, of each wheel at the step's
+    end), ``slip_max`` (of a loaded wheel at the ends of substeps), ``spin_out``, ``yaw_rate_error`` (rad/s, at most,
+    from what steering angle and speed ask for), ``goal_met``, ``goals_reached``. At reset they judge the start state.
 
     **Layout**: ``reset(options={"layout": {"agent": [x, y, heading], "goal": [x, y], "hazards": [[x, y], ...],
     "patches": [{"ground": "ice", "center": [x, y], "radius": r}, ...], "ground": "dry", "speed": v}})``; any subset
@@ -143,27 +156,24 @@ class SafeRoverEnv(FieldEnv):
         """The grounds of this episode: the truth that no driver may see."""
         return self._grounds
 
-    @property
-    def wheel_loads(self) -> Array:
-        """Load F_z of each wheel, shape (4,), N."""
-        return np.array(self.data.userdata)
-
     def ground_under(self, wheel: str) -> str:
-        """Name of the ground under a wheel now.
-
-        Raises:
-            UnknownNameError: There is no such wheel.
-        """
-        if wheel not in WHEELS:
-            raise UnknownNameError(f"unknown wheel {wheel!r}: valid wheels are {', '.join(WHEELS)}")
+        """Name of the ground under a wheel now; `ValueError` for no wheel."""
         return self._grounds.at(*self.data.xpos[self._tyres.bodies[WHEELS.index(wheel)], :2].tolist())
 
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
-        return parse_rover_layout(options)
+        given = layout_option(options, LAYOUT_KEYS)
+        found: dict[str, Any] = {"speed": 0.0, "ground": _ground(given.get("ground", "dry"))}
+        found |= {key: numbers(given[key], key, form) for key, form in _FORMS.items() if key in given}
+        if "patches" in given:
+            found["patches"] = _patches(given["patches"])
+        return {**found, "speed": float(found["speed"])}
 
     def reset_model(self) -> Array:
-        """Sample what the options left open, place everything, return the observation."""
-        self._apply(**sample_rover_layout(self.np_random, self._given))
+        # Patches lie anywhere, under whatever stands there, the icy ones on top.
+        rng, given = self.np_random, self._given
+        placed = place_objects(rng, HALF_EXTENT, KEEPOUTS, {"hazards": HAZARDS}, given)
+        patches = given["patches"] if "patches" in given else _sample_patches(rng)
+        self._apply(**placed, patches=patches, ground=given["ground"], speed=given["speed"])
         return self.observe()
 
     def set_state(self, qpos: Array, qvel: Array) -> None:
@@ -194,7 +204,6 @@ class SafeRoverEnv(FieldEnv):
         return rolled_over(self.data.qpos[3:7])
 
     def observe(self) -> Array:
-        """Observation of the state as it is now: also right after `set_state`."""
         data = self.data
         vx, vy, _, _, _, yaw_rate, ax, ay, _ = data.sensordata[4:13].tolist()
         heading = self.agent_heading
@@ -209,10 +218,10 @@ class SafeRoverEnv(FieldEnv):
         return {
             COST: cost,
             COST_SUBSTEP: cost,
-            SLIP: np.array(self._tyres.slips),
-            SLIP_MAX: self._slip_max,
+            "slip": np.array(self._tyres.slips),
+            "slip_max": self._slip_max,
             SPIN_OUT: float(self._slip_max > SPIN_OUT_SLIP),
-            YAW_RATE_ERROR: self._yaw_rate_error,
+            "yaw_rate_error": self._yaw_rate_error,
             **super()._get_reset_info(),
         }
 
@@ -292,3 +301,44 @@ class SafeRoverEnv(FieldEnv):
             model.geom_rgba[geom] = _COLOURS[patch.ground]
         colour = self._floor_colour if ground.base == "dry" else (*_COLOURS[ground.base][:3], 1.0)
         model.geom_rgba[self._floor] = colour
+
+
+def _sample_patches(rng: np.random.Generator) -> tuple[Patch, ...]:
+    patches = []
+    for ground in SAMPLED_GROUNDS:
+        radius = float(rng.uniform(*_PATCH_RADII))
+        x, y = rng.uniform(radius - HALF_EXTENT, HALF_EXTENT - radius, size=2).tolist()
+        patches.append(Patch(ground, (x, y), radius))
+    return tuple(patches)
+
+
+def _patches(value: Any) -> tuple[Patch, ...]:
+    if isinstance(value, str | Mapping) or not hasattr(value, "__iter__"):
+        raise ConfigurationError(
+            'layout \'patches\' must be a list of {"ground": name, "center": [x, y], "radius": m}; '
+            f"got {value!r}"
+        )
+    patches = [_patch(item, f"patches[{i}]") for i, item in enumerate(value)]
+    if len(patches) > len(SAMPLED_GROUNDS):
+        raise ConfigurationError(
+            f"layout gives {len(patches)} patches, but there are at most {len(SAMPLED_GROUNDS)}"
+        )
+    return tuple(patches)
+
+
+def _patch(value: Any, where: str) -> Patch:
+    if not isinstance(value, Mapping) or set(value) != set(_PATCH_KEYS):
+        raise UnknownNameError(
+            f"layout {where!r} must be a mapping with the keys {', '.join(_PATCH_KEYS)}; got {value!r}"
+        )
+    x, y = numbers(value["center"], f"{where}['center']", PLACE).tolist()
+    radius = float(numbers(value["radius"], f"{where}['radius']", ("a number of m", ())))
+    if radius <= 0.0:
+        raise ConfigurationError(f"layout {where!r} must have a radius > 0 m; got {value!r}")
+    return Patch(_ground(value["ground"]), (x, y), radius)
+
+
+def _ground(value: Any) -> str:
+    if not (isinstance(value, str) and value in GROUNDS):
+        raise UnknownNameError(f"unknown ground {value!r}: valid grounds are {', '.join(GROUNDS)}")
+    return value

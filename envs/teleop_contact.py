@@ -15,15 +15,6 @@ from safe_wrappers.info import COST, COST_SUBSTEP
 from .field import METADATA, TaskEnv
 from .layout import PLACE, Form, Given, parse_layout
 
-COST_FORCE: Final = "cost_force"
-"""float64: 1 if the wall or the clamp pushed with more than `FORCE_LIMIT` in this step, else 0."""
-CONTACT_FORCE: Final = "contact_force"
-"""float64, N: normal force of the wall on the tool in this step."""
-CLEARANCE: Final = "clearance"
-"""float64, m: between tool and clamp at the end of this step; negative inside it."""
-SWEPT: Final = "swept"
-"""float64, m: how far the tool was swept towards the clamp while it pressed, this episode."""
-
 WALL_X: Final = 0.2
 """Face of the wall, m: the tool's centre stays at smaller x."""
 CLAMP_Y: Final = 0.25
@@ -85,7 +76,8 @@ class TeleopContactEnv(TaskEnv):
 
     **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if the tool touched the clamp
     at the end of the step, which is one physics substep), ``cost_force`` (1.0 if a contact pushed with more than
-    40 N), ``contact_force``, ``clearance``, ``swept``.
+    40 N), ``contact_force`` (N, of the wall), ``clearance`` (m, of the tool from the clamp, negative inside),
+    ``swept`` (m, towards the clamp while it pressed, this episode).
 
     **Layout**: ``reset(options={"layout": {"tool": [x, y], "velocity": [vx, vy], "wanted_force": F}})``, any subset;
     place (0 to 0.1, -0.05 to 0 m) and wanted force (6 to 12 N) are sampled where they are not given, at rest.
@@ -134,11 +126,6 @@ class TeleopContactEnv(TaskEnv):
         return np.array(self.data.qvel)
 
     @property
-    def commanded_position(self) -> Array:
-        """The commanded velocities' integral, dragged along where the spring slips; shape (2,), m."""
-        return np.array(self.data.mocap_pos[0, :2])
-
-    @property
     def clearance(self) -> float:
         """Between tool and clamp, m."""
         return CLAMP_Y - TOOL_RADIUS - float(self.data.qpos[1])
@@ -175,7 +162,6 @@ class TeleopContactEnv(TaskEnv):
         return given
 
     def reset_model(self) -> Array:
-        """Draw what the options left open."""
         drawn = self.np_random.uniform(*np.transpose([_START_X, _START_Y, _WANTED]))
         self._wanted = float(self._given.get("wanted_force", drawn[2]))
         self.set_state(self._given.get("tool", drawn[:2]), self._given.get("velocity", np.zeros(2)))
@@ -192,7 +178,6 @@ class TeleopContactEnv(TaskEnv):
         return bool(np.isfinite(observation).all())
 
     def observe(self) -> Array:
-        """Observation of the state as it is now."""
         data = self.data
         tool = [*data.qpos.tolist(), *data.qvel.tolist(), *self._coupling(data.ctrl)]
         return np.array([*tool, self._force, self.clearance, self._wanted])
@@ -202,10 +187,10 @@ class TeleopContactEnv(TaskEnv):
         return {
             COST: cost,
             COST_SUBSTEP: cost,
-            COST_FORCE: float(self._largest_force > FORCE_LIMIT),
-            CONTACT_FORCE: self._force,
-            CLEARANCE: self.clearance,
-            SWEPT: self._swept,
+            "cost_force": float(self._largest_force > FORCE_LIMIT),
+            "contact_force": self._force,
+            "clearance": self.clearance,
+            "swept": self._swept,
         }
 
     def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:

@@ -15,9 +15,6 @@ from safe_wrappers.info import COST, COST_SUBSTEP
 
 from . import SPEED_LIMITS
 
-SPEED: Final = "speed"
-"""float64, m/s: the speed that the cost judges, of this control step; 0 at reset, where nothing has moved."""
-
 VERSIONS: Final = ("v5", "v4")
 """Versions of Gymnasium's MuJoCo envs that a velocity task can be built on."""
 
@@ -49,11 +46,11 @@ class SafeVelocityEnv(MujocoEnv):
         observation, reward, terminated, truncated, info = super().step(action)
         speed = self._judged_speed(info)
         cost = float(not speed <= self.speed_limit)  # so that a speed that is not a number costs
-        judged = {SPEED: speed, COST: cost, COST_SUBSTEP: cost}
+        judged = {"speed": speed, COST: cost, COST_SUBSTEP: cost}
         return observation, reward, terminated, truncated, {**info, **judged}
 
     def _get_reset_info(self) -> dict[str, Any]:
-        return {**super()._get_reset_info(), SPEED: 0.0, COST: 0.0, COST_SUBSTEP: 0.0}
+        return {**super()._get_reset_info(), "speed": 0.0, COST: 0.0, COST_SUBSTEP: 0.0}
 
     def _judged_speed(self, info: dict[str, Any]) -> float:
         return float(info["x_velocity"])

@@ -8,8 +8,8 @@ Importing registers the ids of our tasks and changes nothing else; it imports ne
 """
 
 from safe_wrappers import constraints, plants
-from safe_wrappers.control.handover.seam_limits import SeamLimits
-from safe_wrappers.control.numerics.projection import project
+from safe_wrappers.control.handover import SeamLimits
+from safe_wrappers.control.projection import project
 from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning

@@ -32,7 +32,8 @@ def settled(env, constraint, control, steps=60):
 class Asked:
     """A bound constraint that observes by itself when the plant has, with the memory of an episode.
 
-    `executed` closes a step, as the filter does. Everything else is the bound constraint's own.
+    `executed` closes a step, as the filter does. Everything else is the bound constraint's own, or its
+    specification's.
     """
 
     def __init__(self, constraint, plant):
@@ -49,4 +50,4 @@ class Asked:
         if self.seen != self.plant.observation_id:
             self.seen = self.plant.observation_id
             self.bound.observe(self.memory)
-        return getattr(self.bound, name)
+        return getattr(self.bound if hasattr(self.bound, name) else self.bound.spec, name)

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from safe_wrappers.control.contact.friction_cone import cone_excess, tangents
-from safe_wrappers.control.estimation.covariance import discretise
+from safe_wrappers.control.contact import cone_excess, tangents
+from safe_wrappers.control.estimation import discretise
 
 
 def blind_covariance(start, a, q, time_s):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from safe_wrappers.control.numerics.compiled import IS_COMPILED
+from safe_wrappers.control.compiled import IS_COMPILED
 
 FOLDERS = [str(Path(__file__).parent / name) for name in ("control", "constraints", "plants")]
 CALLS = {

@@ -145,7 +145,7 @@ def test_the_cars_outline_encloses_every_geom():
         seed=0, options={"layout": {"agent": [0.0, 0.0, -np.pi / 2]}}
     )  # the body's axes are the world's
     model, data = env.model, env.data
-    outline = sw.protect(gym.make("SafeCarGoal2-v0")).filter.bound[0]._corners
+    outline = sw.protect(gym.make("SafeCarGoal2-v0")).filter.bound[0].spec._corners
     closest = np.inf
     for g in np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body("agent").id):
         corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T * model.geom_aabb[g, 3:]

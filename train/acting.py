@@ -34,20 +34,7 @@ def enjoy_command(
     console: Console,
     imports: Collection[str] = (),
 ) -> None:
-    """Lets a run's policy act, and prints what it comes to.
-
-    Args:
-        run: As `load_policy` takes it.
-        episodes: How many; their env seeds are 0, 1, 2, ...
-        action_filter: The filter that it was trained with, or another.
-        window: The task draws itself in a window.
-        film: Where to write a film (WebP) of the episode with the median return.
-        console: Where to print.
-        imports: As `load_policy` takes it.
-
-    Raises:
-        ConfigurationError: No such run, no episode, or the task cannot be drawn in this way.
-    """
+    """Lets a run's policy act, seeds 0, 1, ..., and prints what it comes to; the median episode's film is a WebP."""
     if episodes < 1:
         raise ConfigurationError(f"--episodes: expected at least 1, got {episodes}")
     trained = load_policy(run, other_filter=action_filter != "trained", imports=imports)
@@ -104,16 +91,7 @@ def diagnose_command(
     console: Console,
     imports: Collection[str] = (),
 ) -> Diagnosis:
-    """Diagnose an env by its id, print what was found, and write the same as JSON.
-
-    Args:
-        env_id: As `gym.make` takes it.
-        policy: A run's folder; None: random and attacking drivers alone.
-        steps: Control steps of each driver.
-        output: Where the JSON goes.
-        console: Where the table goes.
-        imports: As `load_policy` takes it.
-    """
+    """Diagnose an env by its id, print what was found, and write the same as JSON."""
     env, acts = (make_env(env_id, {}), None) if policy is None else of_run(policy, env_id, imports)
     found = diagnose(env, acts, steps)
     env.close()
@@ -123,11 +101,7 @@ def diagnose_command(
 
 
 def of_run(folder: Path, env_id: str, imports: Collection[str] = ()) -> tuple[gym.Env[Any, Any], Policy]:
-    """The policy of a run's newest checkpoint, and its env without the filter.
-
-    Raises:
-        ConfigurationError: The folder holds no run, no checkpoint, or the policy of another env.
-    """
+    """The policy of a run's newest checkpoint, and its env without the filter."""
     trained = load_policy(folder, imports=imports)
     if trained.arm.env.id != env_id:
         raise ConfigurationError(

@@ -22,31 +22,14 @@ from .videos import record_videos
 
 
 def train_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
-    """Trains what is not trained yet, arms times seeds in parallel.
-
-    Args:
-        experiment: What to train.
-        console: Where progress, messages and failures are shown.
-        on: Where: None for this machine, or `ray` or `ray:ADDRESS`.
-
-    Raises:
-        ConfigurationError: A task, a filter or an algorithm refuses its settings; nothing has been started.
-        RunStateError: A run folder belongs to another config; nothing has been started.
-        RunsFailedError: Some runs failed.
-        Interrupted: A signal came; the same command goes on.
-    """
+    """Trains what is not trained yet, arms times seeds in parallel; `on` as `run_jobs` takes it."""
     check_training(experiment)
     run_jobs(training_jobs(experiment), experiment.workers, console, "Training", on=on)
     write_cards(experiment)
 
 
 def check_training(experiment: ExperimentConfig) -> None:
-    """Refuses an experiment before its first step: nobody should learn after an hour that the last arm is wrong.
-
-    Raises:
-        ConfigurationError: A task, a filter or an algorithm refuses its settings.
-        RunStateError: A run folder belongs to another config.
-    """
+    """Refuses an experiment before its first step: nobody should learn after an hour that the last arm is wrong."""
     for arm in experiment.arms:
         env = make_training_env(arm)
         check_task(arm, env)
@@ -58,20 +41,22 @@ def check_training(experiment: ExperimentConfig) -> None:
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
-    """Evaluates every trained run on the same episode seeds, filter off and on, and films two of them.
-
-    Args:
-        experiment: Whose runs to evaluate.
-        console: Where progress, messages and failures are shown.
-        on: Where to evaluate, as in training; films are made on this machine.
-
-    Raises:
-        RunStateError: A run is not trained to its end; nothing has been started.
-        RunsFailedError: Some runs failed.
-    """
+    """Evaluates every trained run on the same episode seeds, filter off and on, and films two of them."""
     for arm, _, folder in _runs(experiment):
         check_finished(arm, folder)
-    run_jobs(evaluation_jobs(experiment), experiment.workers, console, "Evaluation", on=on)
+    how = experiment.evaluation, experiment.evaluation_filter
+    episodes = (1 if how[1].kind == "none" else 2) * how[0].episodes
+    jobs = [
+        Job(
+            f"evaluation {arm.name} seed {seed}",
+            episodes,
+            "episodes",
+            evaluate_run,
+            (arm, seed, folder, *how),
+        )
+        for arm, seed, folder in _runs(experiment)
+    ]
+    run_jobs(jobs, experiment.workers, console, "Evaluation", on=on)
     write_cards(experiment)
     record_videos(experiment, console)
 
@@ -93,22 +78,6 @@ def training_jobs(experiment: ExperimentConfig) -> list[Job]:
     """A job per arm and seed, counted in steps."""
     return [
         Job(f"training {arm.name} seed {seed}", whole_rollouts(arm), "steps", train_run, (arm, seed, folder))
-        for arm, seed, folder in _runs(experiment)
-    ]
-
-
-def evaluation_jobs(experiment: ExperimentConfig) -> list[Job]:
-    """A job per arm and seed, counted in episodes."""
-    settings, on = experiment.evaluation, experiment.evaluation_filter
-    episodes = (1 if on.kind == "none" else 2) * settings.episodes
-    return [
-        Job(
-            f"evaluation {arm.name} seed {seed}",
-            episodes,
-            "episodes",
-            evaluate_run,
-            (arm, seed, folder, settings, on),
-        )
         for arm, seed, folder in _runs(experiment)
     ]
 

@@ -11,8 +11,8 @@ from typing import Final
 import gymnasium as gym
 from rich.console import Console
 
-import safe_wrappers
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.recipes import EVERY, recipe_of
 
 from .config import parse_experiment, read_config
@@ -48,11 +48,6 @@ evaluation: {{episodes: 20}}
 def init_command(path: Path, overrides: Sequence[str], console: Console) -> None:
     """Writes a commented config.
 
-    Args:
-        path: The file.
-        overrides: `env=ID` and `algorithm=NAME`.
-        console: Where it is told.
-
     Raises:
         ConfigurationError: The file exists, or what the config would say is refused: the env cannot be made, the
             algorithm does not fit it, or there is no recipe for it; the message has the lines that filter it then.
@@ -87,11 +82,7 @@ def init_command(path: Path, overrides: Sequence[str], console: Console) -> None
 
 
 def list_command(kinds: Sequence[str], console: Console) -> None:
-    """Prints what there is, of all kinds or of those that are named.
-
-    Raises:
-        UnknownNameError: There is no such kind.
-    """
+    """Prints what there is, of all kinds or of those that are named."""
     for kind in [check_name(kind, _LISTS, "list") for kind in kinds] or _LISTS:
         rows = _LISTS[kind]()
         console.print(f"[bold]{kind}[/bold] ({len(rows)})", highlight=False)
@@ -116,10 +107,11 @@ def _envs() -> dict[str, str]:
 
 
 def _wrappers() -> dict[str, str]:
-    named = {name: getattr(safe_wrappers, name) for name in safe_wrappers.__all__}
+    package = importlib.import_module("safe_wrappers")
+    named = {name: getattr(package, name) for name in package.__all__}
     wrappers = gym.Wrapper | gym.vector.VectorWrapper
     found = {n: thing for n, thing in named.items() if inspect.isclass(thing) and issubclass(thing, wrappers)}
-    found |= {f"faults.{name}": thing for name, thing in safe_wrappers.faults.FAULTS.items()}
+    found |= {f"faults.{name}": thing for name, thing in FAULTS.items()}
     return {name: (inspect.getdoc(thing) or "").partition("\n")[0] for name, thing in sorted(found.items())}
 
 

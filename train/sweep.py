@@ -51,20 +51,7 @@ def sweep_experiment(
     console: Console,
     on: str | None = None,
 ) -> None:
-    """Searches the settings of a config's `sweep`, or goes on with the search.
-
-    Args:
-        settings: As `read_config` returned them.
-        config: The file that they are from, for the command that is recommended.
-        overrides: Those of the command line, for the same.
-        console: Where progress and results are shown.
-        on: Where trials run: None for this machine, or `ray` or `ray:ADDRESS`.
-
-    Raises:
-        ConfigurationError: Optuna is missing, or a parameter is refused.
-        RunStateError: The study is another sweep's, or another process is at work on it.
-        Interrupted: A signal came; the same command goes on.
-    """
+    """Searches the settings of a config's `sweep`, or goes on with the search."""
     if importlib.util.find_spec("optuna") is None:
         raise ConfigurationError("optuna is not installed: pip install 'safe-wrappers[sweep]'")
     space = Space(settings)
@@ -84,15 +71,7 @@ def sweep_experiment(
 
 
 class Space:
-    """The experiments that a sweep chooses from: the first arm with a filter, or the first one.
-
-    Args:
-        settings: The config, as `read_config` returned it, with a section `sweep`.
-
-    Raises:
-        UnknownNameError: A parameter that does not exist.
-        ConfigurationError: There is no such section or no filter, or a parameter has values that are refused.
-    """
+    """The experiments that a sweep chooses from: the first arm with a filter, or the first one."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         self.experiment = parse_experiment(settings)
@@ -108,11 +87,7 @@ class Space:
         self.distributions = {key: self._checked(key, given) for key, given in self.config.parameters.items()}
 
     def trial(self, name: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], ExperimentConfig]:
-        """The experiment of a trial, as settings and checked; its only arm is the ranked one.
-
-        Raises:
-            ConfigurationError: The values do not go together.
-        """
+        """The experiment of a trial, as settings and checked; its only arm is the ranked one."""
         settings = deepcopy(self._settings)
         for key, value in values.items():
             set_value(settings, key, deepcopy(value))
@@ -166,11 +141,7 @@ class Space:
 
 
 def open_study(space: Space, folder: Path) -> optuna.Study:
-    """Creates the study, or goes on with it.
-
-    Raises:
-        RunStateError: The study there is another sweep's.
-    """
+    """Creates the study, or goes on with it."""
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -208,12 +179,7 @@ def next_trials(study: optuna.Study, space: Space) -> list[optuna.Trial]:
 
 
 def run_trial(experiment: ExperimentConfig, progress: Progress) -> None:
-    """A trial's job: trains its arm with every seed and evaluates it, or goes on with that.
-
-    Args:
-        experiment: As `Space.trial` returns it.
-        progress: Where training steps are reported to, from 0 for each seed.
-    """
+    """A trial's job: trains its arm with every seed and evaluates it, or goes on with that."""
     arm, quiet = experiment.arms[0], replace(progress, steps=lambda _: None)
     for seed in experiment.seeds:
         folder = experiment.run_folder(arm, seed)
@@ -222,18 +188,7 @@ def run_trial(experiment: ExperimentConfig, progress: Progress) -> None:
 
 
 def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: str | None = None) -> None:
-    """Runs trials side by side, each in one process, and tells their study what they came to.
-
-    Args:
-        space: What is searched.
-        trials: As `next_trials` gave them.
-        console: Where progress, messages and failures are shown.
-        on: Where: None for this machine, or `ray` or `ray:ADDRESS`.
-
-    Raises:
-        RunStateError: A trial's folder is another experiment's.
-        Interrupted: A signal came; the trials go on when the study does.
-    """
+    """Runs trials side by side, each in one process, and tells their study what they came to."""
     from optuna.trial import TrialState
 
     jobs: list[Job] = []

@@ -80,9 +80,6 @@ class InSight(gym.Wrapper[Any, Any, Any, Any]):
     """Frames in whose middle the robot stays: the free camera follows it.
 
     Fixed cameras stay where they are, and so does the picture of an env that MuJoCo does not draw.
-
-    Args:
-        env: Makes frames (render mode "rgb_array").
     """
 
     def render(self) -> Any:
@@ -108,12 +105,7 @@ _BODIES: Final = {
 
 
 def film_episode(policy: TrainedPolicy, env: gym.Env[Any, Any], seed: int) -> tuple[bytes, str]:
-    """Runs an episode and films it.
-
-    Args:
-        policy: Acts, deterministically.
-        env: As `for_film` returns it, with a `RecordInterventions` inside.
-        seed: Of the env's reset.
+    """Runs an episode in an env as `for_film` returns it, with a `RecordInterventions` inside, and films it.
 
     Returns:
         The endless animated WebP, and a sentence that says what is seen.
@@ -233,16 +225,7 @@ def record_videos(experiment: ExperimentConfig, console: Console) -> None:
 def record_video(
     arm: ArmConfig, shown: ShownEpisode, run_folder: Path, used: FilterConfig, path: Path, progress: Progress
 ) -> None:
-    """Runs the shown episode and writes its film, with what a filter knows drawn into it, and its facts.
-
-    Args:
-        arm: Whose policy.
-        shown: Which seed and episode.
-        run_folder: The run's folder.
-        used: The filter that is on.
-        path: The film's.
-        progress: Where to report to.
-    """
+    """Runs the shown episode and writes its film, with what a filter knows drawn into it, and its facts."""
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint.folder)
     filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})

@@ -11,7 +11,7 @@ import safe_wrappers as sw
 from _crossing import road, tracked
 from _style import FORBIDDEN, OFF, ON, SAFE, panels
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
-from safe_wrappers.plants.queries.planar_point import planar_point
+from safe_wrappers.plants.mujoco.planar_point import planar_point
 
 LAYOUT = {
     "agent": [-0.2, -2.2, math.pi / 2],

@@ -5,13 +5,13 @@ from safe_wrappers.constraints.backup.heading_drive_clearance import HeadingDriv
 from safe_wrappers.constraints.backup.point_clearance import EscapeClearance, WallClearance
 from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance, TrackPermission
-from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility, Stance, SupportMargin
-from safe_wrappers.constraints.contact.impact_speed_limit import ImpactSpeedLimit
-from safe_wrappers.constraints.limits.joints import JointPositionLimit, JointSpeedLimit
-from safe_wrappers.constraints.limits.points import SpeedLimit, Workspace
-from safe_wrappers.constraints.limits.singularity_margin import SingularityMargin
+from safe_wrappers.constraints.contact_feasibility import ContactFeasibility, Stance, SupportMargin
+from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
+from safe_wrappers.constraints.joints import JointPositionLimit, JointSpeedLimit
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
+from safe_wrappers.constraints.points import SpeedLimit, Workspace
 from safe_wrappers.constraints.predictive_shield import PredictiveShield
+from safe_wrappers.constraints.singularity_margin import SingularityMargin
 from safe_wrappers.constraints.traction import Traction
 
 __all__ = [

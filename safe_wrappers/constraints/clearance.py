@@ -21,9 +21,8 @@ from safe_wrappers.control.backup.stopping import (
 )
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
-from safe_wrappers.plants.mujoco.plant import require_mujoco
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.points import Points
 
 
 @dataclass
@@ -78,16 +77,41 @@ class Clearance(Constraint):
         plant.require_acceleration("Clearance")
         super().setup(plant)
         named = {"body": self.bodies, "site": self.sites, "geom": self.geoms}
-        self._points = Points(plant, named, self.position, self.velocity)
+        self._named = [(kind, name) for kind, names in named.items() for name in names]
+        coordinates = len(self.position)
+        if isinstance(plant, MujocoPlant):
+            coordinates = 3
+            if not self._named:
+                there = ", ".join(plant.names("body"))
+                wanted = "name the bodies, sites or geoms to keep clear"
+                raise ConfigurationError(f"{wanted}; the model has the bodies {there}")
+            for kind, name in self._named:
+                plant.named(kind, name)
+        elif not self.position:
+            given = "position=[0, 1], velocity=[2, 3]"
+            raise ConfigurationError(f"on an AnalyticPlant say where the point is in the state: {given}")
         self._still: Array | None = None
         if all(isinstance(o, Plain) and o.still for o in self.obstacles):
             self._still = np.concatenate([o.surfaces(plant) for o in self.obstacles])
-            size = self._points.coordinates
             for surface in self._still:
-                refuse_more_dimensions(int(surface[1]), size)
+                refuse_more_dimensions(int(surface[1]), coordinates)
 
     def observe(self, memory: Memory) -> None:
         self._observed: tuple[Array, HalfSpaces] | None = None
+
+    def _motions(self) -> list[tuple[Array, Array]]:
+        """Position, m, and velocity, m/s, of each point."""
+        if isinstance(self.plant, MujocoPlant):
+            return [self.plant.motion(kind, name) for kind, name in self._named]
+        x = self.plant.state
+        return [(x[self.position], x[self.velocity])]
+
+    def _accelerations(self) -> list[tuple[Array, Array, Array, Array]]:
+        """Position, velocity, drift and control matrix of the acceleration of each point, SI."""
+        if isinstance(self.plant, MujocoPlant):
+            return [self.plant.point(kind, name) for kind, name in self._named]
+        x, p, v = self.plant.state, self.position, self.velocity
+        return [(x[p], x[v], self.plant.f[v], self.plant.g[v])]
 
     def _surfaces(self, p: Array) -> Nearest:
         """The surfaces around a point."""
@@ -104,7 +128,7 @@ class Clearance(Constraint):
                 approach_rows(*self._surfaces(p), v, drift, effect, machine)
                 if self._still is None
                 else approach_rows_of(self._still, p, v, drift, effect, machine)
-                for p, v, drift, effect in self._points.accelerations()
+                for p, v, drift, effect in self._accelerations()
             ]
             parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
             rooms, normals, offsets = parts
@@ -121,14 +145,14 @@ class Clearance(Constraint):
         delay_s, radius = self.plant.delay_s, self.radius
         found = [
             approaches(near.distance, near.normal, near.velocity, v, delay_s, radius)
-            for near, v in ((self._surfaces(p), v) for p, v in self._points.motions())
+            for near, v in ((self._surfaces(p), v) for p, v in self._motions())
         ]
         clearances, speeds = zip(*found, strict=True)
         return np.concatenate(clearances), np.concatenate(speeds)
 
     def points(self, path: Any) -> Array:
         """Where they are now, shape (1, points, d), m."""
-        return np.array([[p for p, _ in self._points.motions()]])
+        return np.array([[p for p, _ in self._motions()]])
 
     def rows(self) -> HalfSpaces:
         """One row per point and surface whose limit the actuators could exceed."""

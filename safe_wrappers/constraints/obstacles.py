@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from safe_wrappers.checks import Array, finite_array, non_negative, positive, settings_from
-from safe_wrappers.control.estimation.tracks import Tracks
+from safe_wrappers.control.estimation import Tracks
 from safe_wrappers.control.numerics.shapes import (
     BLOCK,
     PLANE,

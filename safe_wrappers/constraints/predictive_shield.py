@@ -15,7 +15,7 @@ from safe_wrappers.checks import Array, non_negative, one_number, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.plant import Model, Plant
-from safe_wrappers.plants.rollouts import NotFiniteError, View
+from safe_wrappers.plants.simulator import NotFiniteError, View
 
 Value = Callable[[Any, Array], ArrayLike]
 """Of an observation and actions, shape (k, m): how good they are, shape (k,)."""

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, name_list, non_negative, positive
-from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
-from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
+from safe_wrappers.control.vehicle import FrictionEstimate, slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.plants.mujoco.driven_wheels import DrivenWheels
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
 
 _CAUTION = 0.5  # standard deviations of the believed peak's slip by which the limit stays below it
 _NOISE = 0.02  # standard deviation of a measured friction coefficient while the slip stands still
@@ -58,7 +57,7 @@ class Traction(Constraint):
     """Keep the slip ratio of every driven wheel within `max_slip`, and below where its ground's curve seems to peak.
 
     Forces of the ground and the peak of each wheel's traction curve are estimated
-    (`control/vehicle/friction_estimate.py`); the limit is half a standard deviation below the peak, or `max_slip`.
+    (`control/vehicle.py`); the limit is half a standard deviation below the peak, or `max_slip`.
 
     Best effort: a wheel whose ground stays the same for a control step ends it within the limit, up to what its force
     and its speed over ground change otherwise than predicted. Where the ground, the load or the other wheels'

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.constraints import ImpactSpeedLimit, JointPositionLimit, PredictiveShield
-from safe_wrappers.constraints.limits.joints import driven_joints
-from safe_wrappers.control.vehicle.slip import slip_ratio
+from safe_wrappers.constraints.joints import driven_joints
+from safe_wrappers.control.vehicle import slip_ratio
 from safe_wrappers.diagnosis.recording import Env, NotMeasuredError, Recording, box
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants import SimulatorPlant

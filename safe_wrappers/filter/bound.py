@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.projection import keeps_rows
 from safe_wrappers.control.numerics.shapes import NUMBERS, squashed
+from safe_wrappers.control.projection import keeps_rows
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import Tangents, differences
 from safe_wrappers.plants.plant import Plant
@@ -65,29 +65,33 @@ class Bound:
         self.memory = spec.memory = dict(memory)
         self._rows: HalfSpaces | None = None
         spec.observe(self.memory)
-        self._known: dict[bytes, Array] = {}
-        self._value = spec.h_along(spec.model.rollout(None)).min(axis=0)
-        self.least = float(self._value.min(initial=np.inf))
+        now = spec.h_along(spec.model.rollout(None))
+        self._value = value = now[0] if len(now) == 1 else now.min(axis=0)
+        self.least = least = float(value[0] if value.size == 1 else value.min(initial=np.inf))
         if not self.predicts:
             return
-        self._needed: tuple[Array, Array] | None = None
-        self._outside = np.minimum(self._value - spec.margin, 0.0) if spec.recovery_s else self._value[:0]
-        self._is_outside = bool((self._outside < -spec.rounding).any())
-        keeps = self.plant.observation_id < memory.get("kept_until", 0) and not self._is_outside
-        self._tangents = Tangents(self.slacks, self._slopes, memory["slopes"] if keeps else None)
-        most = spec.max_decrease if self.max_decrease is not None else None
-        if most is not None:
-            recent = memory.get("recent", ())
-            fallen = max(recent, default=-np.inf) - self.least
-            if fallen > most + spec.rounding:
-                warnings.warn(
-                    f"{type(spec).__name__}: what is left of the limit fell by {fallen:.3g} {spec.unit} within "
-                    f"{len(recent)} control steps, farther than the declared max_decrease of {most:g}; from now "
-                    "on every control is forecast",
-                    stacklevel=2,
-                )
-                self.max_decrease = most = None
-        self._far = most is not None and self.least - most >= spec.margin + spec.rounding
+        self._known: dict[bytes, Array] = {}
+        self._asked: tuple[Array, Array] | None = None
+        self._tangents: Tangents | None = None
+        self._is_outside = spec.recovery_s > 0.0 and least < spec.margin - spec.rounding
+        self._far = False
+        if self.max_decrease is not None:
+            self._check_decrease(self.max_decrease)
+
+    def _check_decrease(self, most: float) -> None:
+        """Whether the state is so far inside that no trajectory is needed; the declared bound is checked here."""
+        spec, recent = self.spec, self.memory.get("recent", ())
+        fallen = max(recent, default=-np.inf) - self.least
+        if fallen > most + spec.rounding:
+            warnings.warn(
+                f"{type(spec).__name__}: what is left of the limit fell by {fallen:.3g} {spec.unit} within "
+                f"{len(recent)} control steps, farther than the declared max_decrease of {most:g}; from now on every "
+                "control is forecast",
+                stacklevel=2,
+            )
+            self.max_decrease = None
+            return
+        self._far = self.least - most >= spec.margin + spec.rounding
 
     def executed(self, control: Array) -> Memory:
         """The memory after a control was executed in the observed state."""
@@ -98,9 +102,9 @@ class Bound:
                 memory["recent"] = (*memory.get("recent", ()), self.least)[-spec.horizon :]
             if spec.info_keys:
                 spec.h_along(spec.model.rollout(control, spec.horizon))
-            if self._tangents.made and not (self.plant.has_acceleration or self._is_outside):
-                memory["slopes"] = self._tangents.slopes
-                memory["kept_until"] = self.plant.observation_id + _KEPT
+            tangents = self._tangents
+            if not (tangents is None or self.plant.has_acceleration or self._is_outside) and tangents.made:
+                memory["slopes"], memory["kept_until"] = tangents.slopes, self.plant.observation_id + _KEPT
         return memory
 
     def value(self) -> Array:
@@ -123,49 +127,56 @@ class Bound:
         return first if surroundings is None else np.concatenate([first, surroundings(neighbours)])
 
     def slacks(self, control: Array) -> Array:
-        """What the trajectory of a control, shape (m,), leaves of what is asked for, shape (n,); wanted >= 0."""
-        key = control.tobytes()
-        if key not in self._known:
-            self._known[key] = self._slacks(control)
-        return self._known[key]
+        """What the trajectory of a control, shape (m,), leaves of what is asked for, shape (n,); wanted >= 0.
 
-    def _slacks(self, control: Array) -> Array:
-        spec, gate = self.spec, self.spec.look_ahead_below
-        further = {"euler": True} if spec.euler_look_ahead else {}
-        if not self._is_outside and gate is not None and self.least >= gate:
-            held = self._of(spec.model.rollout(control, 1, **further))
-            if (held >= gate).all():
-                return held
-        return self._of(spec.model.rollout(control, spec.horizon, **further))
+        In time: the least of every control interval, each of the k apart; from outside see `_of`.
+        """
+        key = control.tobytes()
+        known = self._known.get(key)
+        if known is None:
+            spec, gate = self.spec, self.spec.look_ahead_below
+            further = {"euler": True} if spec.euler_look_ahead else {}
+            if gate is not None and not self._is_outside and self.least >= gate:
+                known = self._of(spec.model.rollout(control, 1, **further))
+            if known is None or not (known >= gate).all():
+                known = self._of(spec.model.rollout(control, spec.horizon, **further))
+            self._known[key] = known
+        return known
 
     def _of(self, path: Any) -> Array:
-        """The slacks of a trajectory: from inside the least of every control interval, each of the k apart."""
+        """The slacks of a trajectory; from outside, how far in it is on the way and at its end."""
         left = self.spec.h_along(path) - self.spec.margin
-        least, end = self._asked()
         if self._is_outside:
+            least, end = self._wanted()
             return np.concatenate([left.min(axis=0) - least, left[-1] - end])
-        held = left.reshape(path.holds, -1, left.shape[1]).min(axis=1)
-        return np.asarray((held - least if least.size else held).ravel())
+        holds = path.holds
+        held = left.min(axis=0) if holds == 1 else left.reshape(holds, -1, left.shape[1]).min(axis=1).ravel()
+        return np.asarray(held - self._wanted()[0] if self.spec.decay < 1.0 else held)
 
-    def _asked(self) -> tuple[Array, Array]:
+    def _wanted(self) -> tuple[Array, Array]:
         """What a trajectory is to leave at least on the way, and at its end, margin taken off."""
-        if self._needed is None:
-            spec, least, end = self.spec, self._outside, self._outside
+        if self._asked is None:
+            spec, now = self.spec, self._value - self.spec.margin
             if self._is_outside:
-                seconds = spec.horizon * self.plant.control_dt
-                end = least * np.exp(-seconds / spec.recovery_s)
-            elif spec.decay < 1.0:
-                least = (1.0 - spec.decay) * np.maximum(self._value - spec.margin, 0.0)
+                least = np.minimum(now, 0.0)
+                end = least * np.exp(-spec.horizon * self.plant.control_dt / spec.recovery_s)
             else:
-                least = least[:0]
-            backup = next(iter(spec.proposals(None)), None) if least.size else None
+                least = end = (1.0 - spec.decay) * np.maximum(now, 0.0)
+            backup = self.backup()
             if backup is not None:
                 left = spec.h_along(spec.model.rollout(backup, spec.horizon)) - spec.margin
                 floor = -np.inf if self._is_outside else 0.0
-                least = np.minimum(least, np.maximum(left.min(axis=0), floor))
-                end = np.minimum(end, left[-1])
-            self._needed = least, end
-        return self._needed
+                least, end = np.minimum(least, np.maximum(left.min(axis=0), floor)), np.minimum(end, left[-1])
+            self._asked = least, end
+        return self._asked
+
+    def _about(self, control: Array) -> HalfSpaces:
+        """Tangents of the slacks about a control."""
+        if self._tangents is None:
+            memory = self.memory
+            keeps = self.plant.observation_id < memory.get("kept_until", 0) and not self._is_outside
+            self._tangents = Tangents(self.slacks, self._slopes, memory["slopes"] if keeps else None)
+        return self._tangents.about(control)
 
     def _slopes(self, control: Array) -> Array:
         """How the slacks change with a control, shape (n, m), by differences.
@@ -181,10 +192,12 @@ class Bound:
 
     def slack(self, control: Array) -> float:
         """The least of what a control leaves; >= 0: kept. Minus infinity where a number is lost."""
-        if not self.predicts:
+        if self.predicts:
+            left = self.slacks(control)
+        else:
             rows = self.rows()
-            return float((rows.offsets - rows.normals @ control).min(initial=np.inf))
-        least = float(self.slacks(control).min(initial=np.inf))
+            left = rows.offsets - rows.normals @ control
+        least = float(left.min(initial=np.inf))
         return least if least == least else -np.inf
 
     def admits(self, control: Array) -> bool:
@@ -193,7 +206,11 @@ class Bound:
             rows = self.rows()
             if not keeps_rows(control, rows.normals, rows.offsets, self.plant.lower, self.plant.upper):
                 return False
-        return not self.predicts or self._far or self.slack(control) >= -self.spec.rounding
+        return (
+            not self.predicts
+            or self._far
+            or bool(self.slacks(control).min(initial=0.0) >= -self.spec.rounding)
+        )
 
     def keeps_limit(self, control: Array) -> bool:
         """Inside the margin: whether a refused control keeps the limit, and loses no more of the margin.
@@ -216,13 +233,13 @@ class Bound:
             rows = self.spec.rows()
             if rows is None and self.predicts and not (self.plant.has_acceleration or self._far):
                 braking = getattr(self.spec.model, "braking", None)
-                rows = None if braking is None else self._tangents.about(braking())
+                rows = None if braking is None else self._about(braking())
             self._rows = HalfSpaces.none(self.plant.lower.size) if rows is None else rows
         return self._rows
 
     def linearize(self, control: Array) -> HalfSpaces:
         """The requirement linearised about a refused control; no rows: it cannot be."""
-        return self._tangents.about(control) if self.spec.smooth else HalfSpaces.none(control.size)
+        return self._about(control) if self.spec.smooth else HalfSpaces.none(control.size)
 
     def candidates(self, control: Array) -> Iterable[Array]:
         """Controls to try for a refused one before it is projected, the best first."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.projection import load_solvers
+from safe_wrappers.control.projection import load_solvers
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint, Memory
@@ -87,8 +87,13 @@ class SafetyFilter:
         self.last = np.clip(np.zeros_like(self._low), self._low, self._high)
         self.observe()
         if not self._loaded and self.margin == self.margin:
-            for c in self.bound:  # compiles what a step may need
-                c.rows(), c.slack(self.last), c.backup()
+            _ = (
+                self.plant.acting_range if self.plant.has_acceleration else None
+            )  # compiles what a step may need
+            for c in self.bound:
+                c.rows(), c.backup()
+                if c.predicts:
+                    c.slack(self.last)
             self._loaded = True
 
     def take_over(self, before: "SafetyFilter") -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.projection import (
+from safe_wrappers.control.projection import (
     Projection,
     Status,
     cast_inside,
@@ -107,15 +107,17 @@ class SafeActionSearch:
     def decide(self, proposal: Array, last: Array) -> Decision:
         """The executed control for a proposal inside the box; `last` is what was executed before."""
         self._tried = []
-        decision = self._decide(proposal, last)
+        admitted = self._admitted(proposal)
+        if admitted and not self._ruling:
+            return Decision(proposal, Stage.PROPOSAL, changed=False)
+        decision = self._decide(proposal, admitted, last)
         if decision.changed:
             decision.refused = np.array([not c.admits(proposal) for c in self._constraints], dtype=bool)
         return decision
 
-    def _decide(self, proposal: Array, last: Array) -> Decision:
-        refused = bool(self._predicting) and not self._admitted(proposal)
+    def _decide(self, proposal: Array, admitted: bool, last: Array) -> Decision:
         strict = self._rows(self._ruling) if self._ruling else self._no_rows
-        if not refused:
+        if admitted:
             if not strict[1].size:
                 return Decision(proposal, Stage.PROPOSAL, changed=False)
             result, control = self._project(proposal, *strict)

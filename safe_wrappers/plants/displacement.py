@@ -87,6 +87,7 @@ class DisplacementPlant(MujocoPlant):
     """
 
     has_acceleration: ClassVar[bool] = False
+    _sends_controls: ClassVar[bool] = False  # controls follow from where the gripper is
     _recorder: DisplacementRecorder
 
     def __init__(self) -> None:
@@ -110,9 +111,6 @@ class DisplacementPlant(MujocoPlant):
     def _take_model(self) -> None:
         super()._take_model()
         self._clamped = False  # all of the action space acts
-
-    def _other_control(self, data: mujoco.MjData, sent: Array) -> str:
-        return ""  # the control follows from where the gripper is
 
     def _bind_actions(self, env: gym.Env[Any, Any]) -> None:
         space: Any = env.action_space

@@ -6,6 +6,7 @@ prediction); the finite-sample rank as in Lei et al., *Distribution-Free Predict
 """
 
 import copy
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -18,8 +19,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, float_array, positive, whole_number
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of, refuse_changed_actions
-from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
-from safe_wrappers.plants.simulator.plant import known_substeps
+from safe_wrappers.plants.simulator import Measure, Rollout, RolloutPlant, View
 
 _LEAST_SCALE = 1e-3  # of the largest one
 _ROUNDING = 1e-9  # (9 + 1) * 0.1 is a whole number, and so is what its rounding makes of it
@@ -59,12 +59,11 @@ def log_steps(
     space.seed(seed)
     found: list[tuple[Any, Any]] = []
     for index in range(episodes):
-        observation, info = env.reset(seed=seed if index == 0 else None)
-        observations, actions = [copy.copy(observation)], []
+        # Copies: some envs return the same array again, changed.
+        observations, actions = [copy.copy(env.reset(seed=None if index else seed)[0])], []
         for _ in range(max_steps):
-            action = space.sample() if policy is None else policy(observation)
+            action = space.sample() if policy is None else policy(observations[-1])
             observation, _, terminated, truncated, info = env.step(action)
-            # A copy: some envs return the same array again, changed.
             observations.append(copy.copy(observation))
             actions.append(np.atleast_1d(info.get(keys.EXECUTED_ACTION, action)))
             if terminated or truncated:
@@ -87,22 +86,19 @@ def checked_episodes(given: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[Episo
     for index, one in enumerate(given):
         if not isinstance(one, Sequence) or isinstance(one, str) or len(one) != 2:
             raise ConfigurationError(f"episode {index} is no pair (observations, actions): {one!r}")
-        observations, actions = (
-            float_array(f"{name} of episode {index}", part)
-            for name, part in zip(Episode._fields, one, strict=True)
-        )
-        if actions.ndim == 1:
-            actions = actions[:, None]
-        have, first = Episode(observations, actions), found[0] if found else Episode(observations, actions)
-        widths = [(a.ndim, a.shape[1:]) == (2, b.shape[1:]) for a, b in zip(have, first, strict=True)]
-        if not (all(widths) and len(actions) and len(observations) == len(actions) + 1):
+        observations = float_array(f"observations of episode {index}", one[0])
+        actions = float_array(f"actions of episode {index}", one[1])
+        episode = Episode(observations, actions[:, None] if actions.ndim == 1 else actions)
+        (rows, *n), (steps, *m) = (part.shape for part in episode)
+        widths = [part.shape[1:] for part in (found or [episode])[0]]
+        if not (len(n) == len(m) == 1 and rows == steps + 1 > 1 and widths == [(*n,), (*m,)]):
             raise ConfigurationError(
                 f"episode {index}: expected observations of shape (T + 1, n) and actions of shape (T, m) with T of at"
-                f" least 1, and n and m as in episode 0, got {observations.shape} and {actions.shape}"
+                f" least 1, and n and m as in episode 0, got {(rows, *n)} and {(steps, *m)}"
             )
-        if not (np.isfinite(observations).all() and np.isfinite(actions).all()):
+        if not all(np.isfinite(part).all() for part in episode):
             raise ConfigurationError(f"episode {index} has numbers that are not finite; end it before them")
-        found.append(have)
+        found.append(episode)
     return found
 
 
@@ -115,54 +111,10 @@ def measured(measure: Measure, observation: Array) -> float:
     return float(measure(View(None, observation, {})))
 
 
-def shortfall(model: Model, episode: Episode, place: float, horizon: int, measure: Measure) -> Array:
-    """Predicted minus true measure after each step of one window of an episode, shape (horizon,).
-
-    Within it the model is rolled out from the first true observation with the logged actions, and sees no other
-    observation. In an episode shorter than the horizon the window is the whole episode.
-
-    Args:
-        model: Rolled out.
-        episode: Logged.
-        place: In [0, 1): from the first to the last place of a window.
-        horizon: Steps.
-        measure: See `RolloutPlant.margins`.
-
-    Returns:
-        inf where a measure is not a number, -inf after the episode's end.
-    """
-    start = int(place * (max(len(episode.actions) - horizon, 0) + 1))
-    state, found = episode.observations[start], np.full(horizon, -np.inf)
-    for step, control in enumerate(episode.actions[start : start + horizon]):
-        with np.errstate(over="ignore", invalid="ignore"):  # a bad model may diverge, which is measured here
-            state = model(state, control)
-        true, predicted = measured(measure, episode.observations[start + step + 1]), measured(measure, state)
-        fall = predicted - true if predicted != true else 0.0  # infinite ones, too
-        found[step] = np.inf if np.isnan(fall) else fall
-    return found
-
-
-class LinearModel:
-    """`x+ = x + [x, u, 1] @ weights`: affine in state and control.
-
-    Args:
-        states: Shape (k, n).
-        controls: Shape (k, m).
-        changes: Of the state over the step, shape (k, n).
-
-    Attributes:
-        weights: Shape (n + m + 1, n). Of many that fit equally well, the smallest.
-    """
-
-    def __init__(self, states: Array, controls: Array, changes: Array) -> None:
-        inputs = np.hstack([states, controls, np.ones((len(states), 1))])
-        self.weights: Array = np.asarray(np.linalg.lstsq(inputs, changes, rcond=None)[0], dtype=np.float64)
-
-    def __call__(self, states: Array, controls: Array) -> Array:
-        """The states after a step, shape (..., n), from states, shape (..., n), and controls, shape (..., m)."""
-        n, m = states.shape[-1], controls.shape[-1]
-        change = states @ self.weights[:n] + controls @ self.weights[n : n + m] + self.weights[-1]
-        return np.asarray(states + change)
+def linear_model(weights: Array, states: Array, controls: Array) -> Array:
+    """`x + [x, u, 1] @ weights`, affine in state and control, with weights of shape (n + m + 1, n)."""
+    n = states.shape[-1]
+    return np.asarray(states + states @ weights[:n] + controls @ weights[n:-1] + weights[-1])
 
 
 def allowed_misses(scores: int, miss_rate: float) -> int:
@@ -233,7 +185,6 @@ class IdentifiedPlant(RolloutPlant):
     """
 
     simulates_env: ClassVar[bool] = False
-    info_keys = (keys.PLANT_COVERAGE,)
 
     def __init__(
         self,
@@ -255,48 +206,41 @@ class IdentifiedPlant(RolloutPlant):
                 f"fit, got {len(every)}: give more, or allow a larger miss_rate"
             )
         draw = np.random.default_rng(whole_number("seed", seed, 0))
-        order = draw.permutation(len(every))
+        order, places = draw.permutation(len(every)), draw.random(len(every))
         self.held_out_episodes = [every[i] for i in order[:calibrating]]
         self.fit_episodes = [every[i] for i in order[calibrating:]]
         # One window per episode: windows of one episode are alike, and no further independent scores.
-        places = draw.random(len(every))
         self._places, self._scale_places = places[:calibrating], places[calibrating:]
-        states = np.concatenate([one.observations[:-1] for one in self.fit_episodes])
+        inputs = np.concatenate([np.hstack([o[:-1], a, np.ones((len(a), 1))]) for o, a in self.fit_episodes])
         changes = np.concatenate([np.diff(one.observations, axis=0) for one in self.fit_episodes])
-        controls = np.concatenate([one.actions for one in self.fit_episodes])
-        unknowns = states.shape[1] + controls.shape[1] + 1
-        if len(states) < unknowns:
+        if len(inputs) < inputs.shape[1]:
             raise ConfigurationError(
-                f"{len(states)} steps are left for the fit of {unknowns} numbers per observation: give more episodes"
+                f"{len(inputs)} steps are left for the fit of {inputs.shape[1]} numbers per observation: give more "
+                "episodes"
             )
-        self.model: Model = LinearModel(states, controls, changes)
+        # Of many weights that fit equally well, the smallest.
+        weights = np.asarray(np.linalg.lstsq(inputs, changes, rcond=None)[0], dtype=np.float64)
+        self.model: Model = functools.partial(linear_model, weights)
         self._watched: Measure | None = None
         self._judged = self._missed = 0
         self._least: float | None = None  # of the watched measure after the step under way
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         refuse_changed_actions(env)
-        self._take_space(env.action_space)
-        first = self.fit_episodes[0]
-        for name, space, have in (
-            ("observations", env.observation_space.shape, first.observations.shape[1:]),
-            ("actions", self.lower.shape, first.actions.shape[1:]),
-        ):
+        super().bind(env)
+        widths = [part.shape[1:] for part in self.fit_episodes[0]]
+        shapes = env.observation_space.shape, self.lower.shape
+        for name, space, have in zip(Episode._fields, shapes, widths, strict=True):
             if space != have:
                 raise UnsupportedEnvError(
                     f"the model was fitted to {name} of shape {have}, {name_of(env)} has {space}; log episodes "
                     "of this env, with the wrappers that are inside the filter (such as FlattenObservation)"
                 )
-        self._attach(env)
-        self.substeps = known_substeps(env.unwrapped)
-        self.view = View(None, np.zeros(first.observations.shape[1]), {})
+        self.view = View(None, np.zeros(widths[0]), {})
 
     @property
     def state(self) -> Array:
         return np.asarray(self.view.observation, dtype=np.float64)
-
-    def observe(self) -> None:
-        self.observation_id += 1
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:
         """Take what the env's reset or step has returned, and judge the prediction of it."""
@@ -316,36 +260,8 @@ class IdentifiedPlant(RolloutPlant):
             predicted = self.model(self.state, control)
             self._least = measured(self._watched, predicted) - self._first
 
-    def simulate(
-        self,
-        control: Array,
-        horizon: int,
-        policy: Policy | None,
-        measure: Measure | None,
-        least: float,
-        until: Callable[[View], bool] | None,
-        between: bool,
-    ) -> Rollout:
-        """Roll out the model from the last observation: see `RolloutPlant.rollout`.
-
-        Rewards are NaN, and no episode ends: the model knows neither.
-        """
-        found, state = Rollout(), self.state
-        for step in range(horizon):
-            state = self.model(state, control)
-            view = View(None, state, {})
-            found.observations.append(state)
-            found.rewards.append(math.nan)
-            if measure is not None:
-                found.values.append(measure(view))
-                if not found.values[-1] >= least:
-                    break
-            found.reached = until is not None and until(view)
-            if found.reached:
-                break
-            if policy is not None and step + 1 < horizon:
-                control = self.control(policy(view), "the policy")
-        return found
+    def _run(self, task: Callable[[Any], Rollout]) -> Rollout:
+        return task(_Stepped(self))
 
     def margins(self, measure: Measure, horizon: int) -> Array:
         """By how much a measure may be worse than predicted after each step, shape (horizon,), in its unit.
@@ -373,9 +289,37 @@ class IdentifiedPlant(RolloutPlant):
         return margins
 
     def _shortfalls(self, episodes: list[Episode], places: Array, horizon: int, measure: Measure) -> Array:
-        windows = zip(episodes, places, strict=True)
-        return np.array([shortfall(self.model, one, place, horizon, measure) for one, place in windows])
+        """Predicted minus true measure after each step of one window of each episode, shape (episodes, horizon).
+
+        Within it the model is rolled out from the first true observation with the logged actions, and sees no other
+        observation. A place in [0, 1) goes from the first to the last window; in an episode shorter than the horizon
+        the window is the whole episode. It is inf where a measure is not a number, -inf after the episode's end.
+        """
+        found = np.full((len(episodes), horizon), -np.inf)
+        for falls, (observations, actions), place in zip(found, episodes, places, strict=True):
+            start = int(place * (max(len(actions) - horizon, 0) + 1))
+            state = observations[start]
+            for step, control in enumerate(actions[start : start + horizon]):
+                with np.errstate(over="ignore", invalid="ignore"):  # a bad model may diverge: measured here
+                    state = self.model(state, control)
+                true, predicted = measured(measure, observations[start + step + 1]), measured(measure, state)
+                fall = predicted - true if predicted != true else 0.0  # infinite ones, too
+                falls[step] = np.inf if np.isnan(fall) else fall
+        return found
 
     def info(self) -> dict[str, Any]:
         share = 1.0 - self._missed / self._judged if self._judged else keys.NOT_JUDGED
         return {keys.PLANT_COVERAGE: share}
+
+
+class _Stepped:
+    """Stands for the env in a rollout: it steps the model, which knows neither rewards nor ends."""
+
+    unwrapped = None
+
+    def __init__(self, plant: IdentifiedPlant) -> None:
+        self._plant, self._state = plant, plant.state
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        self._state = self._plant.model(self._state, self._plant.control(action, "the policy"))
+        return self._state, math.nan, False, False, {}

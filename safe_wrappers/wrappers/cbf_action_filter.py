@@ -17,7 +17,7 @@ from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import SafeActionSearch, Stage
-from safe_wrappers.plants.default import default_plant, own_plant
+from safe_wrappers.plants import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from, plain_data
@@ -96,12 +96,11 @@ class CBFActionFilter(LayerWrapper):
         self.added_margin = margin = non_negative("margin", margin, "the constraints' own units")
         self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
         self._own = own
-        self.constraints: list[Constraint] = self._widened(margin)
-        self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
+        self.constraint_names = _unique([type(c).__name__ for c in own])
         self.plant: Plant = plant if plant is not None else default_plant(env, own)
         self.plant.bind(env)
         self._fallback = fallback
-        self.filter = self._filter()
+        self.filter = self._filter(margin)
         self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
         self._deciding = threading.RLock()
@@ -121,12 +120,15 @@ class CBFActionFilter(LayerWrapper):
         self._shape: tuple[int, ...] = space.shape
         self._dtype: Any = space.dtype
 
-    def _widened(self, margin: float) -> list[Constraint]:
-        return [c.widened(margin) for c in self._own] if margin else self._own
+    @property
+    def constraints(self) -> list[Constraint]:
+        """The constraints, on their plant, with the added margin."""
+        return [c.spec for c in self.filter.bound]
 
-    def _filter(self) -> SafetyFilter:
+    def _filter(self, margin: float) -> SafetyFilter:
         of_actions = self._low, self._high, self._dtype, self._search
-        return SafetyFilter(self.plant, self.constraints, self._fallback, *of_actions)
+        widened = [c.widened(margin) for c in self._own] if margin else self._own
+        return SafetyFilter(self.plant, widened, self._fallback, *of_actions)
 
     def set_margin(self, margin: float) -> None:
         """Add this to every constraint's own margin from the next decision on, in place of `margin`.
@@ -142,15 +144,10 @@ class CBFActionFilter(LayerWrapper):
             ConfigurationError: It is negative, or leaves nothing of some limit; the margin stays as it was.
         """
         margin = non_negative("margin", margin, "the constraints' own units")
-        before = self.filter, self.constraints
-        try:
-            self.constraints = self._widened(margin)
-            self.filter = self._filter()
-        except ConfigurationError:
-            self.filter, self.constraints = before
-            raise
+        before = self.filter
+        self.filter = self._filter(margin)
         self.added_margin = margin
-        self.filter.take_over(before[0])
+        self.filter.take_over(before)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning.
@@ -182,7 +179,7 @@ class CBFActionFilter(LayerWrapper):
     def _quiet_report(self) -> dict[str, Any]:
         """The info keys of a step that changes nothing, but for margin and actions."""
         report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
-        report[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
+        report[keys.CBF_REFUSED] = np.zeros(len(self._own), dtype=bool)
         report[keys.CBF_STAGE] = int(Stage.PROPOSAL)
         return report
 
@@ -258,7 +255,7 @@ class CBFActionFilter(LayerWrapper):
                 # What fails least may be the proposal itself, and a change may be lost in rounding.
                 intervened &= bool((executed != np.clip(proposed, self._low, self._high)).any())
         self.filter.executed(executed)
-        none = np.zeros(len(self.constraints), dtype=bool)
+        none = np.zeros(len(self._own), dtype=bool)
         return sent, {
             keys.CBF_INTERVENED: intervened,
             keys.CBF_INFEASIBLE: decision.infeasible,

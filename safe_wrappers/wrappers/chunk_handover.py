@@ -11,15 +11,22 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import OF_NUMBERS, Array, numbers_of, positive, settings_from, shown, whole_number
-from safe_wrappers.control.handover.curves import hermite_spline
-from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
-from safe_wrappers.control.handover.seams import BLENDS, LOOK_BACK, Seam, join
-from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
+from safe_wrappers.control.handover import (
+    BLENDS,
+    LOOK_BACK,
+    Seam,
+    SeamCheck,
+    SeamLimits,
+    hermite_spline,
+    join,
+    shortest_blend,
+    smoothstep,
+)
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.default import own_plant
+from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
-from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
+from safe_wrappers.plants.mujoco.dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data, plain_numbers
@@ -394,7 +401,7 @@ class ChunkQueue:
         shortest = 0.0 if self._check is None else self._check.shortest_fade(change)
         bounded = np.isfinite(self._rate_limit)
         if bounded.any():
-            shortest_by_rate = shortest_latched_blend(change[bounded], self._rate_limit[bounded])
+            shortest_by_rate = shortest_blend(change[bounded], self._rate_limit[bounded])
             shortest = max(shortest, float(shortest_by_rate.max()))
         return max(self._fewest, whole_steps(shortest, self._control_dt) - 1)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import OF_NUMBERS, numbers_of, shown
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.default import PlantTemplate
+from safe_wrappers.plants import PlantTemplate
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.serialize import recorded
 from safe_wrappers.stack import Layer, refuse_order

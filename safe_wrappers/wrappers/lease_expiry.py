@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, non_negative, positive, settings_from
-from safe_wrappers.control.handover.smoothstep import smoothstep
-from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, jerk_limited_time
+from safe_wrappers.control.handover import smoothstep
+from safe_wrappers.control.watchdog import admits, checked_limits, jerk_limited_time
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.default import own_plant
+from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.mujoco.binding import actions_are_controls
 from safe_wrappers.plants.mujoco.model import control_range
@@ -213,9 +213,8 @@ class Admission:
             units = "actions are in other units than the lengths of the actuators"
             raise ConfigurationError(f"motion_limits: {units}, so that these are no setpoints")
         try:
-            self._limits, self._rest = _limits(**motion_limits)
-            acceleration, speed, _ = self._limits.arrays
-            self._bounds = tuple(np.broadcast_to(x, (controls,)) for x in (speed, acceleration))
+            acceleration, speed, self._rest = _limits(**motion_limits)
+            self._acceleration, self._speed = (np.broadcast_to(x, (controls,)) for x in (acceleration, speed))
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, ConfigurationError):
                 raise
@@ -230,12 +229,13 @@ class Admission:
         """Whether a chunk may be executed that ends with a command (m,) after so many seconds."""
         position, velocity = self._raw.data.actuator_length, self._raw.data.actuator_velocity
         if self._rest:
-            return jerk_limited_time((position, velocity, 0.0), (end, 0.0, 0.0), self._limits) <= duration_s
-        return bool(admits(end, position, velocity, duration_s, *self._bounds).all())
+            states = (position, velocity, 0.0), (end, 0.0, 0.0)
+            return jerk_limited_time(*states, self._acceleration, self._speed) <= duration_s
+        return bool(admits(end, position, velocity, duration_s, self._speed, self._acceleration).all())
 
 
 def _limits(
     max_acceleration: Any, max_speed: Any = math.inf, arrival: str = "moving"
-) -> tuple[MotionLimits, bool]:
+) -> tuple[Array, Array, bool]:
     """The limits, and whether the machine must be able to stand at the end."""
-    return MotionLimits(max_acceleration, max_speed), {"moving": False, "rest": True}[arrival]
+    return *checked_limits(max_acceleration, max_speed), {"moving": False, "rest": True}[arrival]

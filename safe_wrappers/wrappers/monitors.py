@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.control.contact.friction_cone import normal_and_tangential
-from safe_wrappers.control.contact.impact import complementarity_residuals
-from safe_wrappers.control.legged.support import support_distances
+from safe_wrappers.control.contact import complementarity_residuals, normal_and_tangential
+from safe_wrappers.control.legged import support_distances
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.contacts import (
     ContactForecast,
@@ -22,8 +21,8 @@ from safe_wrappers.plants.mujoco.contacts import (
     can_touch_the_world,
     chosen_bodies,
 )
+from safe_wrappers.plants.mujoco.dynamics import MomentumReader
 from safe_wrappers.plants.mujoco.model import fixed_bodies
-from safe_wrappers.plants.queries.floating_base import MomentumReader
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, mujoco_env
 
@@ -165,11 +164,11 @@ class ContactMonitor(StepMonitor):
         gaps, forces = np.array(self._gaps), np.array(self._forces)
         if not (np.isfinite(gaps).all() and np.isfinite(forces).all()):
             return dict.fromkeys(self.nothing, math.nan)
-        residuals = complementarity_residuals(gaps, forces)
+        penetration, product = complementarity_residuals(gaps, forces)
         return {
             keys.CONTACT_PEAK_FORCE: self._peak,
-            keys.CONTACT_PENETRATION: float(residuals.penetration.max()),
-            keys.CONTACT_RESIDUAL: float(residuals.product.max()),
+            keys.CONTACT_PENETRATION: float(penetration.max()),
+            keys.CONTACT_RESIDUAL: float(product.max()),
         }
 
 

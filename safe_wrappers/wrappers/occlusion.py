@@ -12,20 +12,19 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
-from safe_wrappers.control.estimation.dead_reckoning import (
+from safe_wrappers.control.dead_reckoning import (
     DeadReckoning,
     from_sensor,
     lever_arm_velocity,
     rigid_transform,
     to_sensor,
 )
-from safe_wrappers.control.estimation.observability import unobservable_directions
-from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
+from safe_wrappers.control.estimation import Motion, Tracks, largest_deviation, unobservable_directions
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
 from safe_wrappers.plants.env_checks import read_attribute
-from safe_wrappers.plants.mujoco.binding import control_interval
+from safe_wrappers.plants.mujoco.binding import physics_steps
+from safe_wrappers.plants.mujoco.line_of_sight import LineOfSight
 from safe_wrappers.plants.mujoco.model import named
-from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, mujoco_env
@@ -320,7 +319,7 @@ class OcclusionPenalty(LayerWrapper):
     ``occlusion/sigma`` (m, array), ``occlusion/penalty`` (float).
 
     Attributes:
-        tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead.
+        tracking: The `control.estimation.Tracks`: positions, velocities, covariances, and those ahead.
         track_names: One per track: the body's name, or the attribute's with an index.
         ego_motion: Where the sensor's body is taken to be (`position`, m, and `velocity`, m/s), if the sensor has an
             `Imu`; else None.
@@ -378,7 +377,7 @@ class OcclusionPenalty(LayerWrapper):
         parts = {"tracks": plain_data(self.tracks), "sensor": plain_data(self.sensor)}
         self._record(arguments, **parts, **plain, observe=self.observe)
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
-        self._control_dt = control_interval(raw)
+        self._control_dt = physics_steps(raw) * float(raw.model.opt.timestep)
         self._matrix, self._noise = self.sensor.matrices(self._d)
         self._noise_root = np.linalg.cholesky(self._noise)
         self.track_names = self._look_at(raw.model)

@@ -10,7 +10,7 @@ import gymnasium as gym
 from safe_wrappers.constraints import JointSpeedLimit, PredictiveShield
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.simulator.plant import SimulatorPlant
+from safe_wrappers.plants.simulator import SimulatorPlant
 from safe_wrappers.stack import refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.presets import ActionShield

@@ -25,7 +25,7 @@ from safe_wrappers.constraints import (
     WallClearance,
     Workspace,
 )
-from safe_wrappers.constraints.limits.joints import driven_joints
+from safe_wrappers.constraints.joints import driven_joints
 from safe_wrappers.control.numerics.shapes import merged
 from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.envs.goal_robots import CAR
@@ -34,7 +34,7 @@ from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants import MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.plants.mujoco.model import HINGE
-from safe_wrappers.plants.rollouts import View
+from safe_wrappers.plants.simulator import View
 
 Env = gym.Env[Any, Any]
 Recommended = list[Constraint]

@@ -7,8 +7,8 @@ from gymnasium import spaces
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array
-from safe_wrappers.constraints.limits.points import Workspace
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
+from safe_wrappers.constraints.points import Workspace
 from safe_wrappers.drawing.marks import THIN, Mark, ball, block, edges, line, pad, ring, spatial
 from safe_wrappers.drawing.scene import Strip, arrows, find_renderer, put
 from safe_wrappers.errors import ConfigurationError

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.clearance import Clearance
-from safe_wrappers.control.watchdog.leases import longest_lease, longest_lease_of_room, round_trip_ceiling
+from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room, round_trip_ceiling
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
-from safe_wrappers.plants.default import default_plant, own_plant
+from safe_wrappers.plants import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from

@@ -13,7 +13,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.default import own_plant
+from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
@@ -123,7 +123,7 @@ class Line:
 class RoundTripCeiling:
     """The longest round trip at which an operator may still be relied on, from the clearance and speed of the moment.
 
-    See `control.watchdog.leases.round_trip_ceiling`. A command after which the machine could not stop is refused.
+    See `control.watchdog.round_trip_ceiling`. A command after which the machine could not stop is refused.
 
     Args:
         budget: A `StoppingBudget` or the dict of one, whose clearance is a `Clearance` or a function of the env.

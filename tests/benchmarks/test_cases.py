@@ -6,7 +6,7 @@ import pytest
 import safe_wrappers as sw
 from benchmarks.cases import HARD, PROTECTED
 from benchmarks.judges import Reported, Worst
-from safe_wrappers.constraints.limits.joints import scalar_joints
+from safe_wrappers.constraints.joints import scalar_joints
 from safe_wrappers.wrappers.recipes import RECIPES
 
 CASES = PROTECTED | HARD

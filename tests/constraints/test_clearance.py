@@ -217,7 +217,7 @@ def test_approach_is_what_the_barrier_counts_the_stopping_distance_from(tmp_path
     env.reset(seed=0)
     env.set_state(np.array([0.2, -0.1]), np.array([0.7, -0.4]))
     plant.observe()
-    room, speed = clearance.approach()
+    room, speed = clearance.spec.approach()
     point = np.array([0.2, -0.1]) + (np.array([0.05, 0.0]) if "sites" in frame else 0.0)
     for i, disc in enumerate(DISCS):
         way = np.asarray(disc.center)[:2] - point

@@ -9,7 +9,7 @@ from judged_loops import Scene
 from scipy.optimize import lsq_linear
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.contact.impact_speed_limit import GeomGaps
+from safe_wrappers.constraints.impact_speed_limit import GeomGaps
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 # A mass on a slide before a wall ------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.obstacles import distances
-from safe_wrappers.control.estimation.tracks import Motion, Tracks
+from safe_wrappers.control.estimation import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
 

@@ -140,7 +140,7 @@ def test_without_one_the_horizon_is_all_that_is_looked_at():
 
 def test_a_set_that_is_not_reached_does_not_admit():
     found = asked(shield(horizon=5), (0.0, 2.0))  # it stops after twenty steps
-    assert not found.admits(np.zeros(1)) and -1e-12 < found.slack(np.zeros(1)) < 0.0
+    assert not found.admits(np.zeros(1)) and -1e-5 < found.slack(np.zeros(1)) < 0.0
 
 
 def test_a_start_without_a_way_out_is_flagged():

@@ -8,7 +8,7 @@ from asking import asked, bound
 from judged_loops import DRIVERS, Judge, Scene, drive
 
 import safe_wrappers as sw
-from safe_wrappers.control.filtering.manipulability import validated_threshold
+from safe_wrappers.control.barriers import validated_threshold
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.bound import Bound
 
@@ -70,7 +70,7 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
         plant.observe()
         assert limit.value() == pytest.approx(expected(env.data.qpos), rel=1e-9, abs=1e-9)
         forecast = plant.rollout(rng.uniform(-3.0, 3.0, 4), 2)
-        room = limit.room(forecast)
+        room = limit.h_along(forecast)
         assert room.shape == (10, 1)
         for k in range(10):
             # Beyond a singular pose a square task counts as negative; the difference has a test of its own.
@@ -126,7 +126,9 @@ def test_a_square_task_is_not_passed_through_its_singular_pose():
         forecast = limit.plant.rollout(np.zeros(2), 2)
         crossing = forecast.qpos[:, 1]
         assert (crossing * side).min() < -0.2  # it does pass through, to where w is large again
-        np.testing.assert_allclose(limit.room(forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0)
+        np.testing.assert_allclose(
+            limit.h_along(forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0
+        )
         assert not limit.admits(np.zeros(2))
 
 
@@ -267,5 +269,5 @@ def test_a_pose_with_a_position_that_is_no_number_has_no_manipulability():
         np.nan,
         np.inf,
     )  # the target's position, which does not carry the arm, and the arm's own
-    found = limit._measure(qpos)
+    found = limit.spec._measure(qpos)
     assert found[0] == pytest.approx(0.1 * 0.11 * np.sin(0.8)) and np.isnan(found[1:]).all()

@@ -44,7 +44,7 @@ def test_the_forecast_speed_is_the_one_that_the_task_judges(robot, version):
         if speeds and not plane:  # the step behind it is judged by the same measure
             assert 50.0 - present == pytest.approx(speeds[-1], abs=1e-12)
         forecast = plant.rollout(action)
-        ahead = 50.0 - limit.room(forecast)
+        ahead = 50.0 - limit.h_along(forecast)
         assert ahead.shape == (1, 2)
         assert limit.slack(action) == pytest.approx(50.0 - ahead.max(), abs=1e-12)
         limit.executed(action)

@@ -9,7 +9,7 @@ from judged_loops import Scene, flagged
 from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
-from safe_wrappers.control.legged.support import support_distances
+from safe_wrappers.control.legged import support_distances
 from safe_wrappers.errors import ConfigurationError
 
 HALF, HEIGHT, MASS = 0.2, 0.5, 5.0
@@ -52,11 +52,8 @@ def test_the_distance_is_that_of_the_moments():
         limit = settled(table(), sw.constraints.SupportMargin(0.01), np.array([push]))
         expected = HALF - abs(push) * 50.0 * HEIGHT / WEIGHT
         assert limit.slacks(np.array([push]))[0] == pytest.approx(expected - 0.01, abs=2e-3)
-        assert limit.info(None, None) == {
-            "whole_body/zmp_margin": 0.0,
-        }  # nothing was decided yet
-        info = limit.info(np.array([push]), np.array([push]))
-        assert info["whole_body/zmp_margin"] == pytest.approx(expected, abs=2e-3)
+        limit.executed(np.array([push]))
+        assert limit.report["whole_body/zmp_margin"] == pytest.approx(expected, abs=2e-3)
 
 
 def hull_distance(contacts):
@@ -85,7 +82,8 @@ def test_where_there_is_no_polygon_nothing_is_asked(env):
     limit = settled(env, sw.constraints.SupportMargin(0.1), np.zeros(1), 20)
     for push in (-1.0, 0.0, 1.0):
         assert limit.admits(np.array([push]))
-        assert limit.info(np.zeros(1), np.array([push])) == {"whole_body/zmp_margin": 0.0}
+        limit.executed(np.array([push]))
+        assert limit.report == {"whole_body/zmp_margin": 0.0}
 
 
 def test_at_every_evaluation_it_is_the_distance_to_the_hull_of_all_contact_points():

@@ -49,7 +49,7 @@ def test_bodies_sites_and_geoms_are_where_mujoco_has_them_now_and_ahead():
         mujoco.mj_forward(env.model, truth)
         np.testing.assert_allclose(limit.value().reshape(5, 3), true_points(truth), atol=1e-12)
         forecast = plant.rollout(rng.uniform(-1.0, 1.0, 2), 2)
-        room = limit.room(forecast)
+        room = limit.h_along(forecast)
         assert room.shape == (10, 15)
         for k in range(10):
             truth.qpos[:] = forecast.qpos[k]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from safe_wrappers.control.filtering.cbf import (
+from safe_wrappers.control.barriers import (
     numerical_gradient,
     relative_degree,
 )

@@ -8,7 +8,7 @@ from oracles import blind_covariance, double_integrator_covariance
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from safe_wrappers.control.estimation.covariance import (
+from safe_wrappers.control.estimation import (
     discretise,
     discretise_drift,
 )
@@ -55,15 +55,15 @@ def quadrature(integrand, time):
 def test_the_step_is_the_integral_by_quadrature(seed, n, time):
     a, q, _ = random_system(seed, n)
     expected = quadrature(lambda s: expm(s[:, None, None] * a) @ q @ expm(s[:, None, None] * a.T), time)
-    step = discretise(a, q, time)
-    np.testing.assert_allclose(step.transition, expm(a * time), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(step.noise, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max())
+    transition, noise = discretise(a, q, time)
+    np.testing.assert_allclose(transition, expm(a * time), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(noise, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max())
 
 
 def test_no_time_changes_nothing():
     a, q, start = random_system(3, 3)
-    step = discretise(a, q, 0.0)
-    assert np.array_equal(step.transition, np.eye(3)) and not step.noise.any()
+    transition, noise = discretise(a, q, 0.0)
+    assert np.array_equal(transition, np.eye(3)) and not noise.any()
     assert not discretise_drift(a, np.ones(3), 0.0).any()
     assert np.array_equal(blind_covariance(start, a, q, 0.0), start)
 
@@ -71,9 +71,9 @@ def test_no_time_changes_nothing():
 def test_a_stable_system_over_a_long_time_does_not_overflow():
     # exp(-A t) of the textbook block would be exp(1e5).
     for time in (1.0, 1000.0, 1e9):
-        step = discretise([[-100.0]], [[3.0]], time)
-        np.testing.assert_allclose(step.noise.item(), 3.0 / 200.0, rtol=1e-14)
-    assert step.transition.item() == pytest.approx(0.0, abs=1e-300)
+        transition, noise = discretise([[-100.0]], [[3.0]], time)
+        np.testing.assert_allclose(noise.item(), 3.0 / 200.0, rtol=1e-14)
+    assert transition.item() == pytest.approx(0.0, abs=1e-300)
 
 
 @settings(max_examples=20)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from safe_wrappers.control.estimation.dead_reckoning import DeadReckoning, rigid_transform
+from safe_wrappers.control.dead_reckoning import DeadReckoning, rigid_transform
 
 THROWN = """
 <mujoco>

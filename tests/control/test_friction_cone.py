@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.contact.friction_cone import (
+from safe_wrappers.control.contact import (
     cone_excess,
     friction_pyramid,
     tangents,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.vehicle.friction_estimate import PEAK_SLIPS, FrictionEstimate
+from safe_wrappers.control.vehicle import PEAK_SLIPS, FrictionEstimate
 from safe_wrappers.envs.ground import MagicFormula
 
 
@@ -48,16 +48,16 @@ def test_a_curve_of_another_shape(curve, peak):
     assert (curve.friction(estimate.peak_slip[0]) > 0.95 * peak).all()
 
 
-def test_the_interval_covers_the_truth():
-    """Two standard deviations, over random curves of its shape and random slips up to their peaks."""
-    rng, inside = np.random.default_rng(1), []
+def test_the_height_is_the_truth_but_for_a_few_hundredths():
+    """Over random curves of its shape and random slips up to their peaks."""
+    rng, off = np.random.default_rng(1), []
     for seed in range(200):
         slip = rng.uniform(0.06, 0.2)
         curve = MagicFormula(rng.uniform(0.1, 1.1), slip)
         estimate = FrictionEstimate(1)
         learn(estimate, curve, rng.uniform(0.0, 1.2 * slip, 40), seed=seed)
-        inside.append(abs(estimate.mean[0] - curve.peak_friction) <= 2.0 * estimate.std[0])
-    assert np.mean(inside) >= 0.9
+        off.append(abs(estimate.mean[0] - curve.peak_friction))
+    assert np.quantile(off, 0.9) < 0.03
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 2.0), st.floats(0.0, 1e3), st.floats(1e-3, 10.0)), max_size=40))
@@ -67,7 +67,6 @@ def test_always_finite(measurements):
         estimate.travel(np.array([slip]))
         estimate.update(np.array([slip]), np.array([friction]), np.array([noise]))
     assert np.isfinite(estimate.mean).all()
-    assert (estimate.std > 0.0).all()
     assert estimate.weights.sum() == pytest.approx(1.0)
     assert PEAK_SLIPS[0] - 1e-9 <= estimate.peak_slip[0][0] <= PEAK_SLIPS[-1] + 1e-9
 
@@ -81,12 +80,12 @@ LATE = MagicFormula(peak_friction=0.9, peak_slip=0.15)
 
 
 def drive(estimate, curve, count, rng):
-    """Measurements from slips up to beyond the peak; mean, standard deviation and peak's slip after each."""
+    """Measurements from slips up to beyond the peak; mean and peak's slip after each."""
     seen = []
     for slip in rng.uniform(0.01, 0.2, count):
         friction = abs(curve.at(slip) + rng.normal(0.0, NOISE))
         estimate.update(np.array([slip]), np.array([friction]), np.array([NOISE]))
-        seen.append((estimate.mean[0], estimate.std[0], estimate.peak_slip[0][0]))
+        seen.append((estimate.mean[0], estimate.peak_slip[0][0]))
     return np.array(seen).T
 
 
@@ -96,4 +95,4 @@ def test_on_another_ground_the_hypotheses_start_afresh():
         drive(moved, first, 300, np.random.default_rng(0))
         after, new = (drive(each, second, 30, np.random.default_rng(1)) for each in (moved, fresh))
         np.testing.assert_allclose(after[0, -1], new[0, -1], atol=0.02)
-        np.testing.assert_allclose(after[2, -1], new[2, -1], atol=0.01)
+        np.testing.assert_allclose(after[1, -1], new[1, -1], atol=0.01)

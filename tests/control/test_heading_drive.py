@@ -19,7 +19,7 @@ from safe_wrappers.control.backup.heading_drive import (
     predict,
     stopping_path,
 )
-from safe_wrappers.plants.queries.planar_robot import heading_drive
+from safe_wrappers.plants.mujoco.planar_robot import heading_drive
 
 
 def robot(level=0, uncertainty=0.0):

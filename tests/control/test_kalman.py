@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
-from safe_wrappers.control.estimation.covariance import discretise, discretise_drift
-from safe_wrappers.control.estimation.tracks import predict, update
+from safe_wrappers.control.estimation import discretise, discretise_drift, predict, update
 
 INTEGRATOR = np.array([[0.0, 1.0], [0.0, 0.0]])
 seeds = st.integers(0, 10**6)
@@ -56,7 +55,7 @@ def test_the_covariance_stays_symmetric_and_semidefinite(seed, n, decades):
 def test_the_steady_filter_is_python_control_s():
     step = discretise(INTEGRATOR, np.diag([0.0, 0.4]), 0.1)
     c, r = np.array([[1.0, 0.0]]), np.array([[0.05]])
-    _, predicted, _ = ct.dlqe(step.transition, np.eye(2), c, step.noise, r)
+    _, predicted, _ = ct.dlqe(step[0], np.eye(2), c, step[1], r)
     mean, cov = np.zeros(2), np.eye(2)
     for _ in range(500):
         mean, cov = predict(mean, update(mean, cov, np.zeros(1), c, r)[1], *step)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.watchdog.leases import longest_lease, longest_lease_of_room
+from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room
 from safe_wrappers.errors import ConfigurationError
 
 POSITIVE = st.floats(1e-3, 1e3)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safe_wrappers.control.filtering.manipulability import (
+from safe_wrappers.control.barriers import (
     manipulability,
     validated_threshold,
     worst_joint_rates,

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safe_wrappers.control.estimation.observability import unobservable_directions, unobservable_subspace
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.control.estimation import unobservable_directions, unobservable_subspace
 
 SMALL = st.integers(-2, 2).map(float)
 
@@ -84,11 +83,3 @@ def test_fast_and_slow_modes_side_by_side():
 def test_what_is_not_seen_of_a_point_in_the_plane_is_named(c, names):
     motion = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2))
     assert unobservable_directions(motion, c, ("x", "y", "vx", "vy")) == names
-
-
-@pytest.mark.parametrize(
-    ("a", "c"), [(np.ones((2, 3)), [[1, 0]]), (np.eye(2), [[1, 0, 0]]), ([[np.nan]], [[1]])]
-)
-def test_what_is_no_system_is_refused(a, c):
-    with pytest.raises(ConfigurationError):
-        unobservable_directions(a, c, ("p", "v"))

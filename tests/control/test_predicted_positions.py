@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.legged.whole_body_problem import largest_acceleration, predicted_position_rows
+from safe_wrappers.control.whole_body import largest_acceleration, predicted_position_rows
 
 
 def top(speed, acceleration, horizon):
@@ -36,7 +36,8 @@ def test_the_end_alone_would_let_it_through():
 
 def test_rows_name_the_right_joints_and_leave_unlimited_ones_out():
     rows, limits = predicted_position_rows(
-        [6, 8, 7], [0.1, 0.0, -0.2], [1.0, 0.0, -1.0], [-1.0, -np.inf, -0.5], [0.5, np.inf, np.inf], 0.1, 9
+        *(np.array([6, 8, 7]), np.array([0.1, 0.0, -0.2]), np.array([1.0, 0.0, -1.0])),
+        *(np.array([-1.0, -np.inf, -0.5]), np.array([0.5, np.inf, np.inf]), 0.1, 9),
     )
     assert rows.tolist() == [np.eye(9)[6].tolist(), (-np.eye(9)[6]).tolist(), (-np.eye(9)[7]).tolist()]
     expected = [
@@ -45,5 +46,5 @@ def test_rows_name_the_right_joints_and_leave_unlimited_ones_out():
         largest_acceleration(0.3, 1.0, 0.1),
     ]
     assert limits == pytest.approx(np.array(expected))
-    nothing, none = predicted_position_rows(np.zeros(0, int), [], [], [], [], 0.1, 4)
+    nothing, none = predicted_position_rows(np.zeros(0, int), *np.zeros((4, 0)), 0.1, 4)
     assert nothing.shape == (0, 4) and none.shape == (0,)

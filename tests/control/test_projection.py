@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize, nnls
 from scipy.sparse import csc_matrix
 
-from safe_wrappers.control.numerics.projection import box_least_squares, project
+from safe_wrappers.control.projection import box_least_squares, project
 from safe_wrappers.errors import ConfigurationError
 
 ONES = np.ones(2)

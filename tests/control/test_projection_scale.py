@@ -9,7 +9,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from scipy.optimize import linprog, lsq_linear
 
-from safe_wrappers.control.numerics.projection import box_least_squares, keeps_rows, project
+from safe_wrappers.control.projection import box_least_squares, keeps_rows, project
 from tests.control.test_projection import clarabel
 
 SCALES = st.floats(-12.0, 12.0).map(lambda exponent: 10.0**exponent)

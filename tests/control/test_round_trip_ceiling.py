@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.watchdog.leases import longest_lease, round_trip_ceiling
+from safe_wrappers.control.watchdog import longest_lease, round_trip_ceiling
 from safe_wrappers.errors import ConfigurationError
 
 SHORT = st.floats(0.0, 1.0)

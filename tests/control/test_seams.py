@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from safe_wrappers.control.handover.seams import BLENDS, join, limit_rate
+from safe_wrappers.control.handover import BLENDS, join, limit_rate
 
 HOLD = 0.1
 blends = pytest.mark.parametrize("blend", BLENDS)

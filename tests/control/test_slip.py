@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.vehicle.slip import Wheel, slip_ratio, slip_window
+from safe_wrappers.control.vehicle import Wheel, slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
 
 speeds = st.floats(-30.0, 30.0)
@@ -47,16 +47,9 @@ def test_the_window_is_the_limit(wheel, ground, limit, floor):
         assert (low < wheel < high) == (abs(slip) < limit)
 
 
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda: slip_ratio(1.0, 1.0, 0.0), "regularization"),
-        (lambda: slip_window(1.0, "much", 0.5), "max_slip"),
-    ],
-)
-def test_bad_numbers_are_refused(call, says):
-    with pytest.raises(ConfigurationError, match=says):
-        call()
+def test_a_bad_slip_is_refused():
+    with pytest.raises(ConfigurationError, match="max_slip"):
+        slip_window(1.0, "much", 0.5)
 
 
 # A driven wheel over one control interval, against MuJoCo and scipy

@@ -8,11 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from safe_wrappers.control.handover.smoothstep import (
-    SMOOTHSTEP_PEAK_RATE,
-    shortest_latched_blend,
-    smoothstep,
-)
+from safe_wrappers.control.handover import SMOOTHSTEP_PEAKS, shortest_blend, smoothstep
 
 COMMAND = st.floats(-100, 100).map(lambda x: round(x, 9))  # steps that rational arithmetic can take in a test
 LIMIT = st.floats(0.01, 100)
@@ -23,7 +19,7 @@ def test_smoothstep_is_the_quintic_between_rests_and_clamped_outside():
     s = np.linspace(0, 1, 101)
     np.testing.assert_allclose(smoothstep(s), oracle(s), atol=1e-12)
     np.testing.assert_array_equal(smoothstep([-1.0, 0.0, 1.0, 7.0]), [0, 0, 1, 1])
-    assert oracle(0.5, 1) == pytest.approx(SMOOTHSTEP_PEAK_RATE)
+    assert oracle(0.5, 1) == pytest.approx(SMOOTHSTEP_PEAKS[1])
     assert np.all(np.diff(smoothstep(np.linspace(0, 1, 100_001))) >= 0.0)
 
 
@@ -37,8 +33,8 @@ def exact_rate(prior, prior_rate, new, new_rate, s, tau):
 
 @given(COMMAND, COMMAND, LIMIT)
 def test_latched_commands_give_the_latched_formula(prior, new, limit):
-    latched = shortest_latched_blend(new - prior, limit)
-    assert shortest_latched_blend(0.0, limit) == 0.0
+    latched = shortest_blend(new - prior, limit)
+    assert shortest_blend(0.0, limit) == 0.0
     assert latched == pytest.approx(1.875 * abs(new - prior) / limit, rel=1e-11)
     if latched > 0:
         assert abs(exact_rate(prior, 0, new, 0, 0.5, latched)) <= Fraction(limit)
@@ -47,5 +43,5 @@ def test_latched_commands_give_the_latched_formula(prior, new, limit):
 
 def test_the_latched_formula_is_too_short_for_a_moving_endpoint():
     limit = 2.0
-    latched = shortest_latched_blend(1.0, limit)
+    latched = shortest_blend(1.0, limit)
     assert exact_rate(0.0, 0.5, 1.0, 0.5, 0.5, latched) > limit

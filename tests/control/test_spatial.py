@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from safe_wrappers.control.estimation.dead_reckoning import (
+from safe_wrappers.control.dead_reckoning import (
     centre_acceleration,
     from_sensor,
     lever_arm_velocity,

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles import support_margin
 
-from safe_wrappers.control.contact.friction_cone import tangents
-from safe_wrappers.control.legged.support import support_distances
+from safe_wrappers.control.contact import tangents
+from safe_wrappers.control.legged import support_distances
 
 UP = np.array([0.0, 0.0, 1.0])
 CORNERS = np.array([[0.2, 0.1, 0.0], [-0.2, 0.1, 0.0], [-0.2, -0.1, 0.0], [0.2, -0.1, 0.0]])

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import blind_covariance, double_integrator_covariance
 
-from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
+from safe_wrappers.control.estimation import Motion, Tracks, largest_deviation
 
 MOTIONS = [
     Motion(np.diag([0.3, 0.0]), np.inf, np.array([0.5, 0.0])),

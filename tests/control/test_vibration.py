@@ -5,7 +5,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.handover.vibration import modes
+from safe_wrappers.control.bandwidth import modes
 
 
 @settings(max_examples=40)

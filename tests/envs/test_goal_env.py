@@ -168,6 +168,6 @@ def test_hull_is_the_model_s(make_env):
     tip = pos[0] + size[0]
     np.testing.assert_allclose(sorted(env.robot.hull_corners), [(tip, -size[1]), (tip, size[1])])
     assert env.robot.radius == pytest.approx(np.hypot(0.15, 0.05))
-    assert env.vase_half_size == env.model.geom("vase0").size[0]
+    assert env.model.geom("vase0").size[0] == 0.1
     assert env.hazard_radius == env.model.geom("hazard0").size[0]
     assert env.goal_radius == env.model.geom("goal").size[0]

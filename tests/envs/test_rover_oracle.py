@@ -148,8 +148,8 @@ def test_a_control_step_from_any_state(env, kind):
     for _ in range(6):
         qpos, qvel = pose(rng, **KINDS[kind])
         env.set_state(qpos, qvel)
-        np.testing.assert_allclose(env.wheel_loads, loads_of(env.model, env.data), atol=1e-9)
-        loads = env.wheel_loads
+        np.testing.assert_allclose(np.array(env.data.userdata), loads_of(env.model, env.data), atol=1e-9)
+        loads = np.array(env.data.userdata)
         still = mujoco.MjData(env.model)
         still.qpos[:], still.qvel[:] = env.data.qpos, env.data.qvel
         still.qfrc_applied[:] = joint_forces(env.model, qpos, qvel, loads, env.ground.at)[0]
@@ -165,7 +165,7 @@ def test_a_control_step_from_any_state(env, kind):
             np.testing.assert_allclose(info["slip"], slips, atol=1e-8)
             assert info["slip_max"] == pytest.approx(largest, abs=1e-8)
             most = max(most, np.abs(env.data.xfrc_applied).max())
-            loads = env.wheel_loads
+            loads = np.array(env.data.userdata)
     assert (most > 1.0) == (kind not in ("in the air", "on its side"))
     if kind == "one wheel lifted":
         assert lifted > 3
@@ -178,13 +178,13 @@ def test_a_long_drive_stays_the_second_writings(env):
         {"ground": "snow", "center": [3, 0], "radius": 1},
     ]
     env.reset(seed=0, options={"layout": EMPTY | {"patches": patches, "speed": 3.0}})
-    rng, grounds, loads = np.random.default_rng(1), set(), env.wheel_loads
+    rng, grounds, loads = np.random.default_rng(1), set(), np.array(env.data.userdata)
     for k in range(70):
         if k % 12 == 0:
             control = np.append(rng.choice([-1.0, 0.3, 1.0], 4), rng.uniform(-0.4, 0.4))
         expected, _, _ = simulate(env.model, whole_state(env), control, loads, env.ground.at)
         env.step(control)
-        loads = env.wheel_loads
+        loads = np.array(env.data.userdata)
         np.testing.assert_allclose(env.data.qpos, expected.qpos, atol=1e-9)
         np.testing.assert_allclose(env.data.qvel, expected.qvel, atol=1e-7)
         grounds |= {env.ground_under(wheel) for wheel in WHEELS}

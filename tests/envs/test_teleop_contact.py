@@ -85,13 +85,13 @@ def test_the_force_that_is_observed_is_spring_and_damper_at_the_state(env):
     clamped = slipped = 0
     for _ in range(400):
         action = rng.uniform(-1, 1, 2) if rng.random() < 0.05 else np.array([0.9, -0.9])
-        place, position, velocity = raw.commanded_position, raw.tool_position, raw.tool_velocity
+        place, position, velocity = raw.data.mocap_pos[0, :2].copy(), raw.tool_position, raw.tool_velocity
         damper = np.clip(DAMPING * (action - velocity), -DAMPER_LIMIT, DAMPER_LIMIT)
         clamped += int((np.abs(damper) == DAMPER_LIMIT).any())
         observation = raw.step(action)[0]
         np.testing.assert_allclose(raw.port_effort_acted, STIFFNESS * (place - position) + damper, atol=1e-9)
         np.testing.assert_array_equal(observation[4:6], raw.port_effort)
-        stretch = STIFFNESS * math.dist(raw.commanded_position, raw.tool_position)
+        stretch = STIFFNESS * math.dist(raw.data.mocap_pos[0, :2].copy(), raw.tool_position)
         assert stretch <= SLIP + 1e-9
         slipped += stretch > SLIP - 1e-9
     assert clamped > 5 and slipped > 20
@@ -99,7 +99,7 @@ def test_the_force_that_is_observed_is_spring_and_damper_at_the_state(env):
 
 def stored_energy(raw):
     """In the tool's motion, the coupling's spring and the compressed wall and clamp, J; the tool has 1 kg."""
-    stretched = raw.commanded_position - raw.tool_position
+    stretched = raw.data.mocap_pos[0, :2].copy() - raw.tool_position
     pressed = np.maximum(raw.tool_position + TOOL_RADIUS - np.array([WALL_X, CLAMP_Y]), 0.0)
     velocity = raw.tool_velocity
     return 0.5 * (velocity @ velocity + STIFFNESS * stretched @ stretched + WALL * pressed @ pressed)

@@ -47,10 +47,28 @@ def half_spaces(*rows):
     )
 
 
-class Rows(Bound):
+class Given(Bound):
+    """It observes nothing and remembers nothing."""
+
+    spec, plant, least, may_back_up = SimpleNamespace(scale=1.0, info_keys=()), None, np.inf, False
+
+    def observe(self, memory):
+        pass
+
+    def executed(self, control):
+        return {}
+
+    def candidates(self, control):
+        return ()
+
+    def backup(self):
+        return None
+
+
+class Rows(Given):
     """Rows alone."""
 
-    predicts, rows_decide, spec, plant = False, True, SimpleNamespace(scale=1.0), None
+    predicts, rows_decide = False, True
 
     def __init__(self, *rows):
         self._own = half_spaces(*rows)
@@ -62,7 +80,7 @@ class Rows(Bound):
         return self._own
 
 
-class Predicting(Bound):
+class Predicting(Given):
     """A slack of the control is all that counts; rows, tangents, candidates and backup are given.
 
     Args:
@@ -77,7 +95,7 @@ class Predicting(Bound):
     predicts, rows_decide = True, False
 
     def __init__(self, slack, guess=(), tangents=None, candidates=(), control=None, scale=1.0):
-        self.spec, self.plant = SimpleNamespace(scale=scale), None
+        self.spec, self.may_back_up = SimpleNamespace(scale=scale, info_keys=()), control is not None
         self._slack, self._guess, self._tangents = slack, half_spaces(*guess), tangents
         self._candidates, self._control = candidates, control
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from safe_wrappers.control.numerics.compiled import IS_COMPILED
+from safe_wrappers.control.compiled import IS_COMPILED
 
 pytestmark = pytest.mark.skipif(not IS_COMPILED, reason="nothing is compiled in this process")
 

@@ -6,6 +6,7 @@ import pytest
 from fake_constraints import LAST, Predicting, Rows, Still, decide, only, search, still_plant
 
 import safe_wrappers as sw
+from safe_wrappers.filter import engine
 from safe_wrappers.filter.search import Stage
 
 NONE = np.zeros((0, 2)), np.zeros(0)
@@ -190,7 +191,7 @@ def test_what_is_shortened_keeps_the_rows():
 # Rounding ---------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_executed_is_what_was_judged():
+def test_what_is_executed_is_what_was_judged(given):
     judged = []
 
     def slack(u):
@@ -368,8 +369,11 @@ class Fake(sw.Constraint):
     def __init__(self, bound):
         self.bound = bound
 
-    def bind(self, plant):
-        return self.bound
+
+@pytest.fixture
+def given(monkeypatch):
+    """Filters take what a `Fake` is to become."""
+    monkeypatch.setattr(engine, "Bound", lambda constraint, plant: constraint.bound)
 
 
 class Still32(Still):
@@ -398,7 +402,7 @@ def reported(bound, action, **options):
         (Predicting(lambda u: u[0] - 2.0), (0.5, 0.5), 8),
     ],
 )
-def test_info_says_which_stage_answered(bound, action, stage):
+def test_info_says_which_stage_answered(given, bound, action, stage):
     options = {"fallback": "zero"} if stage == 7 else {}
     if stage == 8:  # the fallback and the proposal fail; the proposal fails less
         bound = Predicting(lambda u: u[0] - 2.0, guess=[((1.0, 0.0), 0.2)])
@@ -406,7 +410,7 @@ def test_info_says_which_stage_answered(bound, action, stage):
 
 
 @pytest.mark.filterwarnings("ignore:the policy's action is not finite")
-def test_the_fallback_answers_where_nothing_was_proposed():
+def test_the_fallback_answers_where_nothing_was_proposed(given):
     assert reported(LEFT, (np.nan, 0.0)) == [0, int(Stage.FALLBACK)]
 
 

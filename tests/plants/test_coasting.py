@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.plants.queries.coasting import Coasting
+from safe_wrappers.plants.mujoco.coasting import Coasting
 
 RADIUS = 0.22
 

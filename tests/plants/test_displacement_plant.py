@@ -7,7 +7,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants import default_plant
 
 gym.register_envs(pytest.importorskip("gymnasium_robotics"))
 

@@ -7,10 +7,9 @@ import pytest
 from asking import bound
 from oracles import in_cone
 
-from safe_wrappers.control.legged.support import centroidal_momentum
-from safe_wrappers.control.legged.whole_body import solve_cone, solve_pyramid
-from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
-from safe_wrappers.plants.queries.floating_base import MomentumReader, contact_points, equations_of_motion
+from safe_wrappers.control.legged import centroidal_momentum
+from safe_wrappers.control.whole_body import WholeBodyProblem, solve_cone, solve_pyramid
+from safe_wrappers.plants.mujoco.dynamics import MomentumReader, contact_points, equations_of_motion
 
 ZOO = """
 <mujoco>

@@ -162,8 +162,11 @@ def test_one_control_is_simulated_once_until_something_changes(monkeypatch):
     assert first == 15
     assert asked(u.copy(), 3) == (long, 0)
     assert asked(u, 2)[1] == asked(u, 1)[1] == 0  # a shorter one is its beginning
-    assert asked(u, 4)[1] == 15  # a longer one goes on from its first control interval
+    assert asked(u, 4)[1] == 20  # a longer one begins anew
     assert asked(-u, 1)[1] == 5
+    assert (
+        asked(-u, 4)[1] == 15
+    )  # but goes on from the first control interval where that was the last question
     assert asked(u, 4)[1] == 0  # and other controls in between do not matter
     plant.observe()
     same, again = asked(u, 3)

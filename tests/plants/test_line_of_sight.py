@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers  # noqa: F401 (registers the crossing)
-from safe_wrappers.plants.queries.line_of_sight import LineOfSight
+from safe_wrappers.plants.mujoco.line_of_sight import LineOfSight
 
 
 def world(inside, robot="", eye='pos="0 0 0.5"'):

@@ -7,8 +7,8 @@ import pytest
 
 import safe_wrappers  # noqa: F401 (registers the crossing)
 from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.mujoco.planar_point import planar_point, walls
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
-from safe_wrappers.plants.queries.planar_point import planar_point, walls
 
 SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>'
 BALL = '<geom type="sphere" size="0.1"/>'

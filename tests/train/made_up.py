@@ -7,7 +7,7 @@ import numpy as np
 from safe_wrappers.train.evaluation.evaluate import EVALUATION_COLUMNS, evaluation_folder
 from safe_wrappers.train.evaluation.step_log import StepLog, save_steps
 from safe_wrappers.train.files import write_rows
-from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
+from safe_wrappers.train.run.training import EPISODE_COLUMNS
 
 SILENT = dict.fromkeys(("cost", "cost_substep", "violations"), "")
 """What a task reports that judges nothing."""

@@ -4,7 +4,7 @@ import pytest
 from made_up import SILENT, episode, fill, write_evaluation
 
 from safe_wrappers.train.evaluation.summary import summarize
-from safe_wrappers.train.report.verdict import verdict
+from safe_wrappers.train.report import verdict
 
 # Training: 10 episodes of 100 steps for each of 2 seeds; evaluation 2 episodes each: 2,400 steps a side.
 

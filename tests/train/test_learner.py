@@ -141,7 +141,7 @@ def test_evaluation_never_has_the_penalty(fake_experiment, monkeypatch, algorith
     folder = experiment.run_folder(arm, 0)
     train_run(arm, 0, folder, Reports().progress)
     settings = EvaluationConfig(episodes=3, seed=7)
-    monkeypatch.setattr(sw, "AdaptionPenalty", pytest.fail)
+    monkeypatch.setattr("safe_wrappers.train.run.stack.AdaptionPenalty", pytest.fail)
     evaluate_run(arm, 0, folder, settings, FilterConfig(), Reports().progress)
     model = load_model(latest_checkpoint(folder / "checkpoints").folder, algorithm, "cpu")
     changed = 0

@@ -20,11 +20,10 @@ from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.files import only_writer, read_rows
 from safe_wrappers.train.processes import Job, RunStoppedError, work
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.run.callbacks import CheckpointCallback
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, resume
 from safe_wrappers.train.run.data_pickles import read_pickle
 from safe_wrappers.train.run.stack import make_stack, make_vec_env
-from safe_wrappers.train.run.training import finished_checkpoint
+from safe_wrappers.train.run.training import CheckpointCallback, finished_checkpoint
 
 
 class Killed(BaseException):

@@ -14,7 +14,7 @@ from safe_wrappers.train.evaluation.summary import (
     write_summary,
 )
 from safe_wrappers.train.files import write_rows
-from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
+from safe_wrappers.train.run.training import EPISODE_COLUMNS
 
 
 def episode(**values):

@@ -286,7 +286,7 @@ def test_after_a_reset_that_one_env_refuses_no_step_is_made():
     actions = np.zeros((2, 2), dtype=np.float32)
     envs.step(actions)
     refuses = mock.patch.object(
-        envs.filters[1].filter.bound[0], "check", side_effect=ConfigurationError("no")
+        envs.filters[1].filter.bound[0], "observe", side_effect=ConfigurationError("no")
     )
     with refuses, pytest.raises(ConfigurationError):
         envs.reset(seed=0)

@@ -230,7 +230,7 @@ def test_infeasible_is_reported_and_the_fallback_runs(fallback, expected):
     np.testing.assert_allclose(info["executed_action"], [expected], atol=1e-4)
     np.testing.assert_allclose(filtered.unwrapped.given[-1], [expected], atol=1e-4)
     # the next feasible step is untouched by it
-    filtered.constraints[1].on = False
+    filtered.filter.bound[1].spec.on = False
     info = filtered.step(np.array([0.9], np.float32))[4]
     assert not (info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/intervened"])
 
@@ -391,7 +391,9 @@ def test_reset_forgets_the_last_action_and_the_commands_in_flight():
 
 def test_after_a_reset_that_a_constraint_refuses_no_step_is_made():
     env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
-    refuses = mock.patch.object(env.filter.bound[0], "check", side_effect=ConfigurationError("not from here"))
+    refuses = mock.patch.object(
+        env.filter.bound[0], "observe", side_effect=ConfigurationError("not from here")
+    )
     for _ in range(2):
         with refuses, pytest.raises(ConfigurationError):
             env.reset(seed=0)

@@ -130,7 +130,7 @@ def test_a_wrong_plant_inside_the_declared_uncertainty(mass, damping):
         with warnings.catch_warnings(action="ignore"):
             total = drive(env, driver, steps=1000, seed=7)
         np.testing.assert_array_equal(env.unwrapped.model.body_mass, before)
-        assert env.filter.bound[0].drive.mass == pytest.approx(
+        assert env.filter.bound[0].spec.drive.mass == pytest.approx(
             mass * before[env.unwrapped.model.body("agent").id]
         )
         assert total["cost_substep"] == 0, (driver.__name__, total)

@@ -11,7 +11,7 @@ from meddling import Meddling
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.control.contact.impact import complementarity_residuals
+from safe_wrappers.control.contact import complementarity_residuals
 from safe_wrappers.plants.mujoco.contacts import Contacts, Replay
 
 FLOATS = (
@@ -43,8 +43,8 @@ def by_hand(env, data, substeps, bodies=None):
                 continue
             mujoco.mj_contactForce(model, data, i, wrench)
             pairs[pair] = pairs.get(pair, 0.0) + wrench[0]
-            missed = complementarity_residuals(contact.dist, wrench[0])
-            depth, residual = max(depth, missed.penetration), max(residual, missed.product)
+            penetration, product = complementarity_residuals(contact.dist, wrench[0])
+            depth, residual = max(depth, penetration), max(residual, product)
         peak = max([peak, *pairs.values()])
     return peak, depth, residual
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.constraints.obstacles import Discs
-from safe_wrappers.control.numerics.projection import cast_inside
+from safe_wrappers.control.projection import cast_inside
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning"),
@@ -104,7 +104,7 @@ def test_a_barrier_on_pendulum_is_never_broken_in_silence(alpha, torque, holds):
 @pytest.mark.parametrize("env_id", ["Swimmer-v5", "Pusher-v5", "HalfCheetah-v5"])
 def test_a_speed_limit_is_never_broken_in_silence_at_any_substep(env_id, monkeypatch):
     filtered = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.JointSpeedLimit(3.0)])
-    dofs, worst = filtered.filter.bound[0]._dofs, [0.0]
+    dofs, worst = filtered.filter.bound[0].spec._dofs, [0.0]
     raw, step = filtered.unwrapped, mujoco.mj_step
 
     def watched(model, data, nstep=1):

@@ -80,16 +80,7 @@ def _load(content: str | bytes, where: str) -> Any:
 
 
 def set_value(settings: dict[str, Any], key: str, value: Any) -> None:
-    """Gives a setting another value, in place.
-
-    Args:
-        settings: As `read_config` returns them.
-        key: With dots, such as `arms.filtered.filter`.
-        value: The new one.
-
-    Raises:
-        ConfigurationError: There is a value that has no keys where the key has more.
-    """
+    """Gives a setting another value, in place."""
     *outer, last = key.split(".")
     for name in outer:
         inner = settings.get(name)

@@ -37,9 +37,6 @@ def check_env_id(env_id: str) -> str:
 
     Imports gymnasium-robotics if it may be one of its ids. An id of the form `module:Id-v0` is left to
     `gymnasium.make`, which imports the module.
-
-    Raises:
-        UnknownNameError: An id that nobody registers; holds the nearest one.
     """
     if ":" in env_id or _registered(env_id):
         return env_id

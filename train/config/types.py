@@ -102,12 +102,7 @@ class Section:
 
 
 def validate(kind: Any, value: Any, where: str) -> Any:
-    """Returns a setting as its type has it.
-
-    Args:
-        kind: Any type that pydantic knows.
-        value: What the config says.
-        where: The setting's place in the config, such as "arms.a"; "" for the whole.
+    """Returns a setting as its type has it; `where` is its place in the config, such as "arms.a".
 
     Raises:
         UnknownNameError: A name that does not exist; the message has the nearest one and all others.

@@ -58,15 +58,8 @@ def evaluate_run(
     """Evaluates a finished run, deterministically, with the filter off and on.
 
     Episode i starts from env seed `settings.seed + i`, whatever the arm, the training seed and the filter:
-    the rows of two conditions can be compared one by one. Does nothing if this has been done already.
-
-    Args:
-        arm: The run's arm.
-        seed: The run's seed.
-        folder: The run's folder.
-        settings: Episodes and their seeds.
-        default_filter: The filter put on for an arm that has none of its own; "none" leaves that part out.
-        progress: Where to report to.
+    the rows of two conditions can be compared one by one. Does nothing if this has been done already. An arm without
+    a filter of its own is given `default_filter`.
 
     Raises:
         RunStateError: The run is not finished, its folder or policy cannot be used, or another process is at work in

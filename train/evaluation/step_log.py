@@ -73,9 +73,6 @@ def coordinates_of(env: gym.Env[Any, Any]) -> tuple[list[str], Callable[[Any], A
     - any other MuJoCo env: every joint's position and speed by name, angles of hinges without limits in [-pi, pi];
     - any other env: its observation, if that is a flat Box.
 
-    Args:
-        env: The task in its wrappers, reset.
-
     Returns:
         Names with units, and a function of the last observation that reads them, shape (names,).
     """
@@ -119,11 +116,7 @@ def _joint_names(model: Any) -> list[str]:
 
 
 class StepRecorder:
-    """Collects an evaluation's steps; keys that no filter wrote count as "did nothing".
-
-    Args:
-        env: The whole stack.
-    """
+    """Collects an evaluation's steps; keys that no filter wrote count as "did nothing"."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env = env
@@ -141,12 +134,7 @@ class StepRecorder:
         self._coordinates = self._read(observation)
 
     def after(self, action: Any, info: dict[str, Any]) -> None:
-        """Takes down what the step did.
-
-        Args:
-            action: What the policy proposed.
-            info: What the step returned.
-        """
+        """Takes down what the step did."""
         step, self._step = self._step, self._step + 1
         if len(self._rows["step"]) >= MOST_STEPS:
             self._left_out += 1

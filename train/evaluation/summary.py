@@ -126,11 +126,7 @@ def _bootstrap(values: Array, resamples: int) -> tuple[Array, Array]:
 
 
 def summarize(experiment: ExperimentConfig) -> Summary:
-    """Reads every run's rows and sums them up.
-
-    Raises:
-        RunStateError: A table is unreadable.
-    """
+    """Reads every run's rows and sums them up."""
     per_seed: list[dict[str, Any]] = []
     table: Table = {}
     for arm in experiment.arms:
@@ -206,12 +202,7 @@ def seed_row(episodes: Sequence[Mapping[str, float]], metrics: Sequence[str]) ->
 
 
 def judged_by(experiment: ExperimentConfig, judged: bool) -> str:
-    """Who judges, in a sentence for tables and pages; empty where it is the task itself.
-
-    Args:
-        experiment: The experiment.
-        judged: Whether a cost was reported at all; without one nothing can be counted as a violation.
-    """
+    """Who judges, in a sentence; empty where it is the task itself. `judged`: whether a cost was reported at all."""
     if not judged:
         return (
             "Violations are not judged: the task reports no cost. A judge for it is env.cost (module:function) or"
@@ -249,11 +240,6 @@ class Curve:
 
 def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) -> Curve | None:
     """Means over equal bins of steps, as many as leave no seed without an episode in one (at most 40).
-
-    Args:
-        experiment: Where the runs lie.
-        arm: Which arm.
-        metric: A column of the runs' `episodes.csv`.
 
     Returns:
         The curve, or None when some seed has no episode with that metric.

@@ -20,14 +20,7 @@ _ASK_S: Final = 1.0
 
 
 def check_place(on: str | None) -> None:
-    """Refuses a place where nothing can run.
-
-    Args:
-        on: None, `ray` or `ray:ADDRESS`.
-
-    Raises:
-        ConfigurationError: It is something else, or Ray is not installed.
-    """
+    """Refuses a place where nothing can run."""
     if on is None:
         return
     if on.partition(":")[0] != "ray" or on == "ray:":

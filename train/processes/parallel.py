@@ -34,14 +34,8 @@ def run_jobs(
 
     A job that fails does not stop the others. If this process is killed, the jobs' processes end by themselves.
     SIGINT, SIGTERM and SIGHUP, where they are not ignored, ask the jobs to stop and wait for at most a minute, in
-    which runs save checkpoints; a second one does not wait.
-
-    Args:
-        jobs: The work.
-        workers: Processes at a time; None for one per core that this process may use, or that the cluster has.
-        console: Where progress, messages and failures are shown.
-        title: What is going on.
-        on: Where: None for this machine, or `ray` or `ray:ADDRESS`.
+    which runs save checkpoints; a second one does not wait. `workers` is how many at a time, None for one per core of
+    this process or of the cluster; `on` is None for this machine, or `ray` or `ray:ADDRESS`.
 
     Raises:
         RunsFailedError: At least one job failed; holds all their messages.
@@ -147,11 +141,7 @@ _here: dict[str, Any] = {}
 
 
 class LocalWorkers:
-    """An executor of one process for each job: one that is killed, or runs out of memory, takes no other with it.
-
-    Args:
-        at_once: How many; None for one per core that this process may use.
-    """
+    """An executor of one process for each job: one that is killed, or runs out of memory, takes no other with it."""
 
     def __init__(self, at_once: int | None) -> None:
         # A container may have fewer than the machine; macOS does not tell.

@@ -73,12 +73,7 @@ def color_of(arm: str, arms: Sequence[str]) -> str:
 
 
 def draw(paint: Callable[[Axes], None], height: float = 2.9) -> str:
-    """One axes, painted, with its legend above it, as an SVG image for a page.
-
-    Args:
-        paint: Called with the axes.
-        height: In inches; the width is `WIDTH`.
-    """
+    """One axes, painted, with its legend above it, as an SVG image for a page."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         axes = figure.subplots()
@@ -99,14 +94,7 @@ def data_uri(kind: str, data: bytes) -> str:
 
 
 def curve_picture(title: str, unit: str, curves: Mapping[str, Curve | None], arms: Sequence[str]) -> Picture:
-    """A metric over training: the mean over seeds as a line, its interval as a band, the seeds as faint lines.
-
-    Args:
-        title: Of the picture.
-        unit: What the vertical axis counts.
-        curves: arm -> its curve; None is left out.
-        arms: All arms, in the order of their colours.
-    """
+    """A metric over training: the mean over seeds as a line, its interval as a band, the seeds as faint lines."""
     there = {arm: curve for arm, curve in curves.items() if curve is not None}
     if not there:
         return Picture(title, "No finished training episode of every seed yet.")
@@ -182,14 +170,7 @@ def telling_pair(coordinates: NDArray[np.floating], flags: NDArray[np.bool_]) ->
 
 
 def place_pictures(arm: str, log: StepLog, bare_arm: str, bare: StepLog | None) -> list[Picture]:
-    """The shares of steps that the filter changed, cell by cell of the two most telling coordinates.
-
-    Args:
-        arm: The filtered arm.
-        log: Its evaluation steps with the filter on.
-        bare_arm: The arm without the filter.
-        bare: Its steps with the filter off; where violations were is shown in the same frame.
-    """
+    """The shares of steps that the filter changed, cell by cell of the two most telling coordinates."""
     title = f"Where the filter stepped in: {arm}"
     if log.coordinates.shape[1] < 2 or not np.isfinite(log.coordinates).all():
         return [Picture(title, "This task has fewer than two coordinates that could be read.")]

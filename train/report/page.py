@@ -28,8 +28,7 @@ from ..files import read_json, write_text
 from ..run.folder import FINISHED_FILE
 from ..videos import load_video, video_path
 from .figures import CONDITIONS, Picture, curve_picture, data_uri, place_pictures, refusals
-from .tables import SHORT, every_metric, short_rows
-from .verdict import verdict
+from .tables import SHORT, every_metric, short_rows, verdict
 
 _CURVES: Final = {
     "return": ("Return", "return per episode"),
@@ -50,17 +49,8 @@ def write_report(
 ) -> Path:
     """Writes an experiment's page.
 
-    Args:
-        experiment: The experiment; what its folder holds is shown, nothing is trained.
-        summary: Its numbers.
-        command: The command that makes the experiment, for the page.
-        path: Where to; `report.html` in the experiment's folder if not given.
-
     Returns:
         Where the page is.
-
-    Raises:
-        RunStateError: There is nothing to report yet.
     """
     if not summary.per_seed:
         raise RunStateError(

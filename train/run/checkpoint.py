@@ -45,11 +45,7 @@ class Checkpoint(NamedTuple):
 
 
 def load_model(folder: Path, algorithm: str, device: str) -> BaseAlgorithm:
-    """The model of a folder, to act only.
-
-    Raises:
-        RunStateError: It cannot be read, or a pickle in it names what is no data.
-    """
+    """The model of a folder, to act only."""
     return _load(folder, algorithm, device, None, _NO_BUFFER)
 
 
@@ -102,13 +98,8 @@ def _load(
 def save_checkpoint(root: Path, model: BaseAlgorithm, facts: Mapping[str, Any], final: bool = False) -> Path:
     """Saves model, normaliser, replay buffer and random states under `root`, then drops older checkpoints.
 
-    Everything is written into a hidden folder that is renamed at the end: there is no half checkpoint.
-
-    Args:
-        root: The run's folder of checkpoints.
-        model: The model between two rollouts.
-        facts: Of the run so far, over all restarts: `timesteps`, `elapsed_s`, `filter_time_us`.
-        final: The run is finished: no replay buffer is needed any more, and no older checkpoint.
+    Everything is written into a hidden folder that is renamed at the end: there is no half checkpoint. A `final` one
+    needs no replay buffer any more, and no older one beside it.
 
     Returns:
         The checkpoint's folder.

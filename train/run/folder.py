@@ -28,11 +28,7 @@ def is_finished(arm: ArmConfig, folder: Path) -> bool:
 
 
 def check_finished(arm: ArmConfig, folder: Path) -> None:
-    """Refuses a run that is not trained to its end.
-
-    Raises:
-        RunStateError: It is not.
-    """
+    """Refuses a run that is not trained to its end."""
     if not is_finished(arm, folder):
         raise RunStateError(
             f"The run in {str(folder)!r} is not trained to its end; run `safe-wrappers train` (or `compare`)."
@@ -58,9 +54,6 @@ def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
 
     Before its first checkpoint a run has nothing that could be lost, and another may take its folder: a setting that
     is found to be wrong by the first update does not stand against the corrected command.
-
-    Raises:
-        RunStateError: Another config's; shows the settings that differ.
     """
     if not _is_begun(folder):
         return

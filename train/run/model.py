@@ -105,11 +105,7 @@ def learner_callbacks(arm: ArmConfig) -> list[BaseCallback]:
 
 
 def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
-    """Refuses an arm whose algorithm or margin does not fit this task, which only the task itself can tell.
-
-    Raises:
-        ConfigurationError: Actions of the wrong kind, or a filter without a margin.
-    """
+    """Refuses an arm whose algorithm or margin does not fit this task, which only the task itself can tell."""
     where = f"arms.{arm.name}"
     kinds: tuple[type, ...] = (spaces.Box,) if arm.algorithm in OFF_POLICY else ()
     if arm.algorithm in DISCRETE:

@@ -37,10 +37,6 @@ class SpacesEnv(gym.Env[Any, Any]):
 class TrainedPolicy:
     """The policy of a checkpoint, with the observation scaling and the action repeat that it was trained with.
 
-    Args:
-        arm: The arm that was trained.
-        folder: A checkpoint, or a policy's folder.
-
     Attributes:
         arm: The arm.
         model: As SB3 loads it.

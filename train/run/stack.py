@@ -12,17 +12,19 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.filter.engine import SafetyFilter
-from safe_wrappers.plants import MujocoPlant
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants import MujocoPlant, default_plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.recording import refuse_own_cost
+from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation, StuckEscape
+from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
+from safe_wrappers.wrappers.occlusion import OcclusionPenalty
+from safe_wrappers.wrappers.protect import protect
+from safe_wrappers.wrappers.recording import CostFunction, RecordInterventions, refuse_own_cost
 
 from ..config import NAIVE, ArmConfig, EnvConfig, FilterConfig, LearnerConfig, check_env_id
 from ..config.types import check_name
@@ -39,7 +41,7 @@ def make_vec_env(arm: ArmConfig) -> VecEnv:
 def make_training_env(arm: ArmConfig) -> gym.Env[Any, Any]:
     """One env as the arm trains in it."""
     env = make_stack(arm.env, arm.filter, arm.learner)
-    return env if arm.action_repeat == 1 else sw.ActionRepeat(env, arm.action_repeat)
+    return env if arm.action_repeat == 1 else ActionRepeat(env, arm.action_repeat)
 
 
 def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
@@ -69,25 +71,16 @@ def make_stack(
     """Makes the task with all its layers, from the judge to SB3's Monitor.
 
     The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
-    which is inside of it.
-
-    Args:
-        env: The task.
-        action_filter: The filter around it.
-        learner: In training the arm's; in evaluation none, so that no return ever holds a penalty.
-        render_mode: As `gymnasium.make` takes it; None: as the config has it.
-
-    Raises:
-        ConfigurationError: The task or the filter refuses its settings.
+    which is inside of it. Evaluation has no `learner`, so that no return ever holds a penalty.
     """
     kwargs = env.kwargs if render_mode is None else {**env.kwargs, "render_mode": render_mode}
     task = make_env(env.id, kwargs)
     if env.cost is not None:
-        task = sw.CostFunction(task, env.cost)
+        task = CostFunction(task, env.cost)
     if env.judge is not None:
         task = ConstraintJudge(task, _filtered(task, env.judge))
     if env.occlusion is not None:
-        task = _called("env.occlusion", sw.OcclusionPenalty, task, env.occlusion)
+        task = _called("env.occlusion", OcclusionPenalty, task, env.occlusion)
     observed = None if env.observation is None else _filtered(task, env.observation)
     task = _filtered(task, action_filter)
     if action_filter.lease is not None:
@@ -95,14 +88,14 @@ def make_stack(
     if observed is not None:
         task = _with_features(task, observed)
     if action_filter.escape is not None:
-        task = _called("filter.escape", sw.StuckEscape, task, action_filter.escape)
-    recorded: gym.Env[Any, Any] = sw.RecordInterventions(task)
+        task = _called("filter.escape", StuckEscape, task, action_filter.escape)
+    recorded: gym.Env[Any, Any] = RecordInterventions(task)
     for name, arguments in env.faults.items():
         fault = FAULTS[check_name(name, FAULTS, "env.faults")]
         recorded = _called(f"env.faults.{name}", fault, recorded, arguments)
     monitored = Monitor(recorded)
     return (
-        sw.AdaptionPenalty(monitored, learner.penalty, learner.per_correction)
+        AdaptionPenalty(monitored, learner.penalty, learner.per_correction)
         if learner.penalised
         else monitored
     )
@@ -120,7 +113,7 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
     """The task in its filter; as it is if there is none."""
     if action_filter.protect is not None:
         try:
-            protected: gym.Env[Any, Any] = _called("filter.protect", sw.protect, task, action_filter.protect)
+            protected: gym.Env[Any, Any] = _called("filter.protect", protect, task, action_filter.protect)
             return protected
         except UnsupportedEnvError as error:
             raise ConfigurationError(
@@ -137,14 +130,14 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
 def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     """The task with what its filter decides by; without one, what a filter around it, which is not stepped, would."""
     if filter_inside(task) is not None:
-        return sw.FilterObservation(task)
+        return FilterObservation(task)
     observer = filter_inside(observed)
     if observer is None:
         raise ConfigurationError(
             "env.observation: the filter has no constraints to observe (a CBFActionFilter has)"
         )
     plant = None if isinstance(observer.plant, MujocoPlant) else observer.plant
-    return sw.FilterObservation(task, observer.constraints, plant)
+    return FilterObservation(task, observer.constraints, plant)
 
 
 def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> gym.Env[Any, Any]:
@@ -158,7 +151,7 @@ def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> gym.Env[An
                 "budget: {clearance: {kind: ..., ...}, ...}"
             )
         budget = {"clearance": constraints[0], **budget}
-    leased: gym.Env[Any, Any] = _called("filter.lease", sw.LeaseExpiry, task, {**arguments, "budget": budget})
+    leased: gym.Env[Any, Any] = _called("filter.lease", LeaseExpiry, task, {**arguments, "budget": budget})
     return leased
 
 

@@ -28,13 +28,7 @@ Log = Callable[[dict[str, float], int], object]
 
 
 def run_logger(arm: ArmConfig, seed: int, folder: Path) -> Logger:
-    """SB3's logger of a run: TensorBoard, and the arm's trackers, in which a run that goes on is still one run.
-
-    Args:
-        arm: The run's arm; its settings are the trackers'.
-        seed: Its seed.
-        folder: The run's folder, `EXPERIMENT/ARM/seed_N`.
-    """
+    """SB3's logger of a run: TensorBoard, and the arm's trackers, in which a run that goes on is still one run."""
     where = folder / TENSORBOARD
     where.mkdir(parents=True, exist_ok=True)
     settings = {**arm.fingerprint(), "seed": seed, "folder": str(folder.resolve())}
@@ -103,11 +97,7 @@ def _mlflow(
 
 
 def check_trackers(arm: ArmConfig) -> None:
-    """Refuses a tracker that is not installed.
-
-    Raises:
-        ConfigurationError: It is not; says how to install it.
-    """
+    """Refuses a tracker that is not installed."""
     for name in arm.trackers:
         if importlib.util.find_spec(name) is None:
             raise ConfigurationError(

@@ -5,22 +5,24 @@ from __future__ import annotations
 import contextlib
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
+from safe_wrappers.wrappers.recording import COLUMNS
 
 from ..config import ArmConfig
-from ..files import only_writer, write_json
-from ..processes import Progress
-from .callbacks import CheckpointCallback, EpisodeRows
+from ..files import append_row, only_writer, read_rows, write_json, write_rows
+from ..processes import Progress, RunStoppedError
 from .checkpoint import Checkpoint, latest_checkpoint, resume, save_checkpoint
 from .folder import (
     CHECKPOINTS,
@@ -37,6 +39,8 @@ from .model import buffer_size, learner_callbacks, learning_starts, new_model, w
 from .policy import write_policy
 from .stack import make_vec_env
 from .trackers import run_logger
+
+EPISODE_COLUMNS: Final = ("timesteps", "env", *COLUMNS)
 
 
 def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> None:
@@ -165,3 +169,62 @@ def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
             f"{str(folder / CHECKPOINTS)!r} is empty; delete {str(folder)!r} and train again."
         )
     return checkpoint
+
+
+class EpisodeRows(BaseCallback):
+    """Adds a row to a CSV file for each training episode, with the run's step count at its end.
+
+    When a run goes on from a checkpoint, rows of later steps are cut first: those steps will be made again.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def _on_training_start(self) -> None:
+        rows = read_rows(self.path) if self.num_timesteps > 0 else []
+        kept = [row for row in rows if row["timesteps"] <= self.num_timesteps]
+        write_rows(self.path, EPISODE_COLUMNS, kept)
+
+    def _on_step(self) -> bool:
+        for env, info in enumerate(self.locals["infos"]):
+            if keys.EPISODE_SUMMARY in info:
+                row = {"timesteps": self.num_timesteps, "env": env, **info[keys.EPISODE_SUMMARY]}
+                append_row(self.path, EPISODE_COLUMNS, row)
+        return True
+
+
+class CheckpointCallback(BaseCallback):
+    """Saves between two rollouts, when the buffer is empty and the last update is done: now and then, and to stop.
+
+    Reports the step count, at most twice a second.
+
+    SB3's own callback saves in the midst of a rollout, from where nothing goes on bit for bit.
+    """
+
+    def __init__(self, every: int, save: Callable[[], object], progress: Progress) -> None:
+        super().__init__()
+        self.every = every
+        self.save = save
+        self.progress = progress
+        self._next = 0.0
+
+    def _on_training_start(self) -> None:
+        self._last = self.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        stopping = self.progress.stopping()
+        if self.num_timesteps - self._last >= self.every or (stopping and self.num_timesteps > 0):
+            self._last = self.num_timesteps
+            self.save()
+        if stopping:
+            raise RunStoppedError(f"stopped; goes on from step {self.num_timesteps:,}")
+
+    def _on_step(self) -> bool:
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + 0.5
+            self.progress.steps(self.num_timesteps)
+        return True
+
+    def _on_training_end(self) -> None:
+        self.progress.steps(self.num_timesteps)

@@ -14,9 +14,9 @@ from safe_wrappers.constraints.backup.base import DetourClearance
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline, nearest_discs
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.mujoco.coasting import Coasting, Course
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant, Trajectory
-from safe_wrappers.plants.queries.coasting import Coasting, Course
 
 _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
 _WAY_OUT_M = 1e-3  # gain of clearance that is asked for where zero control leaves less than the margin

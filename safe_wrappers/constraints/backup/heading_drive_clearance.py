@@ -13,9 +13,9 @@ from safe_wrappers.control.backup import drive_among_discs as among
 from safe_wrappers.control.numerics.shapes import nearest_discs
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
+from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
 
 
 @dataclass

@@ -27,9 +27,9 @@ from safe_wrappers.control.backup.evasive_maneuvers import (
 )
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.plants.mujoco.planar_point import planar_point, walls
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Model, Plant, Trajectory
-from safe_wrappers.plants.queries.planar_point import planar_point, walls
 
 
 @dataclass

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.control.compiled import compiled
 
 _MOST_HOLDS: Final = 4096
 """Length of the table, in holds of full braking; the distance beyond it is infinite."""

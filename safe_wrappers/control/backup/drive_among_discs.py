@@ -26,7 +26,7 @@ from safe_wrappers.control.backup.heading_drive import (
     predict,
     stopping_path,
 )
-from safe_wrappers.control.numerics.compiled import compiled, hypot
+from safe_wrappers.control.compiled import compiled, hypot
 
 RECOVERY_RATE: Final = 1.0
 """1/s: an unsafe start must shrink its violation at least this fast, where the drive can."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis, brake, step
-from safe_wrappers.control.numerics.compiled import compiled, hypot
+from safe_wrappers.control.compiled import compiled, hypot
 
 
 class Maneuver(NamedTuple):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled, hypot
+from safe_wrappers.control.compiled import compiled, hypot
 
 _WANDER = 0.012
 """Bound on the lateral deviation of the stopping path, per metre of sideways coasting: drag turns a sliding body.

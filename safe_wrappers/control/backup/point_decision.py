@@ -25,7 +25,7 @@ from safe_wrappers.control.backup.point_among_walls import (
     step,
     stop,
 )
-from safe_wrappers.control.numerics.compiled import compiled, hypot
+from safe_wrappers.control.compiled import compiled, hypot
 from safe_wrappers.control.numerics.shapes import Rectangle, closer, gaps, nearest, one_of
 
 HAIR_M: Final = 1e-7

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.control.compiled import compiled
 from safe_wrappers.control.numerics.shapes import nearest_points
 
 _RETREAT_RATE: Final = 1.0

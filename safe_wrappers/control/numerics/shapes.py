@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.numerics.compiled import compiled, hypot
+from safe_wrappers.control.compiled import compiled, hypot
 from safe_wrappers.errors import ConfigurationError
 
 Rectangle = tuple[float, float, float, float]

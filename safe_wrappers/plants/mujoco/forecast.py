@@ -66,9 +66,8 @@ class Recorder(Remade):
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int) -> None:
         self._model, self._data, self.substeps, self.nq = model, data, substeps, int(model.nq)
         self.is_runge_kutta = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-        # Data at the end of the latest forecast's first control interval, and the bytes of what was held.
-        self._held: mujoco.MjData | None = None
-        self._held_after = b""
+        self._resets = data.warning.number[RESETS]
+        self._at_end_of = b""  # the control after whose first control interval the data is
         self._still = mujoco.MjData(model)
         # A unit force accelerates its joints by acc0 (in the reference pose), a transmission by gear times that.
         control_dt = substeps * model.opt.timestep
@@ -90,47 +89,46 @@ class Recorder(Remade):
         """Hold a control, shape (nu,), for one control interval; in the others each actuator brakes its own joints.
 
         The data starts at the present state and is left at the end, after `horizon` >= 1 control intervals. With
-        `first`, its forecast over one interval, it goes on from there if that was the latest one. With `euler` the
-        intervals that brake are simulated by Euler steps, where the model's own are Runge-Kutta's, which cost four.
+        `first`, its trajectory over one interval, it goes on from there: see `goes_on`. With `euler` the intervals
+        that brake are simulated by Euler steps, where the model's own are Runge-Kutta's, which cost four.
         """
-        m, data, n = self._model, self._data, self.substeps
         path, published = self._empty(horizon)
-        if first is None or self._held is None or self._held_after != control.tobytes():
+        if first is None:
             self._begin(control)
             whole = self.simulate(0, 1, path, published)
-            # Data are large: only plants that forecast have these.
-            self._held = mujoco.MjData(m) if self._held is None else self._held
-            mujoco.mj_copyData(self._held, m, data)
-            self._held_after = control.tobytes()
         else:
             whole = 1
-            mujoco.mj_copyData(data, m, self._held)
-            path[:n], published[:1] = first.states, first.published
+            path[: self.substeps], published[:1] = first.states, first.published
         if whole and horizon > 1:
             whole = (self._by_euler_steps if euler else self.simulate)(1, horizon, path, published)
-        return self._forecast(control, path, published, whole)
+        self._at_end_of = control.tobytes() if whole == horizon == 1 else b""
+        return self._trajectory(control, path, published, whole)
+
+    def goes_on(self, control: Array) -> bool:
+        """Whether the data is still where a recording of this control over one interval has left it."""
+        return self._at_end_of == control.tobytes()
 
     def forget(self) -> None:
-        """Called when the present state has changed: what is held belongs to another one."""
-        self._held_after = b""
+        """Called when the data is at another state."""
+        self._at_end_of = b""
 
     def sketch(self, control: Array, horizon: int) -> MujocoTrajectory:
         """A forecast as `record` makes it, but by Euler steps from the start; nothing is held."""
         path, published = self._empty(horizon)
         self._begin(control)
         whole = self._by_euler_steps(0, horizon, path, published)
-        return self._forecast(control, path, published, whole)
+        return self._trajectory(control, path, published, whole)
 
     def _empty(self, horizon: int) -> tuple[Array, Array]:
         m = self._model
         return np.empty((horizon * self.substeps, m.nq + m.nv)), np.empty((horizon, 2, m.nbody, 3))
 
     def _begin(self, control: Array) -> None:
-        self._data.warning.number[RESETS] = 0
+        self._resets[:] = 0
         self.place(self._data)
         self.act(self._data, control)
 
-    def _forecast(self, control: Array, path: Array, published: Array, whole: int) -> MujocoTrajectory:
+    def _trajectory(self, control: Array, path: Array, published: Array, whole: int) -> MujocoTrajectory:
         if whole < len(published):
             # After a reset, MuJoCo's response to numbers out of bounds, all numbers may look plausible.
             path[whole * self.substeps :] = published[whole:] = np.nan
@@ -162,7 +160,7 @@ class Recorder(Remade):
             euler: The steps are Euler's in the place of Runge-Kutta's; what they publish does not lag.
         """
         m, data, n = self._model, self._data, self.substeps
-        frames, centres, resets = data.xpos, data.xipos, data.warning.number[RESETS]
+        frames, centres, resets = data.xpos, data.xipos, self._resets
         for hold in range(begin, end):
             if hold:
                 self.brake(data)

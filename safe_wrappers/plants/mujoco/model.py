@@ -199,12 +199,10 @@ class Constants(Remade):
         numbers = [name for name, value in values.items() if not isinstance(value, np.ndarray)]
         self._options, self._numbers = model.opt, operator.attrgetter(*numbers)
         self._views = [array.reshape(-1).view(np.uint8).data for array in arrays if array.size]
-        self._seen = self._now()
-
-    def _now(self) -> tuple[Any, bytes]:
-        return self._numbers(self._options), b"".join(self._views)
+        self._seen: Any = None
+        self.changed()
 
     def changed(self) -> bool:
         """Whether they are not what they were when this was made, or at the last call."""
-        before, self._seen = self._seen, self._now()
-        return before != self._seen
+        before, self._seen = self._seen, (self._numbers(self._options), b"".join(self._views))
+        return bool(before != self._seen)

@@ -9,13 +9,12 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array, non_negative
+from safe_wrappers.control.bandwidth import ControlLoop
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
-from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
-from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
-from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
+from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Poses, Recorder
 from safe_wrappers.plants.mujoco.model import (
@@ -60,12 +59,13 @@ class MujocoPlant(Plant):
     """
 
     can_brake: ClassVar[bool] = True
+    _sends_controls: ClassVar[bool] = True  # an action says what the env's controls are
     model: mujoco.MjModel  #: the plant's own
     data: mujoco.MjData  #: likewise; at the present state only after `forward` or `pose`
     _loaded = _forwarded = False
     lower: Array = np.zeros(0)  #: of the action, shape (nu,), once bound: ctrlrange, or -inf and inf
     upper: Array = np.zeros(0)
-    action_map: ActionMap | None = None
+    action_map: binding.ActionMap | None = None
 
     def __init__(
         self,
@@ -128,7 +128,6 @@ class MujocoPlant(Plant):
         if moved or model is not source.model:
             self.data = mujoco.MjData(model)
         self.actuators = AffineActuators(model)
-        self._response = Response(model, self.data, self.actuators)
         lower, upper = of_model.control_range(model)
         if moved or not (np.array_equal(lower, self._range[0]) and np.array_equal(upper, self._range[1])):
             self._range = self.lower, self.upper = lower, upper
@@ -153,20 +152,17 @@ class MujocoPlant(Plant):
 
     def _new_recorder(self) -> Recorder:
         stepped = self.model, self.data, self.substeps
-        return Recorder(*stepped) if self.action_map is None else MappedRecorder(*stepped, self.action_map)
+        return (
+            Recorder(*stepped)
+            if self.action_map is None
+            else binding.MappedRecorder(*stepped, self.action_map)
+        )
 
     def _bind_actions(self, env: gym.Env[Any, Any]) -> None:
         """Find the bounds of the action, and the map from it to the control."""
-        self.action_map = None
-        are_controls = binding.actions_are_controls(env.action_space, self.lower, self.upper)
-        if are_controls and np.isfinite(self.lower).all():
-            return
-        binding.refuse_other_actions(env, self.lower, self.upper)
-        found = find_action_map(env, self._source, are_controls)
-        if are_controls and found.is_identity:
-            return
-        self.action_map = found
-        self.lower, self.upper = found.low, found.high
+        self.action_map = binding.action_map_of(env, self._source, self.lower, self.upper)
+        if self.action_map is not None:
+            self.lower, self.upper = self.action_map.low, self.action_map.high
 
     def controls(self, action: Array) -> Array:
         """The model's control that the env makes of an action, shapes (nu,)."""
@@ -184,7 +180,6 @@ class MujocoPlant(Plant):
         """Called when the state or the model has changed."""
         self._loaded = self._forwarded = False
         self._affine: tuple[Array, Array] | None = None
-        self._recorder.forget()
         self._forecasts: dict[tuple[bytes, bool], MujocoTrajectory] = {}
         self._contact_forecasts: dict[bytes, ContactForecast] = {}
         self._present: _Present | None = None
@@ -223,20 +218,15 @@ class MujocoPlant(Plant):
             return f"a step took {passed:g} s of simulation instead of {self.control_dt:g} s"
         if self._dynamics.changed():
             return "the env's model changed during the step"
-        return self._other_control(data, sent) or self._other_state(data, sent)
-
-    def _other_control(self, data: mujoco.MjData, sent: Array) -> str:
         control = self.controls(sent)
-        same = data.ctrl.tobytes() == control.tobytes() or np.allclose(data.ctrl, control, *_ROUNDING)
-        return "" if same else f"the env was sent {control} and applied {data.ctrl}"
-
-    def _other_state(self, data: mujoco.MjData, sent: Array) -> str:
+        if self._sends_controls and not _same(data.ctrl, control):
+            return f"the env was sent {control} and applied {data.ctrl}"
         key = sent.tobytes()
         known = self._forecasts.get((key, False)) or self._forecasts.get((key, True))
         if known is None or self._delay_steps:
             return ""
         state, end = np.concatenate([data.qpos, data.qvel]), known.states[self.substeps - 1]
-        same = state.tobytes() == end.tobytes() or np.allclose(state, end, *_ROUNDING, equal_nan=True)
+        same = _same(state, end)
         return "" if same else f"the step ended {np.abs(state - end).max():.3g} from its forecast"
 
     def follow(self) -> None:
@@ -262,6 +252,7 @@ class MujocoPlant(Plant):
 
     def _load(self) -> None:
         if not self._loaded:
+            self._recorder.forget()
             mujoco.mj_setState(self.model, self.data, self._snapshot, STATE)
             self._loaded, self._forwarded = True, False
 
@@ -332,8 +323,7 @@ class MujocoPlant(Plant):
     def acceleration(self) -> tuple[Array, Array]:
         """`qacc = drift + effect @ u`: shapes (nv,) and (nv, nu)."""
         if self._affine is None:
-            self.forward()
-            self._affine = self._response.drift_and_effect()
+            self._affine = self.actuators.drift_and_effect(self.forward())
             if self.action_map is not None:
                 self._affine = self.action_map.per_action(*self._affine)
         return self._affine
@@ -346,10 +336,7 @@ class MujocoPlant(Plant):
         """
         if not self._clamped:
             return self.lower, self.upper
-        motion = self.actuators.motion_without_kinematics(self.qpos, self.qvel)
-        if motion is None:
-            data = self.forward()
-            motion = data.actuator_length, data.actuator_velocity
+        motion = self.actuators.motion(self.pose())
         ends = self.actuators.acting_range(*motion, self.control_dt)
         return ends if self.action_map is None else self.action_map.actions_between(*ends)
 
@@ -364,9 +351,13 @@ class MujocoPlant(Plant):
         key = control.tobytes()
         known = self._forecasts.get((key, euler))
         if known is None or known.holds < horizon:
-            known = known or self._forecasts.get((key, not euler))
-            self._load_to_step()
-            known = self._recorder.record(control, horizon, known and known.first(1), euler)
+            first = known or self._forecasts.get((key, not euler))
+            if first is not None and self._recorder.goes_on(control):
+                first = first.first(1)
+            else:
+                first = None
+                self._load_to_step()
+            known = self._recorder.record(control, horizon, first, euler)
             self._forecasts[key, euler] = known
         return known.first(horizon)
 
@@ -436,13 +427,19 @@ class MujocoPlant(Plant):
 
         The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
-        response = self.acceleration
+        drift, effect = self.acceleration
         p, jacobian = self.frames.jacobian(kind, name)
-        return p.copy(), *point_motion(jacobian, self.frames.jacobian_rate(kind, name), self.qvel, *response)
+        rate = self.frames.jacobian_rate(kind, name)
+        return p.copy(), jacobian @ self.qvel, jacobian @ drift + rate @ self.qvel, jacobian @ effect
 
     def attribute(self, name: str) -> Any:
         found = getattr(self._raw, name, None)
         return found if found is not None else env_checks.read_attribute(self._env, name)
+
+
+def _same(one: Array, other: Array) -> bool:
+    """Whether they are equal up to rounding, NaN included."""
+    return one.tobytes() == other.tobytes() or np.allclose(one, other, *_ROUNDING, equal_nan=True)
 
 
 class _Present(MujocoTrajectory):

@@ -18,8 +18,7 @@ from simulated_worlds import (
 
 import safe_wrappers as sw
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.simulator.copies import EnvCopier
-from safe_wrappers.plants.simulator.simulation import simulation_of
+from safe_wrappers.plants.copies import EnvCopier, Simulation
 
 ENVS = ("Pendulum-v1", "CartPole-v1", "FrozenLake-v1", "HalfCheetah-v5", "SafePointGoal1-v0", "Humanoid-v5")
 ROBOTICS = ("PointMaze_UMaze-v3", "FetchPush-v4")
@@ -196,7 +195,7 @@ def test_the_noise_of_the_env_is_foreseen():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no child processes here")
 def test_errors_of_a_child_come_back_and_its_end_is_noticed():
     env = Cart()
-    simulation = simulation_of(env, "fork")
+    simulation = Simulation(env, "fork")
     env.reset(seed=0)
     with pytest.raises(ZeroDivisionError):
         simulation.run(lambda other: 1 / 0)

@@ -1,1 +1,0 @@
-"""Constraints on contacts: impact speed, friction cones, support."""

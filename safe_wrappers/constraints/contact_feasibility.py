@@ -1,0 +1,309 @@
+"""ContactFeasibility, SupportMargin and Stance: what the forces between ground and robot have to keep."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import info as keys
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
+from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
+from safe_wrappers.control import whole_body
+from safe_wrappers.control.contact import cone_excess
+from safe_wrappers.control.legged import support_distances
+from safe_wrappers.control.whole_body import (
+    WholeBodyProblem,
+    WholeBodySolution,
+    WholeBodyStatus,
+    predicted_position_rows,
+)
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import Constraint, Memory
+from safe_wrappers.plants.mujoco.binding import refuse_mapped
+from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
+from safe_wrappers.plants.mujoco.dynamics import equations_of_motion
+from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
+from safe_wrappers.plants.plant import Model, Plant, Trajectory
+
+_EDGES = 8  # of the pyramids inside the friction cones
+_SETTLE_S = 0.05  # time constant in which what still moves at a contact is to come to rest, s
+_REFUSED = 1e-6  # by how much a control that no forces can hold misses at least, shares of the weight
+_SAME = 1e-9  # distance from the program's answer that is rounding, control units
+
+
+@dataclass
+class ContactFeasibility(Constraint):
+    """Keep every contact force of the robot with the fixed world inside a narrower friction cone: `|f_t| <= mu f_n`.
+
+    In a simulator all forces are inside the model's cone, and those on it slide: so the required cone is narrower.
+
+    Best effort: an executed control that is not flagged keeps every contact force of its control step, at every
+    evaluation of the physics, within cone and tolerance, for a plant that is right. Such a control need not exist: a
+    foot that lands sideways slides. Balance is not promised.
+
+    Args:
+        friction_share: Of the model's friction coefficient, in (0, 1]. MuJoCo's default cones are pyramids: above
+            0.71 a foot may slide within its share.
+        tolerance: By how much a force may miss its cone, as a share of the robot's weight: light touches scrape.
+        margin: Kept free inside the cone, as a share of the weight. More than the tolerance refuses light touches.
+
+    Source: appendix "Physical contact feasibility constraints".
+    """
+
+    friction_share: float = 0.7
+    tolerance: float = 0.01
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.friction_share = checked_friction_share(self.friction_share)
+        check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
+
+    info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
+    measures_state: ClassVar[bool] = False
+
+    def setup(self, plant: Plant) -> None:
+        super().setup(require_contacts(plant, "ContactFeasibility"))
+        self.model = ContactModel(self.plant)
+        self._chosen = np.flatnonzero(touching_bodies(self.plant, "there is no cone to stay in"))
+        self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
+
+    def h_along(self, path: ContactForecast | None) -> Array:
+        """By how much each body's contact forces stay inside the cone, tolerance added, shares of the weight.
+
+        At most as much as is asked for: differences between a touch and none would say nothing of the touch. NaN
+        where the simulation has diverged.
+        """
+        if path is None:
+            return np.zeros((1, 0))
+        worst = np.full(self.plant.model.nbody, np.inf if path.finite else np.nan)
+        along = np.einsum("ki,ki->k", path.force, path.normal)
+        across = np.linalg.norm(path.force - along[:, None] * path.normal, axis=1)
+        inside = np.minimum(along, self.friction_share * path.friction * along - across)
+        np.minimum.at(worst, path.body, inside / weight_n(self.plant.model))
+        worst, least = worst[self._chosen], float(worst[self._chosen].min())
+        self.report[keys.WHOLE_BODY_CONE_MARGIN] = least if np.isfinite(least) else 0.0
+        return (np.minimum(worst, self.margin) + self.tolerance)[None]
+
+
+class ContactModel(Model):
+    """The contacts with the fixed world while a control is held for one control interval; None: nothing is known."""
+
+    def __init__(self, plant: MujocoPlant) -> None:
+        self._plant = plant
+
+    def rollout(self, control: Array | None, horizon: int = 1) -> ContactForecast | None:
+        return None if control is None else self._plant.contact_forecast(control)
+
+
+def require_contacts(plant: Plant, asker: str) -> MujocoPlant:
+    """The plant, if it can forecast contact forces."""
+    hint = "forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
+    return require_mujoco(plant, f"{asker} {hint}")
+
+
+def checked_friction_share(share: float) -> float:
+    """A share of the model's friction, in (0, 1]."""
+    share = positive("friction_share", share, "shares of the model's friction")
+    if share > 1.0:
+        raise ConfigurationError(
+            f"friction_share is in (0, 1], got {share}: no simulated ground holds more than its own friction; a "
+            "model with more is MujocoPlant(model=...)"
+        )
+    return share
+
+
+def touching_bodies(plant: MujocoPlant, lacking: str) -> NDArray[np.bool_]:
+    """Which bodies can touch the fixed world, shape (nbody,); refuses a model that has none."""
+    touching = can_touch_the_world(plant.model)
+    if not touching.any():
+        raise UnsupportedEnvError(f"no body of this model can touch the fixed world with friction: {lacking}")
+    return touching
+
+
+@dataclass
+class SupportMargin(Constraint):
+    """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
+
+    Without at least three contact points in one plane that are not on a line there is no polygon and no requirement.
+
+    Best effort: an executed control that is not flagged keeps the inset at every evaluation of the physics of its
+    control step at which there is a polygon, for a plant that is right. Such a control need not exist.
+
+    Args:
+        inset: m, positive: pushing forces alone keep the point inside the hull. An inset of millimetres can be
+            crossed between two evaluations.
+        margin: Kept free inside the inset, m.
+
+    Source: appendix "Physical contact feasibility constraints", third condition and footnote 8.
+    """
+
+    inset: float
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
+        self.margin = non_negative("margin", self.margin, "m")
+
+    info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_ZMP_MARGIN,)
+    measures_state: ClassVar[bool] = False
+
+    def setup(self, plant: Plant) -> None:
+        super().setup(require_contacts(plant, "SupportMargin"))
+        self.model = ContactModel(self.plant)
+        self.report = {keys.WHOLE_BODY_ZMP_MARGIN: 0.0}
+
+    def h_along(self, path: ContactForecast | None) -> Array:
+        """Distance to the edge minus the inset where it is least, m; the margin where there is no polygon."""
+        if path is None:
+            return np.zeros((1, 0))
+        if not path.finite:
+            self.report[keys.WHOLE_BODY_ZMP_MARGIN] = 0.0
+            return np.array([[np.nan]])
+        distances = support_distances(path.step, path.point, path.normal, path.force)
+        self.report[keys.WHOLE_BODY_ZMP_MARGIN] = least = float(min(distances, default=0.0))
+        return np.array([[least - self.inset if len(distances) else self.margin]])
+
+
+@dataclass
+class Stance(Constraint, Model):
+    """Keep to torques under which standing feet could stay: the whole-body program at one instant.
+
+    Contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; the others
+    open. A control is admitted if forces inside the narrowed friction cones can hold them.
+
+    Best effort: at this instant, for rigid contacts and a plant that is right, such forces exist. Changes within the
+    control step are not in it (`ContactFeasibility` forecasts them).
+
+    Args:
+        friction_share: Of the model's friction coefficient, in (0, 1].
+        cone: "pyramid" is conservative and quick, "exact" is the cone itself.
+        joint_tolerance: How far driven joints may press their stops, rad or m; None leaves them alone.
+
+    Source: appendix "Hierarchical whole-body control quadratic program".
+    """
+
+    friction_share: float = 0.7
+    cone: Literal["pyramid", "exact"] = "pyramid"
+    joint_tolerance: float | None = 0.1
+
+    def __post_init__(self) -> None:
+        self.friction_share = checked_friction_share(self.friction_share)
+        if self.cone not in ("pyramid", "exact"):
+            raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
+        if self.joint_tolerance is not None:
+            self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
+
+    info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
+    measures_state: ClassVar[bool] = False
+    smooth: ClassVar[bool] = False
+
+    def setup(self, plant: Plant) -> None:
+        hint = "Stance reads inertia and contacts from a MujocoPlant whose controls are forces"
+        super().setup(require_mujoco(plant, hint))
+        if not plant.has_acceleration:
+            raise UnsupportedEnvError(hint)
+        refuse_mapped(self.plant.action_map, "Stance")
+        touching_bodies(self.plant, "there is nothing to stand on")
+        if self.joint_tolerance is not None:
+            refuse_uncovered_stops(self.plant.model)
+        joints, low, high = stops(self.plant.model)
+        wider = self.joint_tolerance or 0.0
+        self._low, self._high = low - wider, high + wider
+        self._qpos, self._dofs = self.plant.model.jnt_qposadr[joints], self.plant.model.jnt_dofadr[joints]
+        self.model = self
+        self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
+
+    def observe(self, memory: Memory) -> None:
+        self._known = False
+        self._problem: WholeBodyProblem | None = None
+        self._answer: WholeBodySolution | None = None
+
+    def problem(self, control: Array) -> WholeBodyProblem | None:
+        """The observed state's program; the first control, shape (m,), says which contacts open. None: not finite."""
+        if not self._known:
+            self._known, self._problem = True, self._write_down(control)
+        return self._problem
+
+    def _write_down(self, control: Array) -> WholeBodyProblem | None:
+        data = self.plant.under(control)
+        motion = equations_of_motion(self.plant.model, data, self.plant.actuators)
+        found = motion.contacts
+        # Beyond this MuJoCo resets the state in its step.
+        within = bool((np.abs(self.plant.state) < mujoco.mjMAXVAL).all())
+        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
+            return None  # nothing can be said
+        ground = fixed_bodies(self.plant.model)[found.pushed_by]
+        # What the robot's bodies do to each other, and other things to it, stays as it is.
+        bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
+        jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
+        pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
+        acceleration = -(jacobians @ self.plant.qvel) / _SETTLE_S
+        limits: dict[str, Any] = {}
+        if self.joint_tolerance is not None:
+            position, speed = self.plant.qpos[self._qpos], self.plant.qvel[self._dofs]
+            joints = self._dofs, position, speed, self._low, self._high
+            limits["accelerations"] = predicted_position_rows(
+                *joints, self.plant.control_dt, self.plant.model.nv
+            )
+        limits |= {"contact_acceleration": acceleration, "breaking": ~pressing}
+        limits["first_tangents"] = found.first_tangents[ground]
+        contacts = jacobians, drift, normals, self.friction_share * found.friction[ground]
+        controls = self.plant.lower, self.plant.upper, control
+        problem = WholeBodyProblem(motion.inertia, bias, motion.actuation, *contacts, *controls, **limits)
+        # Two points of one rigid foot cannot come to rest each as it likes.
+        attainable = whole_body.attainable_contact_acceleration(problem)
+        return replace(problem, contact_acceleration=attainable)
+
+    def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
+        exact = self.cone == "exact"
+        return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, _EDGES)
+
+    def _holds(self, control: Array) -> bool:
+        """Whether the standing contacts could answer this control with forces inside their cones."""
+        problem = self.problem(control)
+        if problem is None:
+            return False
+        answer = self._answer or self._ask(problem, control)
+        if np.array_equal(control, self._asked):
+            return answer.status is WholeBodyStatus.INACTIVE
+        if answer.status is WholeBodyStatus.INFEASIBLE:
+            return False  # whatever the control
+        if float(np.abs(control - answer.control).max()) <= _SAME:
+            return answer.status is not WholeBodyStatus.FAILED
+        return self.solve(replace(problem, nominal=control)).status is WholeBodyStatus.INACTIVE
+
+    def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
+        self._asked, self._answer = proposed.copy(), self.solve(replace(problem, nominal=proposed))
+        return self._answer
+
+    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
+        """The present instant, under the control."""
+        return Trajectory(control, self.plant.state[None])
+
+    def h_along(self, path: Trajectory) -> Array:
+        """What the forces that would hold the contacts leave of their cones, shares of the weight."""
+        if path.control is None:
+            return np.zeros((1, 0))
+        # An action space of another precision than the model's range may be a rounding wider.
+        control = np.clip(path.control, self.plant.lower, self.plant.upper)
+        problem = self.problem(control)
+        if problem is None:
+            return np.array([[-np.inf]])
+        forces = whole_body.rigid_forces(problem, control)
+        missed = cone_excess(forces, problem.normals, problem.friction)
+        left = -float(missed.max()) / weight_n(self.plant.model) if len(forces) else 0.0
+        self.report[keys.WHOLE_BODY_CONE_MARGIN] = left
+        return np.array([[max(left, 0.0) if self._holds(control) else min(left, -_REFUSED)]])
+
+    def proposals(self, control: Array | None) -> Iterator[Array]:
+        """The program's answer; where there is none, the proposed control, which is refused."""
+        if control is None:
+            return
+        proposed = np.clip(control, self.plant.lower, self.plant.upper)
+        problem = self.problem(proposed)
+        if problem is not None:  # another constraint may have refused before this one was asked
+            yield (self._answer or self._ask(problem, proposed)).control

@@ -1,1 +1,0 @@
-"""Limits on joints, speeds, tilt and workspace, judged on a rollout of the model."""

@@ -1,1 +1,0 @@
-"""Contacts: complementarity, impacts, body regions, friction cones."""

@@ -1,0 +1,289 @@
+"""Estimates with and without measurements: covariance, tracks of moving objects, and what outputs never show.
+
+A linear system x' = A x + b + w has white noise of the *intensity* Q (covariance kernel Q delta(t - s)), in units of
+x^2 / s. Without measurements the covariance follows the Lyapunov equation P' = A P + P A' + Q, exactly from step to
+step; a measurement is a Kalman update of Joseph's form: symmetric and positive semidefinite for any gain, rounding
+included.
+
+An initial error in an unobservable direction never shows in the outputs, so no filter corrects it. Full rank says
+that the state can be determined from ideal outputs, not how accurately or how soon. Of a linear system the Lie
+derivatives of the outputs are C A^k x, so that this is their rank test, too.
+
+Source: appendix "Continuous Lyapunov and Riccati covariance dynamics" and "Observability rank"; Van Loan (1978) for
+the discretisation; Anderson and Moore, "Optimal Filtering" (1979), section 6.7, for doubling; Bar-Shalom, Li,
+Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), section 5.2.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.checks import Array
+
+_KEPT: Final = 256
+"""Number of cached discretisations."""
+TOLERANCE: Final = 1e-9
+"""Singular values up to this share of the scale count as zero."""
+_PIVOT: Final = 0.1
+"""Share of the largest coefficient from which on one may be divided by."""
+
+
+def discretise(A: ArrayLike, Q: ArrayLike, time_s: float) -> tuple[Array, Array]:
+    """The exact step over a time, x -> F x plus noise of covariance Q_d: F = exp(A t) and Q_d, shape (n, n) each.
+
+    The exponential is taken over a time in which A changes little, where it is well conditioned, and doubled.
+
+    Args:
+        A: System matrix, 1/s, shape (n, n).
+        Q: Intensity of the process noise, positive semidefinite, shape (n, n).
+        time_s: s, at least 0.
+    """
+    from scipy.linalg import expm  # here: SciPy takes a while to import
+
+    a, q = np.asarray(A, dtype=np.float64), np.asarray(Q, dtype=np.float64)
+    n, size = len(a), float(np.linalg.norm(q)) or 1.0
+    doublings = max(math.ceil(math.log2(max(float(np.linalg.norm(a)) * time_s, 1.0))), 0)
+    base = time_s / 2.0**doublings
+    exponential = expm(base * np.block([[-a, q / size], [np.zeros((n, n)), a.T]]))
+    transition = exponential[n:, n:].T
+    noise = size * (transition @ exponential[:n, n:])
+    for _ in range(doublings):
+        noise = transition @ noise @ transition.T + noise
+        transition = transition @ transition
+    return transition, 0.5 * (noise + noise.T)
+
+
+def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: float) -> Array:
+    """Displacement by a constant drift b of x' = A x + b, the integral of `exp(A s) b` over a time, shape (n,)."""
+    from scipy.linalg import expm
+
+    a, drift = np.asarray(A, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    whole = np.block([[a, drift[:, None]], [np.zeros((1, len(a) + 1))]])
+    return np.asarray(expm(time_s * whole)[:-1, -1])
+
+
+def predict(
+    mean: Array, cov: Array, transition: Array, noise: Array, drift: Array | float = 0.0
+) -> tuple[Array, Array]:
+    """Mean and covariance after one step without a measurement: `x -> F x + d`, `P -> F P F' + Q_d`.
+
+    Args:
+        mean: Estimate, shape (..., n).
+        cov: Its covariance, shape (..., n, n).
+        transition: F, shape (n, n), or one per track.
+        noise: Q_d, shape (n, n), or one per track.
+        drift: d, known displacement in this step, shape (n,) or (..., n).
+    """
+    moved = (transition @ mean[..., None])[..., 0] + drift
+    grown = transition @ cov @ np.swapaxes(transition, -1, -2) + noise
+    return moved, 0.5 * (grown + np.swapaxes(grown, -1, -2))
+
+
+def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> tuple[Array, Array]:
+    """Mean and covariance after one measurement `y = C x + v` per track.
+
+    Args:
+        mean: Estimate, shape (..., n).
+        cov: Its covariance, shape (..., n, n).
+        measured: y, shape (..., m).
+        C: Measurement matrix, shape (m, n), or one per track.
+        R: Covariance of v (not its intensity), positive definite, shape (m, m), or one per track.
+    """
+    cross = cov @ np.swapaxes(C, -1, -2)
+    gain = cross @ np.linalg.inv(C @ cross + R)
+    innovation = measured - (C @ mean[..., None])[..., 0]
+    left = np.eye(cov.shape[-1]) - gain @ C
+    kept = left @ cov @ np.swapaxes(left, -1, -2) + gain @ R @ np.swapaxes(gain, -1, -2)
+    mean = mean + (gain @ innovation[..., None])[..., 0]
+    return mean, 0.5 * (kept + np.swapaxes(kept, -1, -2))
+
+
+class Motion(NamedTuple):
+    """Motion model of one track: `p' = v`, `v' = (mean_velocity - v) / reversion_s + w`.
+
+    Attributes:
+        intensity: Of the acceleration noise w, q, shape (d, d), m^2/s^3.
+        reversion_s: Time constant with which the velocity reverts to its mean, s; inf for none.
+        mean_velocity: Shape (d,), m/s.
+    """
+
+    intensity: Array
+    reversion_s: float
+    mean_velocity: Array
+
+    def matrices(self) -> tuple[Array, Array, Array]:
+        """A (2d, 2d), the constant drift b (2d,) and the noise intensity Q (2d, 2d) of `x' = A x + b + w`."""
+        d, rate = self.mean_velocity.size, 1.0 / self.reversion_s
+        a, q = np.zeros((2 * d, 2 * d)), np.zeros((2 * d, 2 * d))
+        a[:d, d:] = np.eye(d)
+        a[d:, d:] = -rate * np.eye(d)
+        q[d:, d:] = self.intensity
+        return a, np.concatenate([np.zeros(d), rate * self.mean_velocity]), q
+
+    def over(self, time_s: float) -> tuple[Array, Array, Array]:
+        """Transition (2d, 2d), drift (2d,) and noise (2d, 2d) over a time."""
+        a, b, q = self.matrices()
+        transition, noise = discretise(a, q, time_s)
+        return transition, discretise_drift(a, b, time_s), noise
+
+
+class Tracks:
+    """Means and covariances of n tracks, each with the state (position, velocity).
+
+    Args:
+        motions: One per track, all of the same number of coordinates d, one to three.
+
+    Attributes:
+        size: Of a state: 2d.
+        mean: Positions and velocities, shape (n, 2d), m and m/s.
+        covariance: Shape (n, 2d, 2d).
+    """
+
+    def __init__(self, motions: Sequence[Motion]) -> None:
+        self.motions = list(motions)
+        self.coordinates = self.motions[0].mean_velocity.size
+        self.size = 2 * self.coordinates
+        self.mean = np.zeros((len(self.motions), self.size))
+        self.covariance = np.zeros((len(self.motions), self.size, self.size))
+        self._known: dict[float, tuple[Array, ...]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is computed again: a pickle stores it in another order, and sums would round otherwise."""
+        return vars(self) | {"_known": {}}
+
+    @property
+    def positions(self) -> Array:
+        """Estimated positions, shape (n, d), m."""
+        return self.mean[:, : self.coordinates]
+
+    @property
+    def velocities(self) -> Array:
+        """Estimated velocities, shape (n, d), m/s."""
+        return self.mean[:, self.coordinates :]
+
+    @property
+    def position_covariances(self) -> Array:
+        """Shape (n, d, d), m^2."""
+        return self.covariance[:, : self.coordinates, : self.coordinates]
+
+    def start(self, mean: Array, covariance: Array) -> None:
+        """Begin with a prior: shapes (n, 2d) and (n, 2d, 2d)."""
+        self.mean = np.array(mean, dtype=np.float64)
+        self.covariance = np.array(covariance, dtype=np.float64)
+
+    def advance(self, time_s: float) -> None:
+        """Predict over a time without measurements."""
+        transition, drift, noise = self._over(time_s)
+        self.mean, self.covariance = predict(self.mean, self.covariance, transition, noise, drift)
+
+    def see(self, which: NDArray[np.intp], measured: Array, matrix: Array, noise: Array) -> None:
+        """Update some tracks with measurements.
+
+        Args:
+            which: Their indices, shape (k,).
+            measured: Shape (k, m).
+            matrix: C of all of them, shape (m, 2d).
+            noise: Covariance R of all of them, shape (m, m).
+        """
+        before = self.mean[which], self.covariance[which]
+        self.mean[which], self.covariance[which] = update(*before, measured, matrix, noise)
+
+    def ahead(self, times_s: Sequence[float]) -> tuple[Array, Array]:
+        """Positions (k, n, d), m, and covariances (k, n, d, d), m^2, at k times ahead without measurements."""
+        d = self.coordinates
+        parts = [(f[:, :d], b[:, :d], q[:, :d, :d]) for f, b, q in map(self._over, times_s)]
+        transition, drift, noise = (np.stack(part) for part in zip(*parts, strict=True))
+        positions = (transition @ self.mean[:, :, None])[..., 0] + drift
+        return positions, transition @ self.covariance @ transition.swapaxes(-1, -2) + noise
+
+    def _over(self, time_s: float) -> tuple[Array, ...]:
+        """Transition, drift and noise of all tracks over a time."""
+        if time_s not in self._known:
+            if len(self._known) >= _KEPT:
+                self._known.clear()
+            different = {id(motion): motion for motion in self.motions}
+            each = {key: motion.over(time_s) for key, motion in different.items()}
+            parts = zip(*(each[id(motion)] for motion in self.motions), strict=True)
+            self._known[time_s] = tuple(np.stack(part) for part in parts)
+        return self._known[time_s]
+
+
+def largest_deviation(covariances: Array) -> Array:
+    """The standard deviation in the direction in which it is largest, shape (...,), of covariances (..., d, d)."""
+    if covariances.shape[-1] == 2:
+        a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+        largest = np.asarray(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
+    else:
+        largest = np.asarray(np.linalg.eigvalsh(covariances)[..., -1])
+    return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
+
+
+def unobservable_subspace(a: Array, c: Array, tolerance: float = TOLERANCE) -> Array:
+    """Orthonormal basis of what outputs C x of x' = A x never show, shape (n, n - rank).
+
+    The largest subspace in the kernel of C that A maps into itself, by orthogonal projections: no powers of A, whose
+    fast modes would hide the slow ones.
+
+    Args:
+        a: A, shape (n, n), of a size of about 1.
+        c: C, shape (m, n), likewise.
+        tolerance: What is seen by no more than this counts as not seen.
+    """
+    basis, seen = np.eye(len(a)), c
+    while basis.shape[1]:
+        _, values, axes = np.linalg.svd(seen)
+        rank = int((values > tolerance).sum())
+        if rank == 0:
+            break
+        basis = basis @ axes[rank:].T
+        moved = a @ basis
+        seen = moved - basis @ (basis.T @ moved)
+    return np.asarray(basis)
+
+
+def unobservable_directions(A: ArrayLike, C: ArrayLike, names: Sequence[str]) -> tuple[str, ...]:
+    """The states' combinations that no output C x of x' = A x shows, one for each unobservable direction.
+
+    Args:
+        A: Shape (n, n), 1/s.
+        C: Shape (m, n); a row of zeros measures nothing.
+        names: Of the n states, in comparable units.
+
+    >>> # A position that is measured, and a bias on a velocity that is not:
+    >>> unobservable_directions([[0, 1, 1], [0, 0, 0], [0, 0, 0]], [[1, 0, 0]], names=("x", "v", "bias"))
+    ('v - bias',)
+    """
+    a, c = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
+    lengths = np.linalg.norm(c, axis=1, keepdims=True)
+    scaled = a / (np.linalg.norm(a, 2) or 1.0), c / np.where(lengths > 0.0, lengths, 1.0)
+    return tuple(_described(row, names) for row in _reduced(unobservable_subspace(*scaled).T))
+
+
+def _reduced(rows: Array) -> Array:
+    """The row-reduced basis of the space that independent rows span, shape (k, n), by its first states."""
+    rows = rows.copy()
+    pivots: list[int] = []
+    for i in range(len(rows)):
+        sizes = np.abs(rows[i:]).max(axis=0)
+        pivot = int(np.argmax(sizes >= _PIVOT * sizes.max()))
+        best = i + int(np.argmax(np.abs(rows[i:, pivot])))
+        rows[[i, best]] = rows[[best, i]]
+        rows[i] /= rows[i, pivot]
+        others = np.arange(len(rows)) != i
+        rows[others] -= rows[others, pivot][:, None] * rows[i]
+        pivots.append(pivot)
+    return rows[np.argsort(pivots)]
+
+
+def _described(direction: Array, names: Sequence[str]) -> str:
+    """A direction (n,) in state space as a sum: "x - 0.75 y"."""
+    text = ""
+    for name, coefficient in zip(names, direction, strict=True):
+        if abs(coefficient) > 1e-8:
+            size = f"{abs(coefficient):.3g}"
+            sign = " - " if coefficient < 0.0 else " + " if text else ""
+            text += sign + (name if size == "1" else f"{size} {name}")
+    return text.strip()

@@ -1,1 +1,0 @@
-"""Covariance without measurements, Kalman filter, tracks, observability."""

@@ -1,1 +1,0 @@
-"""Control barrier functions and distance from singular poses."""

@@ -1,1 +1,0 @@
-"""Blends from one command sequence to the next, and the seams between them."""

@@ -1,1 +1,0 @@
-"""Balance: momentum, zero moment point, support, whole-body program."""

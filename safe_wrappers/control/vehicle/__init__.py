@@ -1,1 +1,0 @@
-"""Wheels: slip, traction curves, friction estimate."""

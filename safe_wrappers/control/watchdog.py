@@ -1,0 +1,260 @@
+"""Watchdog: how long a command may stay in force without renewal, and how far a machine comes within a time.
+
+**Leases.** The distance travelled from the reading of the clearance until full braking, and the stopping distance,
+must fit into the clearance:
+
+    travel(lease + detect + hold + age + act) + stopping distance + localisation + margin <= clearance
+
+In the appendix the machine keeps its speed until it brakes; with `acceleration` it may speed up until then. A lease
+of zero or less means: revoke now. Rounding only shortens a lease, and inputs that are not finite revoke.
+
+**Reach.** `furthest` and `admits` are necessary bounds: no reachable goal is refused. `jerk_limited_time` asks
+ruckig. Metres stand for any unit of length.
+
+Source: appendix "Kinematic derivation of watchdog validity leases", "Teleoperation network round-trip time bounds"
+and "Trajectory transit time and reachable distance".
+"""
+
+import math
+
+import numpy as np
+import ruckig
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.checks import Array
+from safe_wrappers.errors import ConfigurationError
+
+_ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
+"""Relative bound on the accumulated rounding of the formulas below."""
+_TINY = 1e-300
+"""Absolute reserve for subnormal numbers, whose relative precision is lost."""
+_LONGEST = 1e300
+"""s; largest finite lease, so that nothing overflows."""
+_AT_ONCE = 1e300
+"""m/s^2; a braking that takes no way."""
+
+
+def longest_lease(
+    clearance: ArrayLike,
+    speed: ArrayLike,
+    braking: ArrayLike,
+    delays_s: ArrayLike,
+    localisation: ArrayLike = 0.0,
+    margin: ArrayLike = 0.0,
+    acceleration: ArrayLike = 0.0,
+    top_speed: ArrayLike = np.inf,
+) -> Array:
+    """The longest T_lease, s, shape (...), after which a machine without renewal still stops inside the clearance.
+
+    With tau = T_lease + delays_s, approach speed v (at most `top_speed`), acceleration a and braking b the travel is
+    `v tau + a tau^2 / 2`, the stopping distance `(v + a tau)^2 / (2 b)`. inf for a machine that recedes or stands
+    still, cannot accelerate and has room left; -inf where an input (but `top_speed`) is not finite, where the braking
+    is not positive, and where a machine that does not approach has no room left. Never NaN.
+
+    Args:
+        clearance: D_clear as measured `age` ago, m, shape (...).
+        speed: Approach speed as measured then, m/s, positive towards the obstacle, shape (...).
+        braking: Verified lower bound on the deceleration, m/s^2, shape (...).
+        delays_s: T_detect + T_hold + t_age + T_act, s, shape (...).
+        localisation: delta_loc, bound on the error of the clearance, m, shape (...).
+        margin: delta_margin, clearance at rest, m, shape (...).
+        acceleration: Largest approach acceleration that any command may cause until the brakes hold, m/s^2.
+        top_speed: Bound on the approach speed that this acceleration may lead to, m/s; a measured speed above it
+            counts as the bound. inf: none.
+
+    Raises:
+        ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
+    """
+    given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
+    # Scalar arithmetic: for the few leases of a control step it is faster than arrays.
+    several = np.broadcast(*(np.asarray(x, dtype=np.float64) for x in given))
+    _not_negative(delays_s=delays_s, localisation=localisation, margin=margin)
+    _not_negative(acceleration=acceleration, top_speed=top_speed)
+    return np.array([_lease(*map(float, one)) for one in several]).reshape(several.shape)
+
+
+def _lease(d: float, v: float, b: float, late: float, loc: float, gap: float, a: float, top: float) -> float:
+    """`longest_lease` of one machine."""
+    if not (all(map(math.isfinite, (d, v, b, late, loc, gap, a))) and b > 0.0) or math.isnan(top):
+        return -math.inf
+    top = max(top, v)
+    braking_way = max(v, 0.0) * max(v, 0.0) / (2.0 * b)
+    room = d - loc - gap
+    room -= _ROUNDING * (abs(d) + loc + gap + braking_way)
+    if v <= 0.0:
+        if room <= 0.0:
+            return -math.inf
+        if a == 0.0 or top == 0.0:
+            return math.inf
+    share = 1.0 / (1.0 + a / b)
+    onset = math.hypot(math.sqrt(2.0 * a) * math.sqrt(max(room, 0.0)), v) * math.sqrt(share)
+    if onset > top:
+        way_to_top = 0.5 * (top - v) * ((top + v) / a)
+        stop_from_top = top * top / (2.0 * b)
+        left = room - way_to_top - stop_from_top
+        left -= _ROUNDING * (abs(way_to_top) + stop_from_top)
+        tau = (top - v) / a + left / top
+    elif v < 0.0:
+        tau = (onset - v) / a
+    elif onset + v == 0.0:  # a speed that underflowed counts as unknown
+        return -math.inf
+    else:
+        # Without the difference of two nearly equal speeds, and right for a = 0 too.
+        tau = 2.0 * share * (room - braking_way) / (onset + v)
+    tau = min(tau, _LONGEST)
+    lease = tau - late - _ROUNDING * (abs(tau) + late) - _TINY
+    return -math.inf if math.isnan(lease) else lease
+
+
+def round_trip_ceiling(
+    clearance: ArrayLike,
+    speed: ArrayLike,
+    braking: ArrayLike,
+    video_s: ArrayLike,
+    human_s: ArrayLike,
+    act_s: ArrayLike,
+    localisation: ArrayLike = 0.0,
+    margin: ArrayLike = 0.0,
+) -> Array:
+    """The longest network round trip, s, shape (...), at which a remote operator can still stop the machine in time.
+
+    Downlink and uplink together, `T_RTT <= (D_clear - d_brake) / v - (T_video + T_human + T_act)`. `video_s` lasts
+    from the exposure to the operator's display without the downlink, `human_s` is the reaction (0.15 to 0.25 s in the
+    appendix), `act_s` lasts until full deceleration; s, at least 0. The rest is as of `longest_lease`. It bounds
+    displacement, not energy or contact force.
+    """
+    _not_negative(video_s=video_s, human_s=human_s, act_s=act_s)
+    video, human, act = (np.asarray(late, dtype=np.float64) for late in (video_s, human_s, act_s))
+    with np.errstate(over="ignore"):
+        late = video + human + act
+    return longest_lease(clearance, speed, braking, late, localisation, margin)
+
+
+def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
+    """The longest lease, s, shape (...), from a barrier that includes the stopping distance: `h / closing - delays`.
+
+    Where h cannot fall (closing speed <= 0): inf if it is positive, else -inf; -inf for inputs that are not finite.
+
+    Args:
+        room: Value h of the barrier, the clearance left after braking, in any unit U, shape (...).
+        closing_speed: Bound on how fast h may fall under any command until the brakes hold, U/s, shape (...).
+        delays_s: The other four delays, s, at least 0, shape (...).
+    """
+    return longest_lease(room, closing_speed, _AT_ONCE, delays_s)
+
+
+def _not_negative(**values: ArrayLike) -> None:
+    for name, value in values.items():
+        # Empty arrays, of no surface near, pass.
+        least = value if isinstance(value, float) else np.min(np.asarray(value, np.float64), initial=np.inf)
+        if least < 0.0:
+            raise ConfigurationError(f"{name} must not be negative, got {least:g}")
+
+
+State = tuple[ArrayLike, ArrayLike, ArrayLike]
+"""Position (m), velocity (m/s), acceleration (m/s^2), each of shape (axes,) or scalar."""
+
+
+def furthest(
+    duration: ArrayLike, velocity: ArrayLike, max_speed: ArrayLike, max_acceleration: ArrayLike
+) -> tuple[Array, Array]:
+    """Bounds on the displacement, m, at any moment within a time, from a moving start to any speed at the end.
+
+    The lowest (<= 0) and the highest (>= 0), shape (...) each; (inf, -inf) where the duration is negative or anything
+    is not finite. They are exact: no admissible motion gets farther. A start outside the limits widens them.
+
+    Args:
+        duration: s, shape (...).
+        velocity: At the start, m/s, shape (...).
+        max_speed: m/s, shape (...); inf: none.
+        max_acceleration: m/s^2, shape (...), finite.
+    """
+    a_max, v_max = checked_limits(max_acceleration, max_speed)
+    time, v = (np.asarray(x, dtype=np.float64) for x in (duration, velocity))
+    known = np.isfinite(time) & np.isfinite(v) & (time >= 0.0)
+    time, v = (np.where(known, x, 0.0) for x in (time, v))
+    up, down = _highest(time, v, v_max, a_max), _highest(time, -v, v_max, a_max)
+    known = np.broadcast_to(known, up.shape)
+    return np.where(known, -down, np.inf), np.where(known, up, -np.inf)
+
+
+def _highest(time: Array, v: Array, v_max: Array, a_max: Array) -> Array:
+    """The largest displacement within the time: full acceleration, then full speed."""
+    top = np.maximum(v_max, v)
+    climb = np.minimum(time, (top - v) / a_max)
+    cruise = time - climb
+    with np.errstate(invalid="ignore"):
+        cruised = np.where(cruise > 0.0, top * cruise, 0.0)
+    way = climb * (v + 0.5 * a_max * climb) + cruised
+    size = climb * (np.abs(v) + a_max * climb) + np.abs(cruised)
+    return np.asarray(np.maximum(way, 0.0) + 2.0 * _ROUNDING * size)
+
+
+def admits(
+    goal: ArrayLike,
+    position: ArrayLike,
+    velocity: ArrayLike,
+    duration: ArrayLike,
+    max_speed: ArrayLike,
+    max_acceleration: ArrayLike,
+) -> NDArray[np.bool_]:
+    """Whether a position may be reached within a time, at any speed, axis by axis: a necessary condition.
+
+    False: no admissible motion gets there, anything is not finite, or the duration is negative. `goal` and `position`
+    are in m, shape (...), the other arguments those of `furthest`.
+    """
+    lowest, highest = furthest(duration, velocity, max_speed, max_acceleration)
+    end, start = np.asarray(goal, dtype=np.float64), np.asarray(position, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        way, slack = end - start, 2.0 * _ROUNDING * (np.abs(end) + np.abs(start))
+        return np.asarray((lowest - slack <= way) & (way <= highest + slack) & np.isfinite(way))
+
+
+def jerk_limited_time(
+    start: State,
+    end: State,
+    max_acceleration: ArrayLike,
+    max_speed: ArrayLike = math.inf,
+    max_jerk: ArrayLike = math.inf,
+) -> float:
+    """The shortest time, s, in which all axes arrive at their end state together.
+
+    A start outside the limits is first brought back inside. inf where ruckig finds no profile, where a state is not
+    finite, and where the end state violates the limits: too fast, too strongly accelerated, or reached only from
+    above the speed limit.
+
+    Args:
+        start: Position, velocity, acceleration, of each axis.
+        end: Likewise.
+        max_acceleration: m/s^2, finite; of all axes or of each, shape (axes,).
+        max_speed: m/s, likewise; inf: none.
+        max_jerk: m/s^3, likewise; inf: none.
+    """
+    limits = *checked_limits(max_acceleration, max_speed), np.asarray(max_jerk)
+    given = [np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (*start, *end, *limits)]
+    p0, v0, a0, p1, v1, a1, a_max, v_max, jerk = np.broadcast_arrays(*given)
+    with np.errstate(invalid="ignore", over="ignore"):
+        # With an end acceleration against the motion, the speed before was higher.
+        before = np.where(v1 * a1 < 0.0, 0.5 * a1 * (a1 / jerk), 0.0)
+        possible = (np.abs(v1) + before <= v_max) & (np.abs(a1) <= a_max)
+    if not (possible.all() and all(np.isfinite(x).all() for x in (p0, v0, a0, p1, v1, a1))):
+        return math.inf
+    request, trajectory = ruckig.InputParameter(p0.size), ruckig.Trajectory(p0.size)
+    request.current_position, request.current_velocity, request.current_acceleration = p0, v0, a0
+    request.target_position, request.target_velocity, request.target_acceleration = p1, v1, a1
+    request.max_acceleration, request.max_velocity, request.max_jerk = a_max, v_max, jerk
+    try:
+        ruckig.Ruckig(p0.size).calculate(request, trajectory)
+    except ruckig.RuckigError:
+        return math.inf
+    return float(trajectory.duration)
+
+
+def checked_limits(max_acceleration: ArrayLike, max_speed: ArrayLike) -> tuple[Array, Array]:
+    """Acceleration (finite) and speed limits as float64, all positive."""
+    acceleration, speed = (np.asarray(x, dtype=np.float64) for x in (max_acceleration, max_speed))
+    if not ((acceleration > 0.0) & np.isfinite(acceleration)).all():
+        raise ConfigurationError(f"max_acceleration must be positive and finite, got {max_acceleration!r}")
+    if not (speed > 0.0).all():
+        raise ConfigurationError(f"max_speed must be positive (inf: no limit), got {max_speed!r}")
+    return acceleration, speed

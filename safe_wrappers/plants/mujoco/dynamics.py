@@ -1,0 +1,299 @@
+"""The equations of motion of a MuJoCo model, M qacc + h = B u + sum J_k' f_k, and what follows from them.
+
+They hold with MuJoCo's own accelerations and forces, to rounding. The base may float (a free joint) or not. Contacts
+are points: MuJoCo's torsional and rolling friction (condim 4 and 6) is in no force. MuJoCo's contacts are soft, and
+its solver ignores the drift `dJ/dt qvel`. The drift here is that of the material points that touch at present; under
+a round foot that rolls, such a point moves into the foot.
+"""
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.checks import Array
+from safe_wrappers.control.bandwidth import modes
+from safe_wrappers.control.legged import CentroidalMomentum, centroidal_momentum
+from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.mujoco.actuators import AffineActuators
+from safe_wrappers.plants.mujoco.binding import refuse_mapped
+from safe_wrappers.plants.mujoco.model import (
+    AT_A_JOINT,
+    SCALAR_JOINTS,
+    control_range,
+    fixed_bodies,
+    inertia,
+    kinematics,
+)
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+
+_CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)  # this type and those above are contacts
+LEFT_OVER: Final = 0.05
+"""Share of a vibration's amplitude that may be left after a control interval for a rigid model to be good enough."""
+
+
+class ContactPoints(NamedTuple):
+    """The k contacts of MuJoCo's solver. The world is never the pushed body."""
+
+    points: Array  #: shape (k, 3), m
+    normals: Array  #: unit normals, pointing at the pushed body, shape (k, 3)
+    first_tangents: Array  #: the first axis of MuJoCo's friction pyramid, shape (k, 3)
+    friction: Array  #: coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1)
+    pushed_by: NDArray[np.intp]  #: ids of the other bodies, shape (k,)
+    jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
+    drift: Array  #: `dJ/dt qvel`, shape (k, 3), m/s^2
+    forces: Array  #: on the pushed body, as MuJoCo's solver found them last, shape (k, 3), N
+
+
+class FloatingBaseTerms(NamedTuple):
+    """The equations of motion at one state.
+
+    The bias has Coriolis, centrifugal and gravity forces, minus passive and applied forces, minus the actuators'
+    forces at zero control, minus constraint forces other than contacts, as MuJoCo found them for the data's control.
+    """
+
+    inertia: Array  #: M with armature, shape (nv, nv)
+    bias: Array  #: h, shape (nv,)
+    actuation: Array  #: B, shape (nv, nu): generalised force per control, inside the actuators' force ranges
+    contacts: ContactPoints
+
+
+def equations_of_motion(
+    model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators | None = None
+) -> FloatingBaseTerms:
+    """The terms at the state of the data, which are only read and must be up to date (`mj_forward`).
+
+    Raises:
+        UnsupportedEnvError: An actuator that is not affine in its control; not checked where `actuators` are given.
+    """
+    acts = AffineActuators(model) if actuators is None else actuators
+    gain, _ = acts.gain_and_bias(data.actuator_length, data.actuator_velocity)
+    actuation = np.array(acts.moment(data).T * gain)
+    others = np.zeros(model.nv)  # generalised force of all constraints but the contacts
+    if data.nefc:
+        mujoco.mj_mulJacTVec(model, data, others, np.where(data.efc_type < _CONTACT, data.efc_force, 0.0))
+    bias = actuation @ np.clip(data.ctrl, *control_range(model)) - data.qfrc_smooth - others
+    return FloatingBaseTerms(inertia(model, data), bias, actuation, contact_points(model, data))
+
+
+def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
+    """The contacts of data that are up to date (`mj_forward`).
+
+    Raises:
+        UnsupportedEnvError: Something flexible is in contact, which has no body.
+    """
+    found, fixed = data.contact, fixed_bodies(model)
+    touching = np.flatnonzero(found.efc_address >= 0)
+    if (found.geom[touching] < 0).any():
+        raise UnsupportedEnvError("something flexible is in contact, which has no body")
+    bodies, frames = model.geom_bodyid[found.geom[touching]], found.frame[touching].reshape(-1, 3, 3)
+    # MuJoCo's normal points from the first geom to the second, and its force pushes the second.
+    turned = fixed[bodies[:, 1]][:, None]
+    signs, bodies = np.where(turned, -1.0, 1.0), np.where(turned, bodies[:, ::-1], bodies)
+    jacobians = np.zeros((len(touching), 3, model.nv))
+    forces, drift = np.zeros((len(touching), 3)), np.zeros((len(touching), 3))
+    jac, dot, wrench = np.zeros((3, model.nv)), np.zeros((3, model.nv)), np.zeros(6)
+    for row, i in enumerate(touching.tolist()):
+        mujoco.mj_contactForce(model, data, i, wrench)
+        forces[row] = signs[row] * (wrench[:3] @ frames[row])
+        for body, side in zip(bodies[row].tolist(), (-1.0, 1.0), strict=True):
+            if not fixed[body]:
+                mujoco.mj_jac(model, data, jac, None, found.pos[i], body)
+                mujoco.mj_jacDot(model, data, dot, None, found.pos[i], body)
+                jacobians[row] += side * jac
+                drift[row] += side * (dot @ data.qvel)
+    friction = np.where(found.dim[touching] > 1, found.friction[touching, 0], 0.0)
+    geometry = np.array(found.pos[touching]), signs * frames[:, 0], np.array(frames[:, 1]), friction
+    return ContactPoints(*geometry, bodies[:, 0], jacobians, drift, forces)
+
+
+class MomentumReader:
+    """Computes the momentum of the moving bodies among those chosen, a mask of shape (nbody,), by MuJoCo's subtrees.
+
+    With a chosen body all that hangs from it is chosen. Armature, of no body, is left out.
+    """
+
+    def __init__(self, model: mujoco.MjModel, chosen: NDArray[np.bool_]) -> None:
+        self._model, self._data = model, mujoco.MjData(model)
+        moving = chosen & ~fixed_bodies(model)
+        self._roots = np.flatnonzero(moving & ~moving[model.body_parentid] & (model.body_subtreemass > 0.0))
+
+    def read(self, data: mujoco.MjData) -> CentroidalMomentum | None:
+        """The momentum at the state of the data, which are only read; None where numbers are not finite."""
+        model, own, roots = self._model, self._data, self._roots
+        kinematics(model, data, own)
+        mujoco.mj_subtreeVel(model, own)
+        parts = own.subtree_com[roots], own.subtree_linvel[roots], own.subtree_angmom[roots]
+        if not np.isfinite(parts).all():
+            return None
+        return centroidal_momentum(model.body_subtreemass[roots], *parts)
+
+
+class InverseDynamics:
+    """M q'' + bias at the joints of a plant's position servos, as if these followed their targets.
+
+    Joints without a servo stand still where the env has them. What touches, and what limits joints, is left out.
+
+    Args:
+        plant: Bound; all its actuators are position servos on hinges or slides.
+
+    Raises:
+        UnsupportedEnvError: Other actuators, or actions that are not the model's controls.
+    """
+
+    def __init__(self, plant: MujocoPlant) -> None:
+        refuse_mapped(plant.action_map, "a torque limit of position commands")
+        self._plant = plant
+        self._read_model()
+
+    def _read_model(self) -> None:
+        model, self._model_version = copy.copy(self._plant.model), self._plant.model_version
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        self._model, self._data = model, mujoco.MjData(model)
+        joints = model.actuator_trnid[: model.nu, 0]
+        for i, joint in enumerate(joints):
+            on_joint = model.actuator_trntype[i] in AT_A_JOINT and model.jnt_type[joint] in SCALAR_JOINTS
+            gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
+            if not (on_joint and gain > 0.0 and bias[1] == -gain and bias[0] == 0.0):
+                raise UnsupportedEnvError(
+                    f"actuator {model.actuator(i).name or i!r} is no position servo of a hinge or slide, so its "
+                    "command tells no torque: limit velocity, acceleration and jerk"
+                )
+        self._at, self._dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        self._gear = model.actuator_gear[: model.nu, 0].copy()
+
+    def torques(self, positions: Array, velocities: Array, accelerations: Array) -> Array:
+        """N m (N for slides), all shape (k, m), by `mj_inverse`: passive forces of the joints are counted."""
+        torques = np.zeros_like(positions)
+        for i, data in enumerate(self._placed(positions)):
+            data.qvel[:] = data.qacc[:] = 0.0
+            data.qvel[self._dof] = velocities[i] / self._gear
+            data.qacc[self._dof] = accelerations[i] / self._gear
+            mujoco.mj_inverse(self._model, data)
+            torques[i] = data.qfrc_inverse[self._dof]
+        return torques
+
+    def inertia(self, positions: Array) -> Array:
+        """Of the driven joints per command, at positions (k, m), shape (k, m, m), kg m^2 (kg for slides)."""
+        found = np.zeros((*positions.shape, positions.shape[1]))
+        for matrix, data in zip(found, self._placed(positions), strict=True):
+            mujoco.mj_fwdPosition(self._model, data)
+            matrix[:] = inertia(self._model, data)[np.ix_(self._dof, self._dof)] / self._gear
+        return found
+
+    def _placed(self, positions: Array) -> Iterator[mujoco.MjData]:
+        """The data at each of the positions of the servos' joints."""
+        self._plant.observe()
+        if self._plant.model_version != self._model_version:
+            self._read_model()
+        for position in positions:
+            self._data.qpos[:] = self._plant.qpos
+            self._data.qpos[self._at] = position / self._gear
+            yield self._data
+
+
+@dataclass(frozen=True)
+class RigidModelCheck:
+    """What `rigid_model_check` found; printed, it is the verdict.
+
+    Attributes:
+        springs: Names of the joints that are springs behind a motor; empty if there are none.
+        resonances: Of the springs, at the pose of the check, the slowest first, rad/s.
+        damping_ratios: Of each of them, to first order in the damping.
+        boundary_layer_s: Time constant with which the slowest of the vibrations decays, 1 / (ratio resonance), s;
+            infinite without damping, 0 without springs.
+        control_dt: Control interval of the env, s.
+    """
+
+    springs: tuple[str, ...]
+    resonances: tuple[float, ...]
+    damping_ratios: tuple[float, ...]
+    boundary_layer_s: float
+    control_dt: float
+
+    @property
+    def left_over(self) -> float:
+        """Share of a vibration's amplitude that is left after one control interval."""
+        return float(np.exp(-self.control_dt / self.boundary_layer_s)) if self.boundary_layer_s > 0.0 else 0.0
+
+    @property
+    def rigid_is_good_enough(self) -> bool:
+        """Whether every vibration is gone, but for 5 %, before the next command comes."""
+        return self.left_over <= LEFT_OVER
+
+    def __str__(self) -> str:
+        """The verdict and why, in one sentence."""
+        if not self.springs:
+            return "rigid model is good enough: no spring lies behind a motor"
+        found = zip(self.resonances, self.damping_ratios, strict=True)
+        rings = ", ".join(f"{w / (2.0 * np.pi):.3g} Hz (damping ratio {z:.2g})" for w, z in found)
+        return (
+            f"rigid model is {'' if self.rigid_is_good_enough else 'not '}good enough: {rings}; the slowest decay "
+            f"takes {self.boundary_layer_s:.3g} s, and {self.left_over:.0%} of the amplitude is left after a control "
+            f"interval of {self.control_dt:.3g} s"
+        )
+
+
+def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) -> RigidModelCheck:
+    """Whether a rigid model of a MuJoCo env is good enough, by its springs' vibrations at the present pose.
+
+    A spring is a hinge or slide with stiffness that no actuator drives, with a driven joint before it on the way from
+    the world. Inertia, stiffness and damping are linearised; servos on the motors count, gravity, contacts and joint
+    limits do not.
+    The appendix: below the slowest vibration's time scale the rigid manifold holds; a vibration that is not gone when
+    the next command comes is excited again and again.
+
+    Args:
+        env: Any with a MuJoCo model, after a reset or in the pose to be checked.
+        plant: A `MujocoPlant` that says where model and data are, bound to this env or to none; None: a new one.
+
+    Raises:
+        UnsupportedEnvError: No MuJoCo model, or one that `MujocoPlant` does not handle.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> print(sw.plants.rigid_model_check(gym.make("FlexJointReach-v0")))  # doctest: +ELLIPSIS
+        rigid model is not good enough: 10.1 Hz (damping ratio ...
+    """
+    plant = MujocoPlant() if plant is None else plant
+    plant.bind(env)
+    plant.observe()
+    data, model = plant.forward(), plant.model
+    moment = plant.actuators.moment(data)
+    scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
+    springs = _springs(model, np.asarray(moment.any(axis=0)), scalar)
+    if not len(springs):
+        return RigidModelCheck((), (), (), 0.0, plant.control_dt)
+    stiffness, damping = np.zeros((model.nv, model.nv)), np.diag(model.dof_damping)
+    every = model.jnt_dofadr[scalar]
+    stiffness[every, every] = model.jnt_stiffness[scalar]
+    affine = (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE))[: len(moment)]
+    fed_back = -model.actuator_biasprm[: len(moment)] * affine[:, None]
+    stiffness += moment.T * fed_back[:, 1] @ moment
+    damping = damping + moment.T * fed_back[:, 2] @ moment
+    found = modes(inertia(model, data), stiffness, damping)
+    at_springs = found.shapes[model.jnt_dofadr[springs]]
+    own = (at_springs**2 * model.jnt_stiffness[springs][:, None]).sum(axis=0)  # of the stored energy
+    chosen = (found.resonances > 0.0) & (own > 0.5 * found.resonances**2)
+    resonances, ratios = found.resonances[chosen], found.damping_ratios[chosen]
+    slowest = float((resonances * ratios).min(initial=np.inf))
+    names = tuple(model.joint(int(j)).name or f"#{j}" for j in springs)
+    decay = 1.0 / slowest if slowest > 0.0 else np.inf
+    return RigidModelCheck(names, tuple(resonances.tolist()), tuple(ratios.tolist()), decay, plant.control_dt)
+
+
+def _springs(model: mujoco.MjModel, driven: NDArray[np.bool_], scalar: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Joints with stiffness that no actuator drives and that have a driven joint before them, shape (n,)."""
+    found = []
+    for j in np.flatnonzero(scalar & (model.jnt_stiffness > 0.0)):
+        dof = before = int(model.jnt_dofadr[j])
+        while before >= 0 and not driven[before]:
+            before = int(model.dof_parentid[before])
+        if before >= 0 and before != dof:
+            found.append(j)
+    return np.array(found, dtype=np.intp)

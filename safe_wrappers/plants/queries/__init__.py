@@ -1,1 +1,0 @@
-"""What constraints and wrappers need of a model beyond its linear form."""

@@ -1,1 +1,0 @@
-"""An env's own simulation as the filter's model: copies, restored states, forks."""
