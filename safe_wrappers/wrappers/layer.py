@@ -159,10 +159,7 @@ def mujoco_env(env: Env, name: str) -> Any:
 
 
 class WrapperRng:
-    """Random numbers apart from the env's, which paired runs need unchanged; a reset's seed starts them anew.
-
-    The env's first seed is used where none was ever given. `stream` keeps it apart from others of the same seed.
-    """
+    """Random numbers of a `stream` apart from the env's; a reset's seed starts them anew, at first the env's own."""
 
     def __init__(self, stream: str) -> None:
         self._stream = zlib.crc32(stream.encode())

@@ -39,10 +39,10 @@ class LeaseExpiry(CommandGate):
     (`set_observation_time`). One of the same observation is executed under the old lease; one that is older, from the
     future or not finite is refused.
 
-    **What it guarantees.** If braking, acceleration, delays and bounds are what they are declared to be and the
-    clearance does not shrink by itself, the machine stops inside it whenever commands stop coming, whatever the
-    commands did. While leases last, commands in the action space pass bit for bit. **What it does not.** It does not
-    check what a fresh command does; `CBFActionFilter` belongs inside. Close to an obstacle no command gets a lease.
+    **What it guarantees.** If all bounds are what they are declared to be and the clearance does not shrink by
+    itself, the machine stops inside it whenever commands stop coming, whatever the commands did. While leases last,
+    commands in the action space pass bit for bit. **What it does not.** It does not check what a fresh command does;
+    `CBFActionFilter` belongs inside.
 
     Args:
         env: With a one-dimensional Box action space.

@@ -28,12 +28,7 @@ from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, mujoco_env
 
 
 class StepMonitor(LayerWrapper, ABC):
-    """Makes each control step of a MuJoCo env once more, visits its physics, and warns once where it ends elsewhere.
-
-    Raises:
-        UnsupportedEnvError: No MuJoCo model.
-        ConfigurationError: A `ChunkHandover` inside, whose step is many control steps, or a second of its kind.
-    """
+    """Makes each control step of a MuJoCo env once more and visits its physics; warns where it ends elsewhere."""
 
     layer: ClassVar = Layer.MONITOR
     partial: ClassVar[str]
@@ -86,8 +81,7 @@ class ContactMonitor(StepMonitor):
     """Reports forces and violations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
-    of its own, from the state before it and with the inputs that the env has left. An env that changes its inputs or
-    its state between substeps cannot be replayed.
+    of its own. An env that changes its inputs or its state between substeps cannot be replayed (`contact/partial`).
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
@@ -179,18 +173,16 @@ PRESSING: Final = 0.01
 class BalanceMonitor(StepMonitor):
     """Reports momentum, used friction and support of a robot on fixed ground; changes nothing.
 
-    Like `ContactMonitor` it makes each control step once more, and looks at the robot's contacts with what does not
-    move at every evaluation of the physics. There is a zero moment point only while three or more contact points, not
-    on a line, are in one plane (within 1 cm and 0.05 rad) and something presses on it. Torsional and rolling friction
-    and forces of the env's own are left out.
+    It sees the physics as `ContactMonitor` does, and the robot's contacts with what does not move. There is a zero
+    moment point only while three or more contact points, not on a line, are in one plane (within 1 cm and 0.05 rad)
+    and something presses on it. Torsional and rolling friction and forces of the env's own are left out.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
         bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves.
 
     Info, at every step: ``balance/linear_momentum`` (kg m/s), ``balance/angular_momentum`` (kg m^2/s), arrays (3,),
-    ``balance/friction_used``, ``balance/zmp_margin`` (m), and ``balance/partial`` (bool), see `safe_wrappers.info`.
-    After a reset they are 0 and False, the margin NaN.
+    ``balance/friction_used``, ``balance/zmp_margin`` (m; NaN without one), and ``balance/partial`` (bool).
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.

@@ -36,14 +36,11 @@ __all__ = ["Imu", "Sensor", "Track"]
 class Imu:
     """An accelerometer and a gyroscope at a site of the sensor's body, from which follows where the body is.
 
-    It integrates by itself, as such units do, and reports at the end of each control step.
-
     Args:
         site: Name of the site; its axes are those of the readings.
         accelerometer_std: Of the noise of a control step's mean acceleration, m/s².
         gyro_std: Of the noise of a control step's mean turn rate, and of that at its end, rad/s.
-        fix_every_s: How often the true pose and velocity of the body are given to the reckoning, s; None: at a reset
-            alone.
+        fix_every_s: How often the reckoning gets the body's true pose and velocity, s; None: at a reset alone.
 
     Raises:
         ConfigurationError: A number outside its range.
@@ -66,13 +63,8 @@ class EgoMotion(DeadReckoning):
     """Where a sensor's body is taken to be, by dead reckoning from the readings of its `Imu`.
 
     Attributes:
-        specific_force: Mean of the accelerometer's readings over the last step, in the axes of its middle, shape
-            (3,), m/s².
+        specific_force: Mean reading over the last step, in the axes of its middle, shape (3,), m/s².
         rate: The gyroscope's reading at its end, shape (3,), rad/s.
-
-    Raises:
-        ConfigurationError: An `Imu` on another body than the sensor.
-        UnknownNameError: No site of that name.
     """
 
     def __init__(self, imu: Imu, sight: LineOfSight) -> None:
@@ -89,11 +81,6 @@ class EgoMotion(DeadReckoning):
         self._since_fix_s = 0.0
         self._at_site = np.zeros(3), np.eye(3)
 
-    @property
-    def rotation(self) -> Array:
-        """The body's axes as columns, shape (3, 3)."""
-        return np.asarray(self.orientation.as_matrix())
-
     def fix_now(self) -> None:
         """Take the body's true motion, at the state that was read last."""
         sight = self._sight
@@ -105,12 +92,7 @@ class EgoMotion(DeadReckoning):
         self._since_fix_s = 0.0
 
     def read(self, time_s: float, noise: Array) -> None:
-        """Read what the step to the present state did, and reckon on.
-
-        Args:
-            time_s: Length of the step.
-            noise: Nine standard normal numbers: of the mean acceleration, the mean turn rate, and that at the end.
-        """
+        """Read what the step to the present state, of `time_s`, did; with nine standard normal numbers as noise."""
         if time_s <= 0.0:
             return
         velocity, axes = self._at_site
@@ -140,17 +122,16 @@ class EgoMotion(DeadReckoning):
 class Sensor:
     """A camera, or any other sensor that needs a line of sight, on a body of the model.
 
-    It measures the tracked point's position (and velocity) relative to itself, in its own axes, with Gaussian noise.
+    It measures positions (and velocities) relative to itself, in its own axes, with Gaussian noise.
 
     Args:
         camera: Name of a camera in the model, which looks along its own -z; or
         site: name of a site, which looks along its own z.
         view_deg: Full opening angle of the cone that it sees, degrees. None: a camera's `fovy`, a site's all around.
-        range_m: Farther away it sees nothing, m; None: as far as there is.
+        range_m: Range of sight, m; None: no end.
         position_std: Of a measured position along each axis, m. None: it does not measure positions.
         velocity_std: Of a measured velocity along each axis, m/s. None: it does not measure velocities.
-        imu: An `Imu` on the same body, from which the estimator reckons where that body is, or the dict of one; None:
-            it knows.
+        imu: An `Imu` on the same body, or the dict of one, by which it reckons where that body is; None: it knows.
 
     Raises:
         ConfigurationError: Both or neither of camera and site, nothing measured, or a number outside its range.
@@ -200,7 +181,7 @@ class Sensor:
             turned, believed = np.eye(3), eye
         else:
             # From the world's axes to where the body's believed orientation puts what is seen along them.
-            turned = ego.rotation @ np.array(sight.data.xmat[sight.body]).reshape(3, 3).T
+            turned = ego.orientation.as_matrix() @ np.array(sight.data.xmat[sight.body]).reshape(3, 3).T
             believed = ego.position + turned @ (eye - body)
         parts = []
         if self.position_std is not None:
@@ -225,9 +206,8 @@ class Track:
     Args:
         bodies: Name of a body, or a pattern ("car*", "car[012]") for every body that fits, in the model's order.
         published: Instead of bodies: name of an attribute of the env, positions of shape (k, 2) or (k, 3), m.
-        acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds q t^3
-            / 3 to the variance of a position. A number, or one per coordinate (0 along a coordinate that does not
-            wander). It has no default.
+        acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3, a number or one per coordinate:
+            after t seconds unseen it adds q t^3 / 3 to the variance of a position. It has no default.
         reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
         mean_velocity: m/s, one per coordinate; None: zeros.
         start_position_std: m, a number or one per coordinate.
@@ -296,12 +276,10 @@ class OcclusionPenalty(LayerWrapper):
     """Estimates what a sensor on the robot sees, and sees no more, and takes a penalty off the reward for not seeing.
 
     After every step it casts a ray to each tracked point. What is in sight is measured, with noise, and updates the
-    track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says. A track's permission to be
-    relied on expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead. The filter belongs
-    outside: its `TrackPermission` and `TrackedDiscs` read the estimates.
-
-    **What it guarantees.** If things move and the sensor errs as declared, the errors have the covariances that are
-    given. **What it does not.** A covariance is no hard bound, and says nothing of things that are not tracked.
+    track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says. Permission to rely on a
+    track expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead. The filter belongs outside:
+    its `TrackPermission` and `TrackedDiscs` read the estimates. If things move and the sensor errs as declared, the
+    errors have the covariances that are given; these are no hard bounds, and say nothing of what is not tracked.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
@@ -309,11 +287,11 @@ class OcclusionPenalty(LayerWrapper):
         sensor: A `Sensor`, or the name of a camera in the model.
         tolerance: Position error that the task can bear, m.
         weight: Of the penalty, the mean of ``min(1, sigmas * sigma / tolerance) ** 2`` over the tracks within the
-            sensor's range; in units of the task's reward per step.
+            sensor's range; the task's reward per step.
         sigmas: k of the bound that is compared with the tolerance.
         axes: "xy" tracks in the plane, "xyz" in space.
-        observe: Whether the observation (other than a flat Box under "tracks") gains, for each track, the estimated
-            position from the sensor's body (m, world axes), velocity (m/s) and deviation along each axis (m).
+        observe: Whether the observation (other than a flat Box under "tracks") gains each track's estimated position
+            from the sensor's body (m, world axes), velocity (m/s) and deviation along each axis (m).
 
     Info, at every step and at reset: ``occlusion/visible``, ``occlusion/expired`` (bool arrays, one per track),
     ``occlusion/sigma`` (m, array), ``occlusion/penalty`` (float).
@@ -321,15 +299,13 @@ class OcclusionPenalty(LayerWrapper):
     Attributes:
         tracking: The `control.estimation.Tracks`: positions, velocities, covariances, and those ahead.
         track_names: One per track: the body's name, or the attribute's with an index.
-        ego_motion: Where the sensor's body is taken to be (`position`, m, and `velocity`, m/s), if the sensor has an
-            `Imu`; else None.
+        ego_motion: Where the sensor's body is taken to be (`position`, m, `velocity`, m/s) by its `Imu`, or None.
         last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.
         permitted: Tracks that may be relied on, bool (n,).
-        unobservable: Track name -> directions of its state that the sensor cannot resolve even in sight.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model.
-        ConfigurationError: A number outside its range, a name that the model does not have, or a wrong order.
+        ConfigurationError: A number outside its range, a name that the model does not have, an `Imu` on another body.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -459,7 +435,13 @@ class OcclusionPenalty(LayerWrapper):
         self._sight.read(self._raw.data)
         if self.ego_motion is not None:
             self.ego_motion.fix_now()
-        self._start()
+        d, n = self._d, len(self.track_names)
+        truth, _ = self._truth()
+        mean = np.zeros((n, self.tracking.size))
+        mean[:, :d] = truth[:, :d] + self._start_std[:, :d] * self._random.draw.standard_normal((n, d))
+        mean[:, d:] = np.stack([motion.mean_velocity for motion in self.tracking.motions])
+        self.tracking.start(mean, self._start_std[:, :, None] ** 2 * np.eye(self.tracking.size))
+        self.last_seen_positions = mean[:, :d].copy()
         info.update(self._look())
         info[keys.OCCLUSION_PENALTY] = 0.0
         return self._observed(observation)
@@ -467,7 +449,13 @@ class OcclusionPenalty(LayerWrapper):
     def step(self, action: Any) -> Step:
         """Step the env with the action as it is, and look."""
         observation, reward, terminated, truncated, info = self._pass_on(action)
-        elapsed = self._elapsed()
+        before, self._time = self._time, float(self._raw.data.time)
+        elapsed = self._time - before
+        if abs(elapsed - self._control_dt) < 1e-9:
+            elapsed = self._control_dt
+        if elapsed < 0.0:
+            gone = f"backwards by {-elapsed:g} s within a step"
+            raise SafeWrappersError(f"the simulation's time ran {gone}. Reset the env instead")
         self.tracking.advance(elapsed)
         self._sight.read(self._raw.data)
         if self.ego_motion is not None:
@@ -486,26 +474,6 @@ class OcclusionPenalty(LayerWrapper):
             name: list(unobservable_directions(motion.matrices()[0], self._matrix, self._state_names))
             for name, motion in zip(self.track_names, self.tracking.motions, strict=True)
         }
-
-    def _elapsed(self) -> float:
-        now = float(self._raw.data.time)
-        elapsed, self._time = now - self._time, now
-        if abs(elapsed - self._control_dt) < 1e-9:
-            return self._control_dt
-        if elapsed < 0.0:
-            gone = f"backwards by {-elapsed:g} s within a step"
-            raise SafeWrappersError(f"the simulation's time ran {gone}. Reset the env instead")
-        return elapsed
-
-    def _start(self) -> None:
-        """The initial fix: truth plus noise of the declared size, and the declared mean velocity."""
-        d, n = self._d, len(self.track_names)
-        truth, _ = self._truth()
-        mean = np.zeros((n, self.tracking.size))
-        mean[:, :d] = truth[:, :d] + self._start_std[:, :d] * self._random.draw.standard_normal((n, d))
-        mean[:, d:] = np.stack([motion.mean_velocity for motion in self.tracking.motions])
-        self.tracking.start(mean, self._start_std[:, :, None] ** 2 * np.eye(self.tracking.size))
-        self.last_seen_positions = mean[:, :d].copy()
 
     def _look(self) -> dict[str, Any]:
         """Measure what is in sight, and report what may be relied on."""

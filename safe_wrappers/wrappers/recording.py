@@ -29,8 +29,8 @@ Judge = Callable[[Any], float]
 class CostFunction(LayerWrapper):
     """Writes ``info["cost"]`` for a task that does not judge itself; changes nothing else.
 
-    After every step, and after a reset, `fn` judges the state in which the env now is, not what happened within the
-    control step; any number above 0 is a violation. Put it next to the task.
+    After every step, and after a reset, `fn` judges the env's state, not what happened within the control step; any
+    number above 0 is a violation. Put it next to the task.
 
     Args:
         env: Whose task reports no cost.
@@ -114,14 +114,11 @@ def _reference(function: Any) -> Any:
 class RecordInterventions(LayerWrapper):
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
-    Put it outside the filter, `LeaseExpiry`, `TeleopChannel` and `OcclusionPenalty`, and inside `ChunkHandover` and
-    SB3's `Monitor`. At an episode's last step `info` gains `info["interventions"]`, a dict: `length`, `return` (of
-    the task: penalties that a wrapper inside has taken off are added back), and the figures of
-    `safe_wrappers.info.EPISODE`. A mean is over all steps of the episode, `margin_min` the smallest finite
-    `cbf/margin`.
-
-    What nobody reported is not zero: it is missing in the summary, and an empty cell in the file. The same holds for
-    a 0 that was not reported at every step; a count above 0 is a lower bound.
+    Put it outside the layers that it counts, and inside `ChunkHandover` and SB3's `Monitor`. At an episode's last
+    step `info` gains `info["interventions"]`, a dict: `length`, `return` (of the task: penalties that a wrapper
+    inside has taken off are added back), and the figures of `safe_wrappers.info.EPISODE`. What nobody reported is not
+    zero: it is missing in the summary, and an empty cell in the file. The same holds for a 0 that was not reported at
+    every step; a count above 0 is a lower bound.
 
     Args:
         env: The env to record.

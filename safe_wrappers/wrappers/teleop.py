@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
+from safe_wrappers.control.teleop import ChannelLedger
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
@@ -27,7 +28,7 @@ from safe_wrappers.wrappers.stopping import (
     StoppingBudget,
     bound_plant,
 )
-from safe_wrappers.wrappers.teleop_coding import Packet, PlainCoding, WaveCoding, port_of
+from safe_wrappers.wrappers.teleop_coding import Packet, Port, WaveCoding
 
 __all__ = ["Link", "RoundTripCeiling"]
 
@@ -212,8 +213,8 @@ class TeleopChannel(CommandGate):
     **What it guarantees.** With a ceiling whose bounds are what they are declared to be, the machine stops inside the
     clearance whatever operator and network do, from a start where it can: proved where the clearance is a distance
     along a line that the brake acts along, best effort elsewhere or with an unverified fallback. With wave coding
-    and the effort that the env says, never more energy has come out than went in, less what is in flight.
-    **What it does not.** Passivity limits neither force nor displacement. Plain coding bounds no energy.
+    never more energy has come out than went in, less what is in flight. **What it does not.** Passivity limits
+    neither force nor displacement.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -267,14 +268,11 @@ class TeleopChannel(CommandGate):
             raise ConfigurationError(f"coding is one of {', '.join(get_args(Coding))}; got {coding!r}")
         plain = {"uplink": self.uplink, "downlink": self.downlink, "ceiling": limit}
         self._record(arguments, plant=plant, **{name: plain_data(value) for name, value in plain.items()})
-        self._port = port_of(env)
-        if coding == "plain":
-            if impedance is not None:
-                raise ConfigurationError(
-                    f'impedance is for coding="wave"; got {impedance!r} with plain coding'
-                )
-            self._coding = PlainCoding(self._port, self.control_dt)
-        else:
+        self._port = Port(env) if env.has_wrapper_attr("port_flow") else None
+        self._waves: WaveCoding | None = None
+        if coding == "plain" and impedance is not None:
+            raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
+        if coding == "wave":
             if self._port is None:
                 published = "port_flow, port_effort_observed, port_feedthrough and port_effort_acted"
                 raise ConfigurationError(
@@ -283,7 +281,7 @@ class TeleopChannel(CommandGate):
             refuse_changed_actions(env)
             if impedance is None:
                 raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
-            self._coding = WaveCoding(self._port, self.control_dt, positive("impedance", impedance, "N s/m"))
+            self._waves = WaveCoding(self._port, self.control_dt, positive("impedance", impedance, "N s/m"))
         self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
         self._down = Line(self.downlink, "TeleopChannel down 0", self._same_s)
         self._watch: RoundTripWatch | None = None
@@ -299,7 +297,11 @@ class TeleopChannel(CommandGate):
         observation = super()._begin(observation, info, seed)
         if self._watch is not None:
             self._watch.reset()
-        self._coding.reset(observation)
+        self.ledger = ChannelLedger()
+        if self._port is not None:
+            self._port.reset(observation)
+        if self._waves is not None:
+            self._waves.reset()
         self._lost = 0
         self._images = [0.0]  # when the image was taken that was shown after each step
         self._report(info, 0.0)
@@ -341,14 +343,15 @@ class TeleopChannel(CommandGate):
         self._moved: Array | None = None
         if action is not None and self._port is not None:
             self._moved = self._boxed(action)[self._port.flow]  # as the machine will take it
-        wave = self._coding.near(self._moved)
+        wave = None if self._waves is None else self._waves.near(self._moved)
         if action is not None and observed_s is not None:
             step = min(max(math.floor(observed_s / self.control_dt + SAME_STEP), 0), len(self._images) - 1)
             self._send(self._up, action, self._images[step], wave)
 
     def _send(self, line: Line, content: Any, made_s: float, wave: Array | None) -> None:
         sequence, lost = line.send(content, made_s, wave, self.now_s)
-        self._coding.sent(line is self._up, sequence, wave, lost)
+        if self._waves is not None:
+            self._waves.sent(line is self._up, sequence, wave, lost)
         self._lost += lost
 
     def _in_force(self, arrived: list[Packet]) -> tuple[Any, float]:
@@ -358,32 +361,42 @@ class TeleopChannel(CommandGate):
         # What is judged is what is executed, by a filter inside too.
         if self._watch is not None and ((command < self._low) | (command > self._high)).any():
             command = self._boxed(command).astype(self._dtype)
-        flow, seen_s = self._coding.far(arrived, newest)
-        if flow is not None:
-            assert self._port is not None
-            whole = np.array(command, dtype=np.float64)
-            whole[self._port.flow] = flow
-            command = self._boxed(whole).astype(self._dtype)
-        return command, seen_s
+        if self._waves is None:
+            return command, newest.made_s
+        flow, seen_s = self._waves.far(arrived)
+        assert self._port is not None
+        whole = np.array(command, dtype=np.float64)
+        whole[self._port.flow] = flow
+        return self._boxed(whole).astype(self._dtype), seen_s
 
     def _send_down(self, executed: Array, observation: Any, obeyed: bool) -> Any:
-        """Send the observation, and return the one that the operator sees."""
-        flow = executed if self._port is None else executed[self._port.flow]
-        wave, given = self._coding.settle(flow, observation, obeyed)
+        """Send the observation, and return the one that the operator sees; add up the energies of the tick."""
+        port, waves, wave = self._port, self._waves, None
+        if port is not None:
+            flow = executed[port.flow]
+            acted, still = port.acted(flow, observation), np.zeros(flow.size)
+            given = (acted, flow) if obeyed else (still, still)
+            wave = None if waves is None else waves.settle(*given, obeyed)
         self._send(self._down, copy.deepcopy(observation), self.now_s, wave)
-        arrived = self._down.receive(self.now_s)
-        newest = self._down.newest
+        arrived, newest = self._down.receive(self.now_s), self._down.newest
         self._images.append(max(self._images[-1], newest.made_s))
-        shown = self._coding.shown(arrived, copy.deepcopy(newest.content))
-        if given is not None:
-            self._coding.account(self._moved, shown, given)
+        shown = copy.deepcopy(newest.content)
+        if port is not None:
+            shown = shown if waves is None else port.replaced(shown, waves.felt(arrived))
+            moved = still if self._moved is None else self._moved
+            self.ledger.add(port.of(shown), moved, *given, self.control_dt, self.stored_j)
         return shown
+
+    @property
+    def stored_j(self) -> float:
+        """Energy of waves on their way, J; 0 for plain coding."""
+        return 0.0 if self._waves is None else self._waves.stored_j
 
     def _report(self, info: dict[str, Any], round_trip_s: float) -> None:
         info[keys.TELEOP_ROUND_TRIP_S] = round_trip_s
         info[keys.TELEOP_LOST] = self._lost
         info[keys.TELEOP_REVOKED] = self.revoked
-        info[keys.TELEOP_CREATED_J] = self._coding.ledger.created_j
+        info[keys.TELEOP_CREATED_J] = self.ledger.created_j
 
 
 def _link(name: str, given: Any) -> Link:

@@ -1,4 +1,4 @@
-"""How commands and forces are written into packets: as they are, or with their energy paid for."""
+"""Ports of effort and flow, and how both are written into packets with their energy paid for."""
 
 import heapq
 import math
@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.teleop import ChannelLedger, WaveLine, effort_and_outgoing, port_energy, to_waves
+from safe_wrappers.control.teleop import WaveLine, effort_and_outgoing, port_energy, to_waves
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.layer import Env
 
@@ -73,90 +73,29 @@ class Port:
         return shown
 
 
-def port_of(env: Env) -> Port | None:
-    """What the env publishes; None if it publishes nothing."""
-    return Port(env) if env.has_wrapper_attr("port_flow") else None
-
-
-Given = tuple[Array, Array]
-"""Effort and flow with which the channel acted on the machine in one tick, shapes (m,)."""
-
-
-class PlainCoding:
-    """Actions and observations as they are; the base of the other.
+class WaveCoding:
+    """Flow and effort as waves (`impedance` in N s/m), each of which pays for what it does at the other end.
 
     In each tick of `tick_s`, in this order: `near` (the operator moves), `sent`, `far` (what arrived is decoded), the
-    env's step, `settle` (what truly happened), `sent`, `shown`, `account`. Without a port no energies are known.
+    env's step, `settle` (what truly happened), `sent`, `felt`.
     """
 
-    _port: Port | None
-
-    def __init__(self, port: Port | None, tick_s: float) -> None:
-        self._port, self._tick_s = port, tick_s
-
-    def reset(self, observation: Any) -> None:
-        """A new episode, whose first observation the operator knows."""
-        self.ledger = ChannelLedger()
-        if self._port is not None:
-            self._port.reset(observation)
-            self._still = np.zeros(self._port.effort.size)
-
-    def near(self, flow: Array | None) -> Array | None:
-        """The operator moves with this flow, or is not there; returns the wave in the packet up."""
-        return None
-
-    def sent(self, up: bool, sequence: int, wave: Any, lost: bool) -> None:
-        """A packet left, up or down."""
-
-    def far(self, arrived: list[Packet], newest: Packet) -> tuple[Array | None, float]:
-        """The flow that replaces the port's entries of the command (None: none does); when its image was taken, s."""
-        return None, newest.made_s
-
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Array | None, Given | None]:
-        """After the env's step with a flow (m,): the wave in the packet down, and what the machine was given.
-
-        Where the operator was not obeyed, the channel's far port was still.
-        """
-        if self._port is None:
-            return None, None
-        acted = self._port.acted(flow, observation)
-        return None, (acted, flow) if obeyed else (self._still, self._still)
-
-    def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        """The observation that the operator gets, with the effort felt in this tick."""
-        return observation
-
-    def account(self, moved: Array | None, shown: Any, given: Given) -> None:
-        """Add up a tick's energies: of the operator's flow (m,), None if absent, and at the machine."""
-        assert self._port is not None
-        moved = self._still if moved is None else moved
-        self.ledger.add(self._port.of(shown), moved, *given, self._tick_s, self.stored_j)
-
-    @property
-    def stored_j(self) -> float:
-        """Energy on its way, J."""
-        return 0.0
-
-
-class WaveCoding(PlainCoding):
-    """Flow and effort as waves (`impedance` in N s/m), each of which pays for what it does at the other end."""
-
-    _port: Port
-
     def __init__(self, port: Port, tick_s: float, impedance: float) -> None:
-        super().__init__(port, tick_s)
-        self._impedance = impedance
+        self._port, self._tick_s, self._impedance = port, tick_s, impedance
 
-    def reset(self, observation: Any) -> None:
-        super().reset(observation)
-        self._up, self._down = (WaveLine(self._tick_s, self._still.size) for _ in range(2))
-        self._back: list[tuple[int, Any]] = []
+    def reset(self) -> None:
+        """A new episode."""
+        size = len(self._port.flow)
+        self._still = np.zeros(size)
+        self._up, self._down = (WaveLine(self._tick_s, size) for _ in range(2))
+        self._back: list[Packet] = []
         self._waiting: list[tuple[int, float]] = []
         self._incoming = self._felt = self._still
         self._seen_s = self._owed_j = 0.0
 
     def near(self, flow: Array | None) -> Array | None:
-        incoming = self._down.deliver(self._back)  # while the operator is away, it ends there
+        """The wave in the packet up, of an operator who moves with this flow; None who is not there."""
+        incoming = self._delivered(self._down, self._back)  # while the operator is away, it ends there
         self._back = []
         if flow is None:
             self._felt = self._still
@@ -165,13 +104,15 @@ class WaveCoding(PlainCoding):
         return outgoing
 
     def sent(self, up: bool, sequence: int, wave: Any, lost: bool) -> None:
+        """A packet left, up or down."""
         line = self._up if up else self._down
         line.send(wave, sequence)
         if lost:
             line.lose(sequence)
 
-    def far(self, arrived: list[Packet], newest: Packet) -> tuple[Array | None, float]:
-        wave = self._up.deliver([(packet.sequence, packet.wave) for packet in arrived])  # type: ignore[misc]
+    def far(self, arrived: list[Packet]) -> tuple[Array, float]:
+        """The flow that the command gets by what has arrived; when its image was taken, s."""
+        wave = self._delivered(self._up, arrived)
         # Seen as late as the wave that is put out now, or the last one.
         for packet in arrived:
             heapq.heappush(self._waiting, (packet.sequence, packet.made_s))
@@ -189,32 +130,35 @@ class WaveCoding(PlainCoding):
         decoded = (math.sqrt(2.0 * b) * wave - self._port.base) / (b + self._port.feedthrough)
         return decoded, self._seen_s
 
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Array | None, Given | None]:
-        _, given = super().settle(flow, observation, obeyed)
+    def settle(self, effort: Array, flow: Array, obeyed: bool) -> Array:
+        """The wave in the packet down, of the effort and the flow with which the channel acted on the machine."""
         if (
             not obeyed
         ):  # a still port absorbs the wave; reflected ones would pile up in the channel without bound
-            return self._still, given
-        assert given is not None
-        _, outgoing = to_waves(*given, self._impedance)
+            return self._still
+        _, outgoing = to_waves(effort, flow, self._impedance)
         # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.
-        left = self._energy(self._incoming) - port_energy(*given, self._tick_s)
+        left = self._energy(self._incoming) - port_energy(effort, flow, self._tick_s)
         energy = self._energy(outgoing)
         if left < 0.0:
             self._owed_j -= left
             outgoing = np.zeros_like(outgoing)
         elif energy > left:
             outgoing = outgoing * (math.sqrt(left / energy) * (1.0 - 1e-15))
-        return outgoing, given
+        return outgoing
 
-    def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        self._back += [(packet.sequence, packet.wave) for packet in arrived]
-        return self._port.replaced(observation, self._felt)
+    def felt(self, arrived: list[Packet]) -> Array:
+        """The effort that the operator feels in this tick, in which these packets arrive."""
+        self._back += arrived
+        return self._felt
 
     @property
     def stored_j(self) -> float:
-        # Of waves that have arrived and were not put out yet, too.
+        """Energy on its way, of waves that have arrived and were not put out yet too, J."""
         return sum(line.in_flight_j + line.reserve_j for line in (self._up, self._down))
+
+    def _delivered(self, line: WaveLine, arrived: list[Packet]) -> Array:
+        return line.deliver([(packet.sequence, packet.wave) for packet in arrived])  # type: ignore[misc]
 
     def _energy(self, wave: Array) -> float:
         return 0.5 * port_energy(wave, wave, self._tick_s)
