@@ -92,10 +92,6 @@ class AdaptionPenalty(LayerWrapper):
             )
         self._record({"penalty": self.penalty, "per_correction": self.per_correction})
 
-    def of(self, correction: float) -> float:
-        """The penalty of a changed step, in units of the task's reward, for a correction in action units."""
-        return self.penalty + self.per_correction * correction
-
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         info[keys.ADAPTION_PENALTY] = 0.0
         return observation
@@ -108,7 +104,7 @@ class AdaptionPenalty(LayerWrapper):
         if info.get(keys.CBF_ESCAPING, False):  # StuckEscape gave the filter another action than this one
             changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))
         if changed:
-            penalty = self.of(float(correction))
+            penalty = self.penalty + self.per_correction * float(correction)
             reward = float(reward) - penalty
         info[keys.ADAPTION_PENALTY] = penalty
         return observation, reward, terminated, truncated, info

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +17,7 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import DiscreteSearch
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.layer import Env, Step, refuse_vector_env
+from safe_wrappers.wrappers.layer import Env, Step, mujoco_env, refuse_vector_env
 
 
 class SlipLimiter(CBFActionFilter):
@@ -112,9 +111,7 @@ class WholeBodyFilter(CBFActionFilter):
     ) -> None:
         arguments = dict(locals())
         refuse_vector_env(env, type(self).__name__)
-        model = getattr(env.unwrapped, "model", None)
-        if not isinstance(model, mujoco.MjModel):
-            raise UnsupportedEnvError(f"WholeBodyFilter needs MuJoCo's .model and .data; {env} has none")
+        model = mujoco_env(env, "WholeBodyFilter").model
         if joint_tolerance is not None:
             joint_tolerance = non_negative("joint_tolerance", joint_tolerance, "rad or m")
             refuse_uncovered_stops(model)

@@ -16,7 +16,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
-from safe_wrappers.plants import default_plant, own_plant
+from safe_wrappers.plants import default_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
@@ -97,7 +97,6 @@ def bound_plant(
     env: Env, plant: Plant | None, fallback: str | FallbackFunction, clearance: Any = None
 ) -> Plant | None:
     """The plant given, else the default one where fallback or clearance need one, bound to the env."""
-    plant = own_plant(plant)
     if plant is None and (callable(fallback) or fallback == "brake" or isinstance(clearance, Constraint)):
         plant = default_plant(env)
     if plant is not None:
