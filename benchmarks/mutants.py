@@ -61,8 +61,7 @@ _MATTER = {
     " SafeActionSearch._nearby not; SafeActionSearch._search not; SafeActionSearch.relinearize not",
     "filter/linearize.py": "Tangents._corrected not",
     "control/projection.py": "_judge comparison; project_unchecked not",
-    "constraints/rollout.py": "BoundRollout._back_inside min/max; BoundRollout.rows not;"
-    " BoundSlacks.slack min/max",
+    "filter/bound.py": "Bound._of min/max; Bound._wanted min/max; Bound.slack min/max; Bound.admits not",
     "constraints/backup/base.py": "BoundDetourClearance.executed arithmetic; BoundDetourClearance._kept_side not",
     "control/backup/drive_among_discs.py": "admits not; _to_disc not",
     "constraints/backup/coasting_clearance.py": "BoundCoastingClearance.admits not;"
@@ -70,7 +69,7 @@ _MATTER = {
     "constraints/backup/point_clearance.py": "BoundEscapeClearance.clearance not;"
     " BoundEscapeClearance.backup min/max",
     "control/backup/point_decision.py": "backup not; _stopped_at not",
-    "constraints/predictive_shield.py": "BoundPredictiveShield.plan not; BoundPredictiveShield._after not",
+    "constraints/predictive_shield.py": "PredictiveShield.plan comparison; PredictiveShield._after not",
     "wrappers/presets.py": "ActionShield.step not; ActionShield.action_masks not",
     "wrappers/stopping.py": "BoundBudget.longest_time not; BoundBudget.can_stop_after not",
     "wrappers/lease_expiry.py": (

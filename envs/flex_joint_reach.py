@@ -35,17 +35,10 @@ SPRINGS: Final = slice(1, None, 2)
 class FlexibleArm:
     """The constants of the planar two-link arm and its joints; the link angles are q0 and, relative to it, q1.
 
-    Link inertia: M(q) = [[`inertia` + 2 `coupling` cos q1, `forearm` + `coupling` cos q1], [the same, `forearm`]].
-
-    Attributes:
-        inertia: kg m^2, both links about the base, the elbow at a right angle.
-        coupling: kg m^2.
-        forearm: kg m^2, the forearm about the elbow.
-        lengths: Shape (2,), m.
-        rotor_inertia: Reflected to the link side, shape (2,), kg m^2.
-        stiffness: Shape (2,), N m/rad.
-        motor_damping: Shape (2,), N m s/rad.
-        joint_damping: Across the springs, shape (2,), N m s/rad.
+    Link inertia: M(q) = [[`inertia` + 2 `coupling` cos q1, `forearm` + `coupling` cos q1], [the same, `forearm`]],
+    kg m^2, about the base with the elbow at a right angle, and of the forearm about the elbow. Of both joints, shape
+    (2,): `lengths` (m), `rotor_inertia` (kg m^2, reflected to the link side), `stiffness` (N m/rad), `motor_damping`
+    and `joint_damping` (N m s/rad, of the motor and across the spring).
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:

@@ -42,26 +42,15 @@ _CAMERA_DISTANCE: Final = 2.8  # in half extents of the field
 
 @dataclass(frozen=True)
 class Level:
-    """One difficulty of the goal task.
-
-    Attributes:
-        hazards: Number of hazard discs in the model; a layout may use fewer.
-        vases: Number of vases in the model; a layout may use fewer.
-        half_extent: The field is the square [-half_extent, half_extent]^2, m; objects are sampled in it.
-        vases_cost: Whether touching or moving a vase costs.
-    """
+    """One difficulty of the goal task; a layout may use fewer hazards and vases."""
 
     hazards: int
     vases: int
-    half_extent: float
-    vases_cost: bool
+    half_extent: float  # m: objects are sampled in the square [-half_extent, half_extent]^2
+    vases_cost: bool  # whether touching or moving one costs
 
 
-LEVELS: Final = (
-    Level(hazards=0, vases=0, half_extent=1.0, vases_cost=False),
-    Level(hazards=8, vases=1, half_extent=1.5, vases_cost=False),
-    Level(hazards=10, vases=10, half_extent=2.0, vases_cost=True),
-)
+LEVELS: Final = (Level(0, 0, 1.0, False), Level(8, 1, 1.5, False), Level(10, 10, 2.0, True))
 """Levels 0, 1 and 2."""
 
 

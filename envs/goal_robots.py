@@ -26,19 +26,12 @@ _QUARTER_TURN: Final = math.pi / 2.0
 
 @dataclass(frozen=True)
 class Hull:
-    """A robot whose root body is called "agent"; every geom in its subtree counts as the robot.
+    """A robot whose root body is called "agent"; every geom in its subtree counts as the robot."""
 
-    Attributes:
-        name: Prefix of its assets: ``<name>_goal<level>.xml``.
-        n_sensors: Length of its sensors' readings, which open the observation.
-        hull_corners: Points of its outline, in the body's frame seen from above, m.
-        hull_radius: Of a disc around its centre that belongs to the outline, too, m.
-    """
-
-    name: str
-    n_sensors: int
-    hull_corners: tuple[tuple[float, float], ...]
-    hull_radius: float = 0.0
+    name: str  # prefix of its assets: <name>_goal<level>.xml
+    n_sensors: int  # how many readings open the observation
+    hull_corners: tuple[tuple[float, float], ...]  # of its outline, in the body's frame seen from above, m
+    hull_radius: float = 0.0  # of a disc around its centre that belongs to the outline, too, m
 
     @property
     def radius(self) -> float:
@@ -128,12 +121,9 @@ Robot = PlanarRobot | WheeledCar
 
 
 def pseudo_lidar(
-    relative: Array,
-    kinds: NDArray[np.intp],
-    n_kinds: int,
-    max_dist: float = LIDAR_RANGE,
+    relative: Array, kinds: NDArray[np.intp], n_kinds: int, max_dist: float = LIDAR_RANGE
 ) -> Array:
-    """Read the lidars of all object kinds at once.
+    """Read the lidars of all object kinds at once: readings in [0, 1], shape (n_kinds * 16,), kind after kind.
 
     An object at distance d in bin i reads s = max(0, 1 - d / max_dist) there. It also reads into both
     neighbours, so that the picture changes smoothly as it crosses a border: with a in [0, 1) its place inside
@@ -144,9 +134,6 @@ def pseudo_lidar(
         kinds: Kind of each object, shape (n,), in [0, n_kinds).
         n_kinds: Number of kinds.
         max_dist: Range, m.
-
-    Returns:
-        Readings in [0, 1], shape (n_kinds * 16,), one kind after the other.
     """
     readings = np.zeros(n_kinds * LIDAR_BINS)
     strength = np.maximum(0.0, max_dist - np.hypot(relative[:, 0], relative[:, 1])) / max_dist

@@ -5,9 +5,9 @@ robot's wheel has its own, to be measured.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from types import MappingProxyType
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import mujoco
@@ -17,23 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True)
 class MagicFormula:
-    """Longitudinal friction over slip, `mu = D sin(C atan(B s))`; slips beyond 1 in size count as 1.
+    """Longitudinal friction over slip, `mu = D sin(C atan(B s))`; slips beyond 1 in size count as 1."""
 
-    Attributes:
-        peak_friction: D.
-        peak_slip: Where it is reached, in (0, 1).
-        shape: C, in (1, 2): how far the curve falls beyond its peak.
-        stiffness: B.
-    """
+    peak_friction: float  # D
+    peak_slip: float  # where it is reached, in (0, 1)
+    shape: float = 1.65  # C, in (1, 2): how far the curve falls beyond its peak
 
-    peak_friction: float
-    peak_slip: float
-    shape: float = 1.65
-    stiffness: float = field(init=False)
-
-    def __post_init__(self) -> None:
-        stiffness = math.tan(math.pi / (2.0 * self.shape)) / self.peak_slip
-        object.__setattr__(self, "stiffness", stiffness)
+    @cached_property
+    def stiffness(self) -> float:
+        """B."""
+        return math.tan(math.pi / (2.0 * self.shape)) / self.peak_slip
 
     def friction(self, slip: ArrayLike) -> NDArray[np.float64]:
         """Coefficient, any shape, with the slip's sign."""
@@ -46,14 +39,12 @@ class MagicFormula:
         return self.peak_friction * math.sin(self.shape * math.atan(x))
 
 
-MAGIC_FORMULA: Final[Mapping[str, MagicFormula]] = MappingProxyType(
-    {
-        "dry": MagicFormula(1.0, 0.14),
-        "wet": MagicFormula(0.7, 0.12),
-        "snow": MagicFormula(0.3, 0.15),
-        "ice": MagicFormula(0.1, 0.10),
-    }
-)
+MAGIC_FORMULA: Final = {
+    "dry": MagicFormula(1.0, 0.14),
+    "wet": MagicFormula(0.7, 0.12),
+    "snow": MagicFormula(0.3, 0.15),
+    "ice": MagicFormula(0.1, 0.10),
+}
 """By ground; at slip 1 about two thirds of the peak remain."""
 GROUNDS: Final = tuple(MAGIC_FORMULA)
 """Names of the grounds, from the best grip to the least."""
@@ -61,13 +52,7 @@ GROUNDS: Final = tuple(MAGIC_FORMULA)
 
 @dataclass(frozen=True)
 class Patch:
-    """A disc of another ground.
-
-    Attributes:
-        ground: One of `GROUNDS`.
-        center: x, y, m.
-        radius: m.
-    """
+    """A disc of another ground, one of `GROUNDS`; m."""
 
     ground: str
     center: tuple[float, float]
@@ -75,11 +60,9 @@ class Patch:
 
 
 class Ground:
-    """A field's grounds, asked point by point: plain numbers, because every wheel asks at every physics substep.
+    """A field's grounds, `base` and patches, of which the later lies on top.
 
-    Args:
-        base: The ground everywhere else, one of `GROUNDS`.
-        patches: Where two overlap, the later one lies on top.
+    They are asked point by point, in plain numbers, because every wheel asks at every physics substep.
     """
 
     def __init__(self, base: str, patches: Sequence[Patch]) -> None:
@@ -144,11 +127,7 @@ def rolled_over(quaternion: NDArray[np.float64]) -> bool:
 
 
 class Tyres:
-    """The tyres of a model whose wheels are hinges.
-
-    Args:
-        model: The model.
-        wheels: Names of the wheels' joints, bodies and geoms.
+    """The tyres of a model whose wheels are hinges; `wheels` are names of their joints, bodies and geoms.
 
     Attributes:
         bodies: Ids of the wheels' bodies.

@@ -83,10 +83,7 @@ def numbers(value: Any, key: str, form: Form) -> Array:
 
 
 def place_goal_beside(
-    rng: np.random.Generator,
-    half_extent: float,
-    keepouts: Mapping[str, float],
-    standing: Mapping[str, Array],
+    rng: np.random.Generator, half_extent: float, keepouts: Mapping[str, float], standing: Mapping[str, Array]
 ) -> Array:
     """Place the next goal, shape (2,), m, in the field [-half_extent, half_extent]^2, m, beside centres by name.
 
@@ -104,12 +101,10 @@ def place_objects(
 ) -> dict[str, Array]:
     """Place the objects that do not stand yet, kind by kind, and turn the robot anywhere.
 
-    An object with keepout k is drawn uniformly from the field [-half_extent, half_extent]^2 shrunk by k, until it is
-    at least k + k' away from every object placed before, m. `keepouts` are in the order in which kinds are placed,
+    Returns centres by name, shapes (n, 2), m; of the goal shape (2,), of the agent its pose, (3,), m and rad. An
+    object with keepout k is drawn uniformly from the field [-half_extent, half_extent]^2 shrunk by k, until it is at
+    least k + k' away from every object placed before, m. `keepouts` are in the order in which kinds are placed,
     `counts` one where nothing is said; what is `given` stands and is kept.
-
-    Returns:
-        Centres by name, shapes (n, 2), m; of the goal shape (2,), of the agent its pose, shape (3,), m and rad.
 
     Raises:
         ConfigurationError: What stands leaves no room for the rest.

@@ -48,11 +48,9 @@ U_MAZE_PATROLS: Final = (((1, 1), (1, 3)), ((3, 1), (3, 3)))
 class MarkingRenderer(MujocoRenderer):
     """Draws what another renderer draws, and markers on top: in frames and in the window alike.
 
-    Markers lie in the renderer's scene alone. Model and data stay bit for bit as they are.
-
-    Args:
-        renderer: The env's own, of which no frame has been asked yet.
-        markers: Asked at every frame for what `mujoco.mjv_initGeom` takes: ``type``, ``size``, ``pos``, ``rgba``.
+    Markers lie in the renderer's scene alone. Model and data stay bit for bit as they are. Of the given renderer no
+    frame has been asked yet; `markers` is asked at every frame for what `mujoco.mjv_initGeom` takes: ``type``,
+    ``size``, ``pos``, ``rgba``.
     """
 
     def __init__(self, renderer: MujocoRenderer, markers: Callable[[], Sequence[dict[str, Any]]]) -> None:

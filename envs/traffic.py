@@ -50,16 +50,7 @@ class Traffic:
         self.steps = steps
 
     def drive(self, rng: np.random.Generator, positions: Array, velocities: Array) -> Array:
-        """Draw the next states.
-
-        Args:
-            rng: Source of randomness.
-            positions: Along x, shape (n,), m.
-            velocities: Along x, shape (n,), m/s.
-
-        Returns:
-            Positions and velocities at the ends of the steps, shape (steps, 2, n).
-        """
+        """Draw positions and velocities at the ends of the next steps, shape (steps, 2, n), from those now, (n,)."""
         noise = rng.standard_normal((2 * self.steps, len(positions)))
         states = self._from_state @ np.stack([positions, velocities])
         states += self._from_noise @ noise

@@ -113,7 +113,6 @@ _NUMBERS: Final = [key for key in KEYS.values() if not key.shape]
 CBF_BOOLS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "bool")
 CBF_FLOATS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "float64")
 
-# StuckEscape, every step ------------------------------------------------------------------------------------
 CBF_STUCK: Final = _key("cbf/stuck", "bool", chunk="any", log="stuck")
 """For `after_s` the filter has changed most actions, and the rewards have not added up to more than `progress`."""
 CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
@@ -153,7 +152,6 @@ SUCCESS: Final = _key("success", "bool")
 IS_SUCCESS: Final = _key("is_success", "bool")
 """Of `FlexJointReach-v0` and tasks of others: the goal is reached at the step's end."""
 
-# AdaptionPenalty, every step --------------------------------------------------------------------------------
 ADAPTION_PENALTY: Final = _key("adaption/penalty", "float64", unit="reward", chunk="sum", log="penalty")
 """What was taken off this step's reward because the filter changed the action; else 0."""
 
@@ -162,7 +160,6 @@ ACTION_CLIPPED: Final = _key("action/clipped", "float64", unit="action", chunk="
 """L2 norm by which the action left the action space (of a chunk, of the entry that left it farthest); what is
 executed was clipped to the space. A filter inside counts that in `cbf/correction`."""
 
-# ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
 HANDOVER_PEAK_JERK: Final = _key("handover/peak_jerk", "float64", unit="action/s", log="peak_jerk")
 """The largest rate of change between neighbouring executed commands, of any component."""
 HANDOVER_STARVED: Final = _key("handover/starved", "int64", log="starved")
@@ -173,7 +170,6 @@ HANDOVER_REFUSED: Final = _key("handover/refused", "bool")
 """A chunk was refused: not finite, not newer than the one in force, too late, out of reach, or without a blend that
 keeps `limits`."""
 
-# LeaseExpiry, every control step ---------------------------------------------------------------------------------
 LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")
 """Remaining time of the lease in force after this control step; 0 without a lease."""
 LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
@@ -182,7 +178,6 @@ or a chunk's end was out of reach."""
 LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_braking")
 """The fallback acted at this control step."""
 
-# TeleopChannel, every control step --------------------------------------------------------------------------------
 TELEOP_ROUND_TRIP_S: Final = _key("teleop/round_trip_s", "float64", unit="s")
 """Age of the image that the command in force was made from; before the first one, since the reset."""
 TELEOP_LOST: Final = _key("teleop/lost", "int64", chunk="sum")
@@ -226,11 +221,9 @@ OCCLUSION_PENALTY: Final = _key(
 )
 """What was taken off this step's reward."""
 
-# The faults of safe_wrappers.wrappers.faults, every step --------------------------------------------------------
 FAULT_ACTIVE: Final = _key("fault/active", "bool", chunk="any", log="fault")
 """The policy's action of this step was lost, late or replaced."""
 
-# RecordInterventions ---------------------------------------------------------------------------------------
 EPISODE: Final = (
     EpisodeFigure("intervention_rate", "mean", (CBF_INTERVENED,)),
     EpisodeFigure("correction_mean", "mean", (CBF_CORRECTION,)),

@@ -24,8 +24,7 @@ def constraint_from(data: Any) -> Constraint:
         return data
     if not isinstance(data, dict):
         raise ConfigurationError(
-            "expected a constraint (an instance of a subclass of sw.Constraint, whose bind(plant) returns a "
-            f"sw.BoundConstraint) or the dict of one; got {data!r}"
+            f"expected a constraint (an instance of a subclass of sw.Constraint) or the dict of one; got {data!r}"
         )
     kind = data.get("kind", "")
     if not isinstance(kind, str) or kind not in KINDS:

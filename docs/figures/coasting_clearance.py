@@ -43,7 +43,7 @@ def ways() -> tuple[Array, list[Array], Array]:
         if not constraint.admits(np.ones(2)):
             break
         env.step(np.ones(2, dtype=np.float32))
-    run = constraint.coasting.run
+    run = constraint.spec.coasting.run
     controls = ([1.0, 1.0], [0.0, 0.0])
     courses = [run(np.array(u), constraint.spec.horizon, 0.2).places for u in controls]
     return env.unwrapped.agent_position, courses, np.array(HAZARD)

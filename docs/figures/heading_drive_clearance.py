@@ -29,7 +29,7 @@ def braking(detail: dict[str, Any]) -> tuple[Array, Any]:
     task.set_state(task.data.qpos.copy(), qvel)
     bound: Any = filtered.filter.bound[0]
     filtered.filter.observe()
-    area = stopping_path(bound.drive, Motion(*task.data.qpos[:3], *task.data.qvel[:3]))
+    area = stopping_path(bound.spec.drive, Motion(*task.data.qpos[:3], *task.data.qvel[:3]))
     where = [task.agent_position]
     for _ in range(150):
         filtered.filter.observe()

@@ -14,12 +14,8 @@ from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control import whole_body
 from safe_wrappers.control.contact import cone_excess
 from safe_wrappers.control.legged import support_distances
-from safe_wrappers.control.whole_body import (
-    WholeBodyProblem,
-    WholeBodySolution,
-    WholeBodyStatus,
-    predicted_position_rows,
-)
+from safe_wrappers.control.projection import Status
+from safe_wrappers.control.whole_body import WholeBodyProblem, WholeBodySolution, predicted_position_rows
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
@@ -269,12 +265,12 @@ class Stance(Constraint, Model):
             return False
         answer = self._answer or self._ask(problem, control)
         if np.array_equal(control, self._asked):
-            return answer.status is WholeBodyStatus.INACTIVE
-        if answer.status is WholeBodyStatus.INFEASIBLE:
+            return answer.status is Status.INACTIVE
+        if answer.status is Status.INFEASIBLE:
             return False  # whatever the control
         if float(np.abs(control - answer.control).max()) <= _SAME:
-            return answer.status is not WholeBodyStatus.FAILED
-        return self.solve(replace(problem, nominal=control)).status is WholeBodyStatus.INACTIVE
+            return answer.status is not Status.FAILED
+        return self.solve(replace(problem, nominal=control)).status is Status.INACTIVE
 
     def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
         self._asked, self._answer = proposed.copy(), self.solve(replace(problem, nominal=proposed))

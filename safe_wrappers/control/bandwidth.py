@@ -82,20 +82,14 @@ class ControlLoop:
         check_fields(self, positive, ["phase_margin_deg"], "degrees")
         check_fields(self, non_negative, ["compute_s", "bus_s"], "s")
         check_fields(self, non_negative, ["warn_below_deg"], "degrees")
-        if self.phase_margin_deg >= 180.0:
-            raise ConfigurationError(f"phase_margin_deg is below 180 degrees, got {self.phase_margin_deg:g}")
-        if self.phase_margin_deg <= self.warn_below_deg:
+        if not self.warn_below_deg < self.phase_margin_deg < 180.0:
             raise ConfigurationError(
-                f"a design of {self.phase_margin_deg:g} degrees cannot keep warn_below_deg = "
-                f"{self.warn_below_deg:g}: hold and delays only take away; design for more, or ask for less"
+                f"phase_margin_deg is below 180 degrees, and above warn_below_deg = {self.warn_below_deg:g}: hold "
+                f"and delays only take away; got {self.phase_margin_deg:g}"
             )
 
     def margin_left_deg(self, control_dt: float, delay_s: float = 0.0) -> float:
-        """What hold and delays leave of the phase margin, degrees; at 0 or below nothing is left.
-
-        Args:
-            control_dt: The plant's hold, s.
-            delay_s: The plant's delay, s.
+        """What hold and delays of a plant, s, leave of the phase margin, degrees; at 0 or below nothing is left.
 
         Raises:
             ConfigurationError: A crossover at or above the Nyquist frequency, where a hold is no delay any more.
@@ -104,24 +98,21 @@ class ControlLoop:
         return math.degrees(math.radians(self.phase_margin_deg) - phase_lag(self.crossover, control_dt, late))
 
     def warn_if_short(self, control_dt: float, delay_s: float) -> None:
-        """Warn if less is left than `warn_below_deg`.
-
-        Raises:
-            ConfigurationError: As `margin_left_deg`.
-        """
+        """Warn if less is left than `warn_below_deg`; raises as `margin_left_deg`."""
         left = self.margin_left_deg(control_dt, delay_s)
         if left >= self.warn_below_deg:
             return
         spare = math.radians(self.phase_margin_deg - self.warn_below_deg)
-        parts = f"plant {delay_s:g} + compute {self.compute_s:g} + bus {self.bus_s:g} + half a hold"
         late = self.compute_s + self.bus_s + delay_s + 0.5 * control_dt
-        message = (
+        warnings.warn(
             f"{left:.1f} degrees of phase margin are left of {self.phase_margin_deg:g}, which is less than "
             f"{self.warn_below_deg:g}: a loop that crosses over at {self.crossover:g} rad/s is {late:.4g} s late "
-            f"({parts} {0.5 * control_dt:g}) and bears {spare / self.crossover:.4g} s; design it for at "
-            f"most {spare / late:.3g} rad/s, or shorten hold and delays"
+            f"(plant {delay_s:g} + compute {self.compute_s:g} + bus {self.bus_s:g} + half a hold "
+            f"{0.5 * control_dt:g}) and bears {spare / self.crossover:.4g} s; design it for at most "
+            f"{spare / late:.3g} rad/s, or shorten hold and delays",
+            PhaseMarginWarning,
+            stacklevel=3,
         )
-        warnings.warn(message, PhaseMarginWarning, stacklevel=3)
 
 
 class Modes(NamedTuple):

@@ -17,31 +17,27 @@ from typing import Any, TypeVar
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def _compiler() -> Callable[..., Any] | None:
-    if os.environ.get("SAFE_WRAPPERS_COMPILED", "1") == "0":
-        return None
-    try:
-        import numba
-    except ImportError:  # a Python or machine that it does not support yet
-        return None
-    _announce_waits()
-    return numba.njit
-
-
 _COMPILING = (
     "safe-wrappers: compiling for this machine, once (10 to 40 s); later starts load what is compiled"
 )
 
 
-def _announce_waits() -> None:
-    """Follow the compiler's events: only this package's functions count."""
-    from numba.core import event
+def _compiler() -> Callable[..., Any] | None:
+    """Numba's, which says once that it compiles functions of this package; None where it is off or not there."""
+    if os.environ.get("SAFE_WRAPPERS_COMPILED", "1") == "0":
+        return None
+    try:
+        import numba
+        from numba.core import event
+    except ImportError:  # a Python or machine that it does not support yet
+        return None
 
     class Notice(event.Listener):
         written = False
 
         def on_start(self, event: Any) -> None:
-            if _is_ours(event) and not self.written:
+            module = str(event.data["dispatcher"].py_func.__module__)
+            if module.startswith("safe_wrappers.") and not self.written:
                 self.written = True
                 print(_COMPILING, file=sys.stderr, flush=True)
 
@@ -49,10 +45,7 @@ def _announce_waits() -> None:
             """Nothing is said."""
 
     event.register("numba:compile", Notice())
-
-
-def _is_ours(event: Any) -> bool:
-    return str(event.data["dispatcher"].py_func.__module__).startswith("safe_wrappers.")
+    return numba.njit
 
 
 def _drop_stale(function: Callable[..., Any]) -> None:

@@ -6,14 +6,14 @@ direction. It does not say that a foothold carries the load.
 
 **Impact.** One mass on one massless linear spring without damping, `m x'' = -k x - m a`, `x(0) = 0`, `x'(0) = v`, up
 to the first peak of the deflection x. Not modelled: stiffness that grows with depth, damping, a pad at the end of its
-stroke, a second contact. Arguments are numbers or arrays that broadcast; speeds of approach that are negative count
-as at rest. What is not finite, or not positive where it must be, raises `ConfigurationError`.
+stroke, a second contact. Masses and stiffnesses are positive; speeds of approach that are negative count as at rest.
 
 **Braking after contact is too late.** The peak comes a quarter of a period after the touch, typically 20 to 50 ms. A
 brake that acts later does not reduce it (`braked_deflection`), so protection needs clearance before contact.
 
 Source: appendix "Rigid Body Contact Mechanics", "Non-smooth collision manifolds and velocity jumps", "Elastodynamic
-impact force and compliance deformation" and "Physical contact feasibility constraints".
+impact force and compliance deformation" and "Physical contact feasibility constraints". Arguments are numbers or
+arrays that broadcast; they are not checked, and NaN gives NaN.
 """
 
 import math
@@ -21,8 +21,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, finite_array, finite_arrays, float_array, whole_number
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.checks import Array, whole_number
+
+Numbers = Array | float
 
 
 def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
@@ -30,7 +31,7 @@ def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array,
 
     Forces are on the robot, shape (..., 3), N; unit normals point at the robot, shape (..., 3).
     """
-    f, n = finite_arrays(forces=forces, normals=normals)
+    f, n = np.asarray(forces, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     along = np.einsum("...i,...i->...", f, n)
     return along, f - along[..., None] * n
 
@@ -38,7 +39,7 @@ def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array,
 def cone_excess(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -> Array:
     """Largest violation of the two conditions, shape (...), N: at most 0 inside the cone."""
     along, rest = normal_and_tangential(forces, normals)
-    return np.asarray(np.maximum(np.linalg.norm(rest, axis=-1) - checked_friction(friction) * along, -along))
+    return np.asarray(np.maximum(np.linalg.norm(rest, axis=-1) - np.asarray(friction) * along, -along))
 
 
 def tangents(normals: ArrayLike, first: ArrayLike | None = None) -> Array:
@@ -75,7 +76,7 @@ def friction_pyramid(
         Shape (..., edges + 1, 3): one row for each side, then `-normal`.
     """
     edges = whole_number("edges", edges, 3)
-    n, mu = finite_array("normals", normals), checked_friction(friction)
+    n, mu = np.asarray(normals, dtype=np.float64), np.asarray(friction, dtype=np.float64)
     middle = (np.arange(edges) + 0.5) * (2.0 * math.pi / edges)
     facing = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
     slope = mu[..., None, None] * math.cos(math.pi / edges) * n[..., None, :]
@@ -83,31 +84,18 @@ def friction_pyramid(
     return np.concatenate([sides, np.broadcast_to(-n, (*sides.shape[:-2], 3))[..., None, :]], axis=-2)
 
 
-def checked_friction(friction: ArrayLike) -> Array:
-    """Friction coefficients as float64, finite and at least 0."""
-    mu = finite_array("friction", friction)
-    if not (mu >= 0.0).all():
-        raise ConfigurationError(f"friction must be 0 or more, got {mu}")
-    return mu
-
-
-def complementarity_residuals(gap: ArrayLike, force: ArrayLike) -> tuple[Array, Array]:
+def complementarity_residuals(gap: Numbers, force: Numbers) -> tuple[Array, Array]:
     """Violations of `gap >= 0` and of `gap * force = 0`, shapes (...), 0 where they hold: m and N m.
 
     The gap is a signed distance, m, shape (...), negative where the bodies penetrate; the force is along the normal,
     N, shape (...), positive where it pushes the bodies apart. Compliant contacts, MuJoCo's among them, violate the
     law by design.
     """
-    g, f = finite_arrays(gap=gap, force=force)
-    return np.maximum(-g, 0.0), np.abs(g * f)
+    return np.maximum(np.negative(gap), 0.0), np.abs(gap * force)
 
 
 def peak_force(
-    speed: ArrayLike,
-    mass: ArrayLike,
-    stiffness: ArrayLike,
-    push: ArrayLike = 0.0,
-    deflection: ArrayLike = 0.0,
+    speed: Numbers, mass: Numbers, stiffness: Numbers, push: Numbers = 0.0, deflection: Numbers = 0.0
 ) -> Array:
     """The largest force of a contact, shape (...), N: `v sqrt(k m)`, with a push `p + sqrt((k x - p)^2 + k m v^2)`.
 
@@ -118,23 +106,22 @@ def peak_force(
         push: p, a force that goes on, N.
         deflection: x, how deep the contact is already, m.
     """
-    v, p, x = finite_arrays(speed=speed, push=push, deflection=deflection)
-    m, k = _positive("mass", mass), _positive("stiffness", stiffness)
-    return np.asarray(p + np.hypot(k * x - p, np.maximum(v, 0.0) * np.sqrt(k * m)))
+    pressed, struck = stiffness * deflection - push, np.maximum(speed, 0.0) * np.sqrt(stiffness * mass)
+    return np.asarray(push + np.hypot(pressed, struck))
 
 
-def speed_limit(force: ArrayLike, mass: ArrayLike, stiffness: ArrayLike) -> Array:
+def speed_limit(force: Numbers, mass: Numbers, stiffness: Numbers) -> Array:
     """The approach speed whose `peak_force` is F, `F / sqrt(k m)`, shape (...), m/s, of F (N), m (kg) and k (N/m)."""
-    return np.asarray(force / np.sqrt(_positive("stiffness", stiffness) * _positive("mass", mass)))
+    return np.asarray(force / np.sqrt(stiffness * mass))
 
 
-def time_to_peak(mass: ArrayLike, stiffness: ArrayLike) -> Array:
+def time_to_peak(mass: Numbers, stiffness: Numbers) -> Array:
     """From the first touch to the peak without braking, a quarter of a period, shape (...), s, of m (kg), k (N/m)."""
-    return np.asarray(np.pi / 2.0 * np.sqrt(_positive("mass", mass) / _positive("stiffness", stiffness)))
+    return np.asarray(np.pi / 2.0 * np.sqrt(mass / stiffness))
 
 
 def braked_deflection(
-    speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, braking: ArrayLike, latency: ArrayLike = 0.0
+    speed: Numbers, mass: Numbers, stiffness: Numbers, braking: Numbers, latency: Numbers = 0.0
 ) -> Array:
     """The first peak of the deflection when a brake works against it, shape (...), m.
 
@@ -148,22 +135,10 @@ def braked_deflection(
         braking: Constant deceleration a >= 0 of brakes alone, without the contact's own, m/s^2.
         latency: From the touch to the brake's action, at least 0, s.
     """
-    v, m, k, a = finite_arrays(speed=speed, mass=mass, stiffness=stiffness, braking=braking)
-    late = float_array("latency", latency)
-    if not ((late >= 0.0).all() and (a >= 0.0).all()):
-        raise ConfigurationError(f"latency and braking must be 0 or more, got {late} and {a}")
-    root = np.sqrt(_positive("mass", m) / _positive("stiffness", k))
-    free, b = np.maximum(v, 0.0) * root, a * root**2
+    late, root = np.asarray(latency, dtype=np.float64), np.sqrt(mass / stiffness)
+    free, b = np.maximum(speed, 0.0) * root, braking * root**2
     in_time = (late < np.pi / 2.0 * root) & (free > 0.0)
     # (x_max + b)^2 - b^2, divided rather than subtracted: for a strong brake the difference cancels.
     gained = free**2 + 2.0 * b * free * np.sin(np.where(in_time, late, 0.0) / root)
     braked = gained / np.where(in_time, np.sqrt(b**2 + gained) + b, 1.0)
     return np.asarray(np.where(in_time, braked, free))
-
-
-def _positive(name: str, value: ArrayLike) -> Array:
-    """Positive numbers as float64, inf included."""
-    array = float_array(name, value)
-    if not (array > 0.0).all():
-        raise ConfigurationError(f"{name} must be positive, got {array}")
-    return array

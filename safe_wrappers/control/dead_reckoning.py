@@ -1,4 +1,7 @@
-"""Dead reckoning from an inertial unit, with lever arms."""
+"""Dead reckoning from an inertial unit, with lever arms: v_P = v_O + ω x r, a_P = a_O + α x r + ω x (ω x r).
+
+Source: appendix "Spatial coordinate frames".
+"""
 
 from __future__ import annotations
 
@@ -19,13 +22,9 @@ _SHARES, _PARTS = 0.5 * (_NODES + 1.0)[:, None], 0.5 * _WEIGHTS
 def centre_acceleration(
     acceleration: Array, angular_velocity: Array, angular_acceleration: Array, arm: Array
 ) -> Array:
-    """Acceleration of O, m/s², from that of P: a_O = a_P - α x r - ω x (ω x r).
+    """Acceleration of O, m/s², from that of P, the derivative of its velocity; the arm is P - O, m.
 
-    Args:
-        acceleration: Of P, shape (..., 3), m/s²: the derivative of its velocity, free of gravity's sign conventions.
-        angular_velocity: Of the body, shape (..., 3), rad/s.
-        angular_acceleration: Of the body, shape (..., 3), rad/s².
-        arm: P - O, shape (..., 3), m, in the same axes as the others.
+    All of shape (..., 3) in the same axes; angular velocity in rad/s, acceleration in rad/s².
     """
     extra = np.cross(angular_acceleration, arm) + np.cross(angular_velocity, np.cross(angular_velocity, arm))
     return np.asarray(acceleration - extra)
@@ -98,10 +97,7 @@ class DeadReckoning:
 
 
 def lever_arm_velocity(velocity: Array, angular_velocity: Array, arm: Array) -> Array:
-    """Velocity of P, m/s, from that of O, in the same axes: v_P = v_O + ω x r, with the arm r = P - O in m.
-
-    The velocity (m/s), angular velocity (rad/s) and arm have shape (..., 3).
-    """
+    """Velocity of P, m/s, from that of O, and the arm P - O, m, all of shape (..., 3) in the same axes."""
     return np.asarray(velocity + np.cross(angular_velocity, arm))
 
 

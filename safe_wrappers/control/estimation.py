@@ -25,7 +25,7 @@ from safe_wrappers.checks import Array
 
 _KEPT: Final = 256
 """Number of cached discretisations."""
-TOLERANCE: Final = 1e-9
+_TOLERANCE: Final = 1e-9
 """Singular values up to this share of the scale count as zero."""
 _PIVOT: Final = 0.1
 """Share of the largest coefficient from which on one may be divided by."""
@@ -34,12 +34,8 @@ _PIVOT: Final = 0.1
 def discretise(A: ArrayLike, Q: ArrayLike, time_s: float) -> tuple[Array, Array]:
     """The exact step over a time, x -> F x plus noise of covariance Q_d: F = exp(A t) and Q_d, shape (n, n) each.
 
-    The exponential is taken over a time in which A changes little, where it is well conditioned, and doubled.
-
-    Args:
-        A: System matrix, 1/s, shape (n, n).
-        Q: Intensity of the process noise, positive semidefinite, shape (n, n).
-        time_s: s, at least 0.
+    A in 1/s and the noise's intensity Q, positive semidefinite, have the shape (n, n). The exponential is taken over
+    a time in which A changes little, where it is well conditioned, and doubled.
     """
     from scipy.linalg import expm  # here: SciPy takes a while to import
 
@@ -68,14 +64,9 @@ def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: float) -> Array:
 def predict(
     mean: Array, cov: Array, transition: Array, noise: Array, drift: Array | float = 0.0
 ) -> tuple[Array, Array]:
-    """Mean and covariance after one step without a measurement: `x -> F x + d`, `P -> F P F' + Q_d`.
+    """Mean (..., n) and covariance (..., n, n) after a step without measurement: `x -> F x + d`, `P -> F P F' + Q_d`.
 
-    Args:
-        mean: Estimate, shape (..., n).
-        cov: Its covariance, shape (..., n, n).
-        transition: F, shape (n, n), or one per track.
-        noise: Q_d, shape (n, n), or one per track.
-        drift: d, known displacement in this step, shape (n,) or (..., n).
+    The transition F and the noise Q_d have the shape (n, n), or are one per track; d is a known drift in this step.
     """
     moved = (transition @ mean[..., None])[..., 0] + drift
     grown = transition @ cov @ np.swapaxes(transition, -1, -2) + noise
@@ -83,14 +74,10 @@ def predict(
 
 
 def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> tuple[Array, Array]:
-    """Mean and covariance after one measurement `y = C x + v` per track.
+    """Mean (..., n) and covariance (..., n, n) after one measurement `y = C x + v`, shape (..., m), per track.
 
-    Args:
-        mean: Estimate, shape (..., n).
-        cov: Its covariance, shape (..., n, n).
-        measured: y, shape (..., m).
-        C: Measurement matrix, shape (m, n), or one per track.
-        R: Covariance of v (not its intensity), positive definite, shape (m, m), or one per track.
+    C has the shape (m, n), the covariance R of v (not its intensity) is positive definite, shape (m, m); or they are
+    one per track.
     """
     cross = cov @ np.swapaxes(C, -1, -2)
     gain = cross @ np.linalg.inv(C @ cross + R)
@@ -180,14 +167,7 @@ class Tracks:
         self.mean, self.covariance = predict(self.mean, self.covariance, transition, noise, drift)
 
     def see(self, which: NDArray[np.intp], measured: Array, matrix: Array, noise: Array) -> None:
-        """Update some tracks with measurements.
-
-        Args:
-            which: Their indices, shape (k,).
-            measured: Shape (k, m).
-            matrix: C of all of them, shape (m, 2d).
-            noise: Covariance R of all of them, shape (m, m).
-        """
+        """Update tracks (indices, shape (k,)) with measurements (k, m), with one C (m, 2d) and R (m, m) for all."""
         before = self.mean[which], self.covariance[which]
         self.mean[which], self.covariance[which] = update(*before, measured, matrix, noise)
 
@@ -221,21 +201,16 @@ def largest_deviation(covariances: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
 
 
-def unobservable_subspace(a: Array, c: Array, tolerance: float = TOLERANCE) -> Array:
-    """Orthonormal basis of what outputs C x of x' = A x never show, shape (n, n - rank).
+def unobservable_subspace(a: Array, c: Array) -> Array:
+    """Orthonormal basis of what outputs C x of x' = A x never show, shape (n, n - rank); A and C of a size near 1.
 
     The largest subspace in the kernel of C that A maps into itself, by orthogonal projections: no powers of A, whose
     fast modes would hide the slow ones.
-
-    Args:
-        a: A, shape (n, n), of a size of about 1.
-        c: C, shape (m, n), likewise.
-        tolerance: What is seen by no more than this counts as not seen.
     """
     basis, seen = np.eye(len(a)), c
     while basis.shape[1]:
         _, values, axes = np.linalg.svd(seen)
-        rank = int((values > tolerance).sum())
+        rank = int((values > _TOLERANCE).sum())
         if rank == 0:
             break
         basis = basis @ axes[rank:].T

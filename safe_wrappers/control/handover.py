@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,6 @@ from safe_wrappers.errors import ConfigurationError
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-Blend = Literal["smoothstep", "quintic"]
 BLENDS: Final = ("smoothstep", "quintic")
 
 LOOK_BACK: Final = 3
@@ -55,19 +54,12 @@ def shortest_blend(change: Array | float, limit: Array | float, derivative: int 
     return np.asarray(time * _ROUND_UP)
 
 
-@dataclass(frozen=True, slots=True)
-class Seam:
-    """Transition from one stream into the next.
+class Seam(NamedTuple):
+    """Transition from one stream into the next."""
 
-    Attributes:
-        plan: The commands from the seam on, shape (n, m): the blend, then the new stream bit for bit.
-        steps: Control steps of the blend: the first `steps` commands are mixed.
-        limited: Which commands were rate-limited in addition to the blend, shape (n,).
-    """
-
-    plan: Array
-    steps: int
-    limited: NDArray[np.bool_]
+    plan: Array  #: commands from the seam on, shape (n, m): the blend, then the new stream bit for bit
+    steps: int  #: control steps of the blend: the first `steps` commands are mixed
+    limited: NDArray[np.bool_]  #: which commands were rate-limited in addition to the blend, shape (n,)
 
 
 def join(
@@ -76,7 +68,7 @@ def join(
     new: Array,
     control_dt: float,
     *,
-    blend: Blend = "smoothstep",
+    blend: str = "smoothstep",
     fewest: int = 0,
     rate_limit: Array | float = np.inf,
     low: Array | float = -np.inf,
@@ -85,21 +77,20 @@ def join(
 ) -> Seam | None:
     """The shortest blend from what was sent into a new stream that keeps the rate limit.
 
-    "smoothstep" mixes the two streams, the prior one held at the last command unless it lasts for the whole blend.
-    "quintic" bridges from the last command to the new stream with matching first and second derivatives at both ends,
-    clipped to the box. If no blend that ends inside the new stream keeps the limit,
-    the one that exceeds it least is rate-limited step by step.
+    If no blend that ends inside the new stream keeps it, the one that exceeds it least is rate-limited step by step.
 
     Args:
         sent: The latest commands, oldest first, shape (k, m), k >= 0; with none there is no seam.
         prior: Remaining commands of the present stream, shape (p, m), p >= 0.
         new: The new stream for the next steps, shape (n, m), n >= 1.
         control_dt: Control interval, s.
-        blend: See above.
+        blend: "smoothstep" mixes the streams, the prior one held at the last command unless it lasts for the whole
+            blend. "quintic" bridges from the last command to the new stream with matching first and second
+            derivatives at both ends, clipped to the box.
         fewest: Least number of steps of the blend (fewer only if the new stream is shorter).
         rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
-        low: Action box, for the bridge, shape (m,) or a number.
-        high: Likewise.
+        low: Lower bound of the action box, for the bridge, shape (m,) or a number.
+        high: Upper bound.
         accepts: Whether a blend of so many steps will do, 0 for none, asked from the shortest on of those that keep
             the rate limit and that the box does not cut. If none will do, the result is None.
     """
@@ -159,17 +150,10 @@ def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:
     return np.asarray(np.where(mixed, steps, 0.0).max(axis=1))
 
 
-def _phases(steps: int, longest: int) -> Array:
-    """Normalised time at every step of a blend of `steps` steps, shape (longest + 1,); 1 from its end on."""
-    return np.asarray(np.minimum((np.arange(longest + 1) + 1.0) / (steps + 1.0), 1.0))
-
-
-@lru_cache(maxsize=256)
-def _weights(first: int, longest: int) -> Array:
-    """The new stream's weight at every step of every candidate blend, shape (c, longest + 1)."""
-    weights = np.array([smoothstep(_phases(n, longest)) for n in range(first, longest + 1)])
-    weights.flags.writeable = False
-    return weights
+def _phases(first: int, longest: int) -> Array:
+    """Normalised time at every step of blends of `first` to `longest` steps, 1 from an end on, (c, longest + 1)."""
+    steps = np.arange(longest + 1) + 1.0
+    return np.asarray(np.minimum(steps / steps[first:, None], 1.0))
 
 
 @lru_cache(maxsize=256)
@@ -178,16 +162,13 @@ def _basis(first: int, longest: int) -> Array:
     from scipy.interpolate import BPoly  # here: SciPy takes a while to import
 
     unit = np.eye(6)
-    phases = np.array([_phases(n, longest) for n in range(first, longest + 1)])
-    weights = np.asarray(BPoly.from_derivatives([0.0, 1.0], [unit[:3], unit[3:]])(phases))
-    weights.flags.writeable = False
-    return weights
+    return np.asarray(BPoly.from_derivatives([0.0, 1.0], [unit[:3], unit[3:]])(_phases(first, longest)))
 
 
 def _mixed(sent: Array, prior: Array, new: Array, first: int) -> Array:
     """Every candidate blend of the two streams, shape (c, n, m)."""
     n = len(new)
-    weight = _weights(first, n - 1)[:, :, None]
+    weight = smoothstep(_phases(first, n - 1))[:, :, None]
     moving = np.concatenate([prior[:n], np.broadcast_to(sent[-1], (max(n - len(prior), 0), sent.shape[1]))])
     lengths = np.arange(first, n)[:, None, None]
     before = np.where(lengths <= len(prior), moving, sent[-1])
@@ -254,13 +235,7 @@ def hermite_spline(positions: Array, spacing: float) -> PPoly:
 
 
 def knot_torque_step(inertia: Array, spacing: float, positions: Array) -> Array:
-    """Torque steps M(q) dq'' at the inner knots of `hermite_spline`, N m, shape (k - 2, m).
-
-    Args:
-        inertia: Matrices M, one per inner knot, shape (k - 2, m, m), kg m^2.
-        spacing: From one knot to the next, s.
-        positions: Shape (k, m), rad.
-    """
+    """Torque steps M(q) dq'' at the inner knots of `hermite_spline`, N m, shape (k - 2, m), for M (k - 2, m, m)."""
     bend = hermite_spline(positions, spacing).derivative(2)
     at_starts, at_ends = bend.c[-1], np.polyval(bend.c, spacing)
     jumps = at_starts[1:] - at_ends[:-1]
@@ -374,21 +349,13 @@ class SeamCheck:
         return bool((np.abs(torque) <= self._torque * _ROUNDING).all() and slow.all())
 
     def bears_knots(self, knots: Array, spacing: float) -> bool:
-        """Whether the torque steps at a cubic spline's knots, M times the acceleration's, keep the torque's slew.
-
-        Args:
-            knots: Positions, shape (k, m).
-            spacing: From one to the next, s.
-        """
+        """Whether torque steps at the knots (k, m) of a cubic spline, `spacing` s apart, keep the torque's slew."""
         if self._inertia is None or len(knots) < 3:
             return True
         steps = knot_torque_step(self._inertia(knots[1:-1]), spacing, knots)
         return bool((self._slew * self._control_dt * _ROUNDING >= np.abs(steps)).all())
 
     def shortest_fade(self, change: Array) -> float:
-        """Duration of the shortest smoothstep between two held commands that keeps the limits but those of torque, s.
-
-        The change is |u_new - u_prior|, shape (m,).
-        """
+        """The shortest smoothstep, s, that changes a held command by (m,) within the limits but those of torque."""
         spans = [shortest_blend(change, bound, d) for d, bound in self._bounds.items()]
         return float(np.max(spans, initial=0.0))

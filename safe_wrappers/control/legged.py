@@ -13,9 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_arrays
+from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled, hypot
 
 COPLANAR_M = 0.01
@@ -26,22 +26,15 @@ _FACING = math.cos(0.05) - _ROUNDING
 """The cosine of the largest angle between their normals and the mean."""
 
 
-def support_distances(instant: ArrayLike, points: ArrayLike, normals: ArrayLike, forces: ArrayLike) -> Array:
+def support_distances(instant: NDArray[np.intp], points: Array, normals: Array, forces: Array) -> Array:
     """Distances, m, negative outside, where three or more contacts of one plane, not on a line, are pressed.
 
-    One for each of these instants in turn; the others have none.
-
-    Args:
-        instant: To which instant each contact belongs, whole numbers, shape (n,); in any order.
-        points: Shape (n, 3), m.
-        normals: Unit normals, shape (n, 3).
-        forces: On the robot, shape (n, 3), N.
+    One for each of these instants in turn; the others have none. Contacts are given by the number of their instant,
+    shape (n,), in any order, their points, m, unit normals and forces on the robot, N, shape (n, 3) each.
     """
-    p, n, f = finite_arrays(points=points, normals=normals, forces=forces)
-    when = np.asarray(instant)
-    order = np.argsort(when, kind="stable")
-    each = np.split(order, np.flatnonzero(np.diff(when[order])) + 1)
-    found = np.array([_distance(p[these], n[these], f[these]) for these in each])
+    order = np.argsort(instant, kind="stable")
+    each = np.split(order, np.flatnonzero(np.diff(instant[order])) + 1)
+    found = np.array([_distance(points[these], normals[these], forces[these]) for these in each])
     return np.asarray(found[found != math.inf])
 
 
@@ -131,14 +124,7 @@ class CentroidalMomentum(NamedTuple):
 def centroidal_momentum(
     masses: Array, positions: Array, velocities: Array, angular_momenta: Array
 ) -> CentroidalMomentum:
-    """Of n parts together.
-
-    Args:
-        masses: Shape (n,), kg, their sum positive.
-        positions: Of the parts' own centres of mass, shape (n, 3), m.
-        velocities: Of the same points, shape (n, 3), m/s.
-        angular_momenta: Of the parts about them, shape (n, 3), kg m^2/s.
-    """
+    """Of n parts together: masses (n,), kg, their centres, m, velocities, m/s, and angular momenta about these."""
     total = float(masses.sum())
     com, momenta = masses @ positions / total, masses[:, None] * velocities
     # Relative to the centre of mass; the velocities need no such shift, since sum m (p - c) = 0.

@@ -48,11 +48,11 @@ class Status(StrEnum):
     """How a projection ended."""
 
     INACTIVE = "inactive"
-    """The nominal control satisfies everything; `control` is that control, bit for bit."""
+    """The nominal control satisfies everything; `control` is that one, bit for bit."""
     PROJECTED = "projected"
     """`control` is the closest admissible control, residual checked."""
     INFEASIBLE = "infeasible"
-    """No control in the box satisfies every row; `control` violates them least."""
+    """No control in the box satisfies everything; of rows, `control` violates them least."""
     FAILED = "failed"
     """No method gave an answer that passed the check; `control` is only inside the box."""
 
@@ -93,21 +93,16 @@ def project(
         ConfigurationError: Shapes do not match, bounds cross, or an argument that must be finite is not.
     """
     u = np.array(u_nom, dtype=np.float64, ndmin=1)
-    m = u.size
-    a = np.asarray(normals, dtype=np.float64)
-    b = np.asarray(offsets, dtype=np.float64).reshape(-1)
-    a = a.reshape(b.size, m) if a.ndim < 2 and a.size == b.size * m else a  # one row may come flat
-    lo, hi = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-    if u.ndim != 1 or a.shape != (b.size, m):
+    a, b = np.asarray(normals, dtype=np.float64), np.asarray(offsets, dtype=np.float64).reshape(-1)
+    a = a.reshape(b.size, u.size) if a.ndim < 2 and a.size == b.size * u.size else a  # one row may come flat
+    if u.ndim != 1 or a.shape != (b.size, u.size):
         wanted = "u_nom (m,), normals (k, m) and offsets (k,)"
         raise ConfigurationError(f"expected {wanted}; got {u.shape}, {a.shape} and {b.shape}")
+    lo, hi = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     try:
-        if lo.shape != u.shape:
-            lo = np.full(m, lo)
-        if hi.shape != u.shape:
-            hi = np.full(m, hi)
+        lo, hi = np.broadcast_to(lo, u.shape), np.broadcast_to(hi, u.shape)
     except ValueError:
-        raise ConfigurationError(f"expected bounds of shape ({m},); got {lo.shape} and {hi.shape}") from None
+        raise ConfigurationError(f"expected bounds of shape {u.shape}; got {lo.shape}, {hi.shape}") from None
     return project_unchecked(u, a, b, lo, hi)
 
 

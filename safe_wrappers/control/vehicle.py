@@ -32,10 +32,7 @@ _SURPRISE: Final = 4.0
 def slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike, regularization: float) -> Array:
     """Normalised slip `(r w - v) / max(|v|, |r w|, regularization)`, in size at most 1 (2 in opposite directions).
 
-    Args:
-        wheel_speed: r w, m/s, any shape.
-        ground_speed: v_x, m/s, broadcast against it.
-        regularization: Least denominator, m/s, > 0: near rest the slip is proportional to the sliding speed.
+    Of speeds in m/s, any shape. The regularization, m/s, > 0, makes slip near rest proportional to the sliding speed.
     """
     wheel, ground = np.asarray(wheel_speed, dtype=np.float64), np.asarray(ground_speed, dtype=np.float64)
     larger = np.maximum(np.abs(wheel), np.abs(ground))
@@ -43,12 +40,10 @@ def slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike, regularization: 
 
 
 def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: float) -> tuple[Array, Array]:
-    """The smallest and largest circumferential speed r w, m/s, whose slip is at most `max_slip` in size.
+    """The smallest and largest r w, m/s, whose slip is at most `max_slip`, in (0, 1), in size; shape as of v_x, m/s.
 
-    Args:
-        ground_speed: v_x, m/s, any shape.
-        max_slip: In (0, 1), broadcast against it; a `ConfigurationError` otherwise.
-        regularization: As in `slip_ratio`, m/s.
+    Raises:
+        ConfigurationError: A `max_slip` outside (0, 1).
     """
     ground, slip = np.asarray(ground_speed, dtype=np.float64), finite_array("max_slip", max_slip)
     if not ((slip > 0.0) & (slip < 1.0)).all():
@@ -92,11 +87,8 @@ class Wheel:
     ) -> Response:
         """To torque and force held for `substeps` physics steps of `timestep` s.
 
-        Args:
-            timestep: s.
-            substeps: Of one control interval.
-            feedback: k of speed servos, N m s/rad; `torque` is then their torque at standstill.
-            implicit: Whether the engine integrates the feedback implicitly, like damping.
+        The feedback is the k of speed servos, N m s/rad, which the engine may integrate implicitly, like damping;
+        `torque` is then their torque at standstill.
         """
         k = np.asarray(feedback, dtype=np.float64)
         effective = self.inertia + timestep * (self.damping + (k if implicit else 0.0))

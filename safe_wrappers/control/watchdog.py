@@ -8,6 +8,10 @@ must fit into the clearance:
 In the appendix the machine keeps its speed until it brakes; with `acceleration` it may speed up until then. A lease
 of zero or less means: revoke now. Rounding only shortens a lease, and inputs that are not finite revoke.
 
+With the delays T_video + T_human + T_act of a remote operator (without the downlink; a reaction takes 0.15 to 0.25 s)
+the lease is the longest round trip of the network, `T_RTT <= (D_clear - d_brake) / v - delays`. It bounds
+displacement, not energy or contact force.
+
 **Reach.** `furthest` and `admits` are necessary bounds: no reachable goal is refused. `jerk_limited_time` asks
 ruckig. Metres stand for any unit of length.
 
@@ -48,8 +52,8 @@ def longest_lease(
 
     With tau = T_lease + delays_s, approach speed v (at most `top_speed`), acceleration a and braking b the travel is
     `v tau + a tau^2 / 2`, the stopping distance `(v + a tau)^2 / (2 b)`. inf for a machine that recedes or stands
-    still, cannot accelerate and has room left; -inf where an input (but `top_speed`) is not finite, where the braking
-    is not positive, and where a machine that does not approach has no room left. Never NaN.
+    still, cannot accelerate and has room left; -inf where an input (but `top_speed`) is not finite or has a sign that
+    makes no sense, and where a machine that does not approach has no room left. Never NaN.
 
     Args:
         clearance: D_clear as measured `age` ago, m, shape (...).
@@ -61,21 +65,17 @@ def longest_lease(
         acceleration: Largest approach acceleration that any command may cause until the brakes hold, m/s^2.
         top_speed: Bound on the approach speed that this acceleration may lead to, m/s; a measured speed above it
             counts as the bound. inf: none.
-
-    Raises:
-        ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
     """
     given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
     # Scalar arithmetic: for the few leases of a control step it is faster than arrays.
     several = np.broadcast(*(np.asarray(x, dtype=np.float64) for x in given))
-    _not_negative(delays_s=delays_s, localisation=localisation, margin=margin)
-    _not_negative(acceleration=acceleration, top_speed=top_speed)
     return np.array([_lease(*map(float, one)) for one in several]).reshape(several.shape)
 
 
 def _lease(d: float, v: float, b: float, late: float, loc: float, gap: float, a: float, top: float) -> float:
     """`longest_lease` of one machine."""
-    if not (all(map(math.isfinite, (d, v, b, late, loc, gap, a))) and b > 0.0) or math.isnan(top):
+    known = all(map(math.isfinite, (d, v, b, late, loc, gap, a)))
+    if not (known and b > 0.0 and late >= 0.0 and loc >= 0.0 and gap >= 0.0 and a >= 0.0 and top >= 0.0):
         return -math.inf
     top = max(top, v)
     braking_way = max(v, 0.0) * max(v, 0.0) / (2.0 * b)
@@ -106,49 +106,14 @@ def _lease(d: float, v: float, b: float, late: float, loc: float, gap: float, a:
     return -math.inf if math.isnan(lease) else lease
 
 
-def round_trip_ceiling(
-    clearance: ArrayLike,
-    speed: ArrayLike,
-    braking: ArrayLike,
-    video_s: ArrayLike,
-    human_s: ArrayLike,
-    act_s: ArrayLike,
-    localisation: ArrayLike = 0.0,
-    margin: ArrayLike = 0.0,
-) -> Array:
-    """The longest network round trip, s, shape (...), at which a remote operator can still stop the machine in time.
-
-    Downlink and uplink together, `T_RTT <= (D_clear - d_brake) / v - (T_video + T_human + T_act)`. `video_s` lasts
-    from the exposure to the operator's display without the downlink, `human_s` is the reaction (0.15 to 0.25 s in the
-    appendix), `act_s` lasts until full deceleration; s, at least 0. The rest is as of `longest_lease`. It bounds
-    displacement, not energy or contact force.
-    """
-    _not_negative(video_s=video_s, human_s=human_s, act_s=act_s)
-    video, human, act = (np.asarray(late, dtype=np.float64) for late in (video_s, human_s, act_s))
-    with np.errstate(over="ignore"):
-        late = video + human + act
-    return longest_lease(clearance, speed, braking, late, localisation, margin)
-
-
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
     """The longest lease, s, shape (...), from a barrier that includes the stopping distance: `h / closing - delays`.
 
     Where h cannot fall (closing speed <= 0): inf if it is positive, else -inf; -inf for inputs that are not finite.
-
-    Args:
-        room: Value h of the barrier, the clearance left after braking, in any unit U, shape (...).
-        closing_speed: Bound on how fast h may fall under any command until the brakes hold, U/s, shape (...).
-        delays_s: The other four delays, s, at least 0, shape (...).
+    The room is h, in any unit U; the closing speed bounds how fast it may fall under any command until the brakes
+    hold, U/s; the delays are the other four, s, at least 0.
     """
     return longest_lease(room, closing_speed, _AT_ONCE, delays_s)
-
-
-def _not_negative(**values: ArrayLike) -> None:
-    for name, value in values.items():
-        # Empty arrays, of no surface near, pass.
-        least = value if isinstance(value, float) else np.min(np.asarray(value, np.float64), initial=np.inf)
-        if least < 0.0:
-            raise ConfigurationError(f"{name} must not be negative, got {least:g}")
 
 
 State = tuple[ArrayLike, ArrayLike, ArrayLike]
@@ -163,11 +128,7 @@ def furthest(
     The lowest (<= 0) and the highest (>= 0), shape (...) each; (inf, -inf) where the duration is negative or anything
     is not finite. They are exact: no admissible motion gets farther. A start outside the limits widens them.
 
-    Args:
-        duration: s, shape (...).
-        velocity: At the start, m/s, shape (...).
-        max_speed: m/s, shape (...); inf: none.
-        max_acceleration: m/s^2, shape (...), finite.
+    All arguments have shapes that broadcast: s, m/s (at the start), m/s (inf: none) and m/s^2 (finite).
     """
     a_max, v_max = checked_limits(max_acceleration, max_speed)
     time, v = (np.asarray(x, dtype=np.float64) for x in (duration, velocity))
@@ -221,23 +182,12 @@ def jerk_limited_time(
 
     A start outside the limits is first brought back inside. inf where ruckig finds no profile, where a state is not
     finite, and where the end state violates the limits: too fast, too strongly accelerated, or reached only from
-    above the speed limit.
-
-    Args:
-        start: Position, velocity, acceleration, of each axis.
-        end: Likewise.
-        max_acceleration: m/s^2, finite; of all axes or of each, shape (axes,).
-        max_speed: m/s, likewise; inf: none.
-        max_jerk: m/s^3, likewise; inf: none.
+    above the speed limit. The limits are of all axes or of each, in m/s^2 (finite), m/s and m/s^3 (inf: none).
     """
     limits = *checked_limits(max_acceleration, max_speed), np.asarray(max_jerk)
     given = [np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (*start, *end, *limits)]
     p0, v0, a0, p1, v1, a1, a_max, v_max, jerk = np.broadcast_arrays(*given)
-    with np.errstate(invalid="ignore", over="ignore"):
-        # With an end acceleration against the motion, the speed before was higher.
-        before = np.where(v1 * a1 < 0.0, 0.5 * a1 * (a1 / jerk), 0.0)
-        possible = (np.abs(v1) + before <= v_max) & (np.abs(a1) <= a_max)
-    if not (possible.all() and all(np.isfinite(x).all() for x in (p0, v0, a0, p1, v1, a1))):
+    if not all(np.isfinite(x).all() for x in (p0, v0, a0, p1, v1, a1)):
         return math.inf
     request, trajectory = ruckig.InputParameter(p0.size), ruckig.Trajectory(p0.size)
     request.current_position, request.current_velocity, request.current_acceleration = p0, v0, a0

@@ -16,7 +16,6 @@ Source: appendix "Floating-base equations of motion" and "Hierarchical whole-bod
 """
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import NamedTuple
 
 import clarabel
@@ -24,8 +23,9 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_array, positive
-from safe_wrappers.control.contact import checked_friction, cone_excess, friction_pyramid, tangents
+from safe_wrappers.checks import Array, finite_array
+from safe_wrappers.control.contact import cone_excess, friction_pyramid, tangents
+from safe_wrappers.control.projection import Status
 from safe_wrappers.errors import ConfigurationError
 
 TOLERANCE = 1e-6
@@ -94,8 +94,8 @@ class WholeBodyProblem:
                 finite_array(name, value)
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
-        checked_friction(self.friction)
-        positive("force_weight", self.force_weight, "1/N^2")
+        if not (self.friction >= 0.0).all():
+            raise ConfigurationError(f"friction must be 0 or more, got {self.friction}")
         opens = np.zeros(len(self.normals), bool) if self.breaking is None else self.breaking
         acceleration = 0.0 if self.contact_acceleration is None else self.contact_acceleration
         object.__setattr__(self, "stance", np.flatnonzero(~opens))
@@ -103,37 +103,18 @@ class WholeBodyProblem:
         object.__setattr__(self, "wanted", acceleration - self.drift)
 
 
-class WholeBodyStatus(StrEnum):
-    """Outcome of a solution."""
-
-    INACTIVE = "inactive"
-    """The nominal control satisfies everything: `control` equals it, bit for bit."""
-    SOLVED = "solved"
-    """The best control that satisfies everything, residuals checked."""
-    INFEASIBLE = "infeasible"
-    """No control does."""
-    FAILED = "failed"
-    """No solver gave an answer that passed the check."""
-
-
 class WholeBodySolution(NamedTuple):
-    """A checked answer. Its violations, each at least 0, are evaluated from the answer itself.
+    """A checked answer; without one (infeasible, failed) the nominal control, clipped to the box, and no forces.
 
-    Attributes:
-        control: Shape (nu,), finite and inside the box; without an answer the nominal one, clipped to it.
-        acceleration: qacc under it and the forces, shape (nv,).
-        forces: At the contacts, shape (k, 3), N, each inside its cone (and pyramid); zeros without an answer.
-        status: Compares equal to its string.
-        contact_error: Largest error of a contact's acceleration, m/s^2 (of an opening one: its shortfall).
-        cone_error: Largest violation of an exact friction cone, N, also where a pyramid was used.
+    Its violations, each at least 0, are evaluated from the answer itself.
     """
 
-    control: Array
-    acceleration: Array
-    forces: Array
-    status: WholeBodyStatus
-    contact_error: float
-    cone_error: float
+    control: Array  #: shape (nu,), finite and inside the box
+    acceleration: Array  #: qacc under it and the forces, shape (nv,)
+    forces: Array  #: at the contacts, shape (k, 3), N, each inside its cone (and pyramid)
+    status: Status
+    contact_error: float  #: largest error of a contact's acceleration, m/s^2; of an opening one its shortfall
+    cone_error: float  #: largest violation of an exact friction cone, N, also where a pyramid was used
 
 
 def solve_pyramid(problem: WholeBodyProblem, edges: int = 4) -> WholeBodySolution:
@@ -238,18 +219,18 @@ class Program(NamedTuple):
 def _solve(problem: WholeBodyProblem, sides: Array | None) -> WholeBodySolution:
     """With the sides of pyramids, shape (k, edges, 3), for the contacts that stay and have friction; None: cones."""
     rigid, nominal, nu = _eliminate(problem), problem.nominal, len(problem.nominal)
-    status, found = WholeBodyStatus.INFEASIBLE, None
+    status, found = Status.INFEASIBLE, None
     if rigid.contradiction <= _tolerance(problem.wanted):
         program = _program(problem, rigid, sides)
         nothing = np.zeros(len(program.linear) - nu)
-        found = _checked(problem, rigid, program, nominal, nothing, WholeBodyStatus.INACTIVE)
+        found = _checked(problem, rigid, program, nominal, nothing, Status.INACTIVE)
         y = None if found else _optimum(program)
-        if isinstance(y, WholeBodyStatus):
+        if isinstance(y, Status):
             status = y
         elif y is not None:
-            status = WholeBodyStatus.FAILED
-            found = _checked(problem, rigid, program, nominal, y[nu:], WholeBodyStatus.INACTIVE)
-            found = found or _checked(problem, rigid, program, y[:nu], y[nu:], WholeBodyStatus.SOLVED)
+            status = Status.FAILED
+            found = _checked(problem, rigid, program, nominal, y[nu:], Status.INACTIVE)
+            found = found or _checked(problem, rigid, program, y[:nu], y[nu:], Status.PROJECTED)
     if found is not None:
         return found
     # Nothing passed: the nominal control clipped to its box, contacts without force.
@@ -262,20 +243,15 @@ def _tolerance(sizes: Array) -> float:
 
 
 def _checked(
-    problem: WholeBodyProblem,
-    rigid: _Rigid,
-    program: Program,
-    control: Array,
-    inner: Array,
-    status: WholeBodyStatus,
+    problem: WholeBodyProblem, rigid: _Rigid, program: Program, control: Array, inner: Array, status: Status
 ) -> WholeBodySolution | None:
     """The answer of a control and inner forces, or None if it is outside the box or its residuals are too large."""
     inside = np.clip(control, problem.lower, problem.upper)
-    allowed = TOLERANCE if status is WholeBodyStatus.SOLVED else 0.0  # a solver's round-off at the box
+    allowed = TOLERANCE if status is Status.PROJECTED else 0.0  # a solver's round-off at the box
     if not float(np.abs(control - inside).max(initial=0.0)) <= allowed:
         return None
     y = np.concatenate([inside, inner])
-    executed = inside if status is WholeBodyStatus.SOLVED else control
+    executed = inside if status is Status.PROJECTED else control
     answer = _answer(problem, executed, rigid.forces(problem, y), status)
     soft = len(_acceleration_rows(problem)[1])
     over, force = program.rows @ y - program.limits, _tolerance(answer.forces)
@@ -289,9 +265,7 @@ def _checked(
     return answer if fine else None
 
 
-def _answer(
-    problem: WholeBodyProblem, control: Array, forces: Array, status: WholeBodyStatus
-) -> WholeBodySolution:
+def _answer(problem: WholeBodyProblem, control: Array, forces: Array, status: Status) -> WholeBodySolution:
     """With residuals from the problem's own matrices, independent of the elimination."""
     pushed = np.einsum("kiv,ki->v", problem.jacobians, forces)
     acceleration = np.linalg.solve(problem.inertia, problem.actuation @ control + pushed - problem.bias)
@@ -337,19 +311,12 @@ def _program(problem: WholeBodyProblem, rigid: _Rigid, sides: Array | None) -> P
     pressure = friction[exact, None, None] * normals[exact, None]
     frame = np.concatenate([pressure, tangents(normals[exact])], axis=1)
     free = np.full(n - nu, np.inf)
-    return Program(
-        hessian,
-        linear,
-        np.concatenate(rows),
-        np.concatenate(limits),
-        np.concatenate([problem.lower, -free]),
-        np.concatenate([problem.upper, free]),
-        frame @ by_contact[exact],
-        (frame @ force[exact])[:, :, 0],
-    )
+    box = np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free])
+    cones = frame @ by_contact[exact], (frame @ force[exact])[:, :, 0]
+    return Program(hessian, linear, np.concatenate(rows), np.concatenate(limits), *box, *cones)
 
 
-def _optimum(program: Program) -> Array | WholeBodyStatus:
+def _optimum(program: Program) -> Array | Status:
     """By daqp where there are no cones; by clarabel as well before infeasibility is accepted."""
     scale = 1.0 / np.sqrt(program.hessian.diagonal())  # to unit curvature along each unknown
     scaled = program._replace(
@@ -360,13 +327,13 @@ def _optimum(program: Program) -> Array | WholeBodyStatus:
         upper=program.upper / scale,
         cones=program.cones * scale,
     )
-    y = WholeBodyStatus.FAILED if len(program.cones) else by_daqp(scaled)
-    if isinstance(y, WholeBodyStatus):
+    y = Status.FAILED if len(program.cones) else by_daqp(scaled)
+    if isinstance(y, Status):
         y = by_clarabel(scaled)
-    return y if isinstance(y, WholeBodyStatus) else y * scale
+    return y if isinstance(y, Status) else y * scale
 
 
-def by_daqp(p: Program) -> Array | WholeBodyStatus:
+def by_daqp(p: Program) -> Array | Status:
     """The y of a program without cones, shape (n,), by an active set; or why there is none."""
     n, k = p.linear.size, p.limits.size
     most = np.minimum(np.concatenate((p.upper, p.limits)), _UNBOUNDED)
@@ -375,11 +342,11 @@ def by_daqp(p: Program) -> Array | WholeBodyStatus:
         p.hessian, p.linear, np.ascontiguousarray(p.rows), most, least, np.zeros(n + k, np.int32)
     )
     if flag == -1:
-        return WholeBodyStatus.INFEASIBLE
-    return np.asarray(y) if flag > 0 and np.isfinite(y).all() else WholeBodyStatus.FAILED
+        return Status.INFEASIBLE
+    return np.asarray(y) if flag > 0 and np.isfinite(y).all() else Status.FAILED
 
 
-def by_clarabel(p: Program) -> Array | WholeBodyStatus:
+def by_clarabel(p: Program) -> Array | Status:
     """The y of a program, shape (n,), by an interior point method; or why there is none."""
     from scipy import sparse  # here: SciPy takes a while to import
 
@@ -396,9 +363,9 @@ def by_clarabel(p: Program) -> Array | WholeBodyStatus:
     solver = clarabel.DefaultSolver(hessian, p.linear, sparse.csc_matrix(matrix), right, kinds, settings)
     solution = solver.solve()
     if solution.status in _NONE_EXISTS:
-        return WholeBodyStatus.INFEASIBLE
+        return Status.INFEASIBLE
     y = np.asarray(solution.x)
-    return y if solution.status in _FOUND and np.isfinite(y).all() else WholeBodyStatus.FAILED
+    return y if solution.status in _FOUND and np.isfinite(y).all() else Status.FAILED
 
 
 def largest_acceleration(distance: Array, speed: Array, horizon_s: float) -> Array:
@@ -427,16 +394,9 @@ def predicted_position_rows(
     """Rows `G qacc <= g`, shapes (m, nv) and (m,), that keep joints in range until the horizon, upper limits first.
 
     A bound at the present position does not cover the motion between samples. The acceleration is constant; there is
-    one row for each finite limit.
-
-    Args:
-        dofs: Indices of the joints' degrees of freedom (slides and hinges), shape (n,).
-        positions: Shape (n,), m or rad.
-        velocities: Shape (n,).
-        lower: Smallest positions, shape (n,); -inf is no limit.
-        upper: Largest positions, shape (n,); inf is no limit.
-        horizon_s: s; a control step, or the time that stopping takes if that is longer.
-        nv: Degrees of freedom of the whole model.
+    one row for each finite limit. Slides and hinges are given by their degrees of freedom among the model's nv, their
+    positions, velocities and ranges, shape (n,), m or rad; the horizon is a control step, or the time that stopping
+    takes if that is longer.
     """
     above, below, units = np.isfinite(upper), np.isfinite(lower), np.eye(nv)[dofs]
     rows = np.concatenate([units[above], 0.0 - units[below]])  # 0 - x: no negative zeros

@@ -77,33 +77,19 @@ def _physics(env: Env) -> tuple[mujoco.MjModel, mujoco.MjData] | tuple[None, Non
 
 @dataclass
 class Recording:
-    """What one driver did in k control steps. What MuJoCo says is empty for an env without it.
-
-    Attributes:
-        env: As it was given to `record`.
-        control_dt: Control interval, s; NaN where nothing says it.
-        infos: Of each step, with those of a contact and a balance monitor, where the env allows them.
-        struck: Names of the two bodies with the largest force of each step; None where there was none.
-        touching: After each step, pairs of geoms that touch, ids.
-        first: The first steps of episodes, shape (k,).
-        terminated: Shape (k,).
-        executed: The actions that the unwrapped env was given, shape (k, m).
-        qpos: After each step, shape (k, nq).
-        qvel: Shape (k, nv).
-        diverged: Whether MuJoCo has found numbers in a step that are not finite, and has reset its data, shape (k,).
-    """
+    """What one driver did in k control steps. What MuJoCo says is empty for an env without it."""
 
     env: Env
-    control_dt: float
-    infos: list[dict[str, Any]]
-    struck: list[tuple[str, str] | None]
-    touching: list[set[tuple[int, int]]]
-    first: np.ndarray
+    control_dt: float  # s; NaN where nothing says it
+    infos: list[dict[str, Any]]  # with those of a contact and a balance monitor, where the env allows them
+    struck: list[tuple[str, str] | None]  # bodies with the largest force
+    touching: list[set[tuple[int, int]]]  # pairs of geoms, ids, after each step
+    first: np.ndarray  # steps of episodes, shape (k,)
     terminated: np.ndarray
-    executed: Array
-    qpos: Array
+    executed: Array  # actions that the unwrapped env was given, shape (k, m)
+    qpos: Array  # after each step, shape (k, nq)
     qvel: Array
-    diverged: np.ndarray
+    diverged: np.ndarray  # MuJoCo has found numbers that are not finite, and has reset its data, shape (k,)
 
     def of_info(self, key: str) -> Array:
         """A number of each step's info, shape (k,); NaN where a step does not report it."""

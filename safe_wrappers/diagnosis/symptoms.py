@@ -42,37 +42,22 @@ Measured = tuple[float, list[Evidence]]
 
 
 class Treatment(NamedTuple):
-    """What helps.
+    """What helps."""
 
-    Attributes:
-        code: How the wrapper is typed; "" where none can be tried.
-        wrap: Does the same to an env.
-        advice: What to do besides, or why no wrapper can be tried.
-    """
-
-    code: str
-    wrap: Callable[[Env], Env] | None
-    advice: str = ""
+    code: str  # how the wrapper is typed; "" where none can be tried
+    wrap: Callable[[Env], Env] | None  # does the same to an env
+    advice: str = ""  # what to do besides, or why no wrapper can be tried
 
 
 class Symptom(NamedTuple):
-    """One row of the table of symptoms.
-
-    Attributes:
-        title: In words.
-        threshold: From which on it is a symptom, in `unit`.
-        unit: Of the figure; "share" is one of control steps.
-        measure: Of what one driver did; raises `NotMeasuredError`.
-        treatment: For the env of a recording.
-        policies_only: Random and attacking drivers have this symptom of themselves.
-    """
+    """One row of the table of symptoms."""
 
     title: str
-    threshold: float
-    unit: str
-    measure: Callable[[Recording], Measured]
+    threshold: float  # from which on it is a symptom, in `unit`
+    unit: str  # "share" is one of control steps
+    measure: Callable[[Recording], Measured]  # or a `NotMeasuredError`
     treatment: Callable[[Recording], Treatment]
-    policies_only: bool = False
+    policies_only: bool = False  # random and attacking drivers have this symptom of themselves
 
 
 def _typed(arguments: dict[str, Any]) -> list[str]:

@@ -31,6 +31,7 @@ class SafetyFilter:
         search: How an admissible action is looked for.
 
     Attributes:
+        constraints: As given.
         bound: The constraints on the plant, in their order.
         reporting: Those of them that write info keys of their own.
         memories: What each constraint remembers of the episode, in their order.
@@ -54,7 +55,7 @@ class SafetyFilter:
         dtype: Any = np.float64,
         search: type[SafeActionSearch] = SafeActionSearch,
     ) -> None:
-        self.plant, self._constraints = plant, constraints
+        self.plant, self.constraints = plant, constraints
         self._making = fallback, low, high, dtype, search
         self._low, self._high = low, high
         self._loaded = False
@@ -65,7 +66,7 @@ class SafetyFilter:
         """Let the constraints read what they need of the plant's model."""
         fallback, low, high, dtype, search = self._making
         plant = self.plant
-        self.bound = [Bound(constraint, plant) for constraint in self._constraints]
+        self.bound = [Bound(constraint, plant) for constraint in self.constraints]
         self.reporting = [c for c in self.bound if c.spec.info_keys]
         kinds = [type(c.spec).__name__ for c in self.reporting]
         for kind in kinds:

@@ -22,21 +22,13 @@ _FINGERS = (
 
 
 class DisplacementRecorder(Recorder):
-    """Forecasts under displacements of the gripper; braking is a displacement of zero.
+    """A `Recorder` of displacements of the gripper; braking is a displacement of zero.
 
-    Args:
-        model, data, substeps: As in `Recorder`.
-        dtype: Of the env's actions; the env scales them in this precision.
-        blocked: Whether the env keeps the fingers closed.
+    The env scales actions in the precision of `dtype`; `blocked` says whether it keeps the fingers closed.
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        substeps: int,
-        dtype: Any,
-        blocked: bool,
+        self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int, dtype: Any, blocked: bool
     ) -> None:
         super().__init__(model, data, substeps)
         (self._mocap, self._gripper), *_ = welds(model)

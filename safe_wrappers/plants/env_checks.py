@@ -17,8 +17,7 @@ def read_attribute(env: gym.Env[Any, Any], name: str) -> Any:
     try:
         return env.get_wrapper_attr(name)
     except AttributeError:
-        public = sorted(n for n in dir(env.unwrapped) if not n.startswith("_"))
-        there = ", ".join(public)
+        there = ", ".join(n for n in dir(env.unwrapped) if not n.startswith("_"))
         raise UnknownNameError(f"the env publishes no attribute {name!r}; it has: {there}") from None
 
 
@@ -59,19 +58,17 @@ def check_timing(
     env: gym.Env[Any, Any], control_dt: float | None, remedy: str = "pass control_dt, in seconds"
 ) -> float:
     """How long one action is held, s: the env's `dt`, or `control_dt` where the env has none; both must agree."""
+    given = None if control_dt is None else positive("control_dt", control_dt, "s")
     try:
         dt = float(env.get_wrapper_attr("dt"))
     except (AttributeError, TypeError, ValueError):
-        dt = None
-    if control_dt is not None:
-        hold = positive("control_dt", control_dt, "s")
-    elif dt is not None:
-        hold = positive("the env's dt", dt, "s")
-    else:
-        raise ConfigurationError(
-            f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): {remedy}"
-        )
-    if dt is not None and not np.isclose(dt, hold, rtol=1e-6):
+        if given is None:
+            raise ConfigurationError(
+                f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): {remedy}"
+            ) from None
+        return given
+    hold = positive("the env's dt", dt, "s") if given is None else given
+    if not np.isclose(dt, hold, rtol=1e-6):
         raise ConfigurationError(
             f"control_dt = {hold} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "
             "another interval than the env's promises nothing: pass control_dt equal to env.unwrapped.dt"
@@ -88,13 +85,12 @@ def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
         and np.issubdtype(space.dtype, np.floating)
     ):
         return space
-    expected = f"expected a continuous Box action space of shape (m,), got {space}"
     if isinstance(space, gym.spaces.Discrete):
-        raise ConfigurationError(
-            f"{expected}: use ActionShield(env, [PredictiveShield(...)]), which tries every action"
+        remedy = "Use ActionShield(env, [PredictiveShield(...)]), which tries every action"
+    else:
+        remedy = (
+            "Give the env one flat Box of floats, from gymnasium.spaces.flatten_space where all its parts are such, "
+            "and translate in its step (gymnasium.spaces.unflatten); discrete parts alone may be numbered, for "
+            "ActionShield"
         )
-    raise ConfigurationError(
-        f"{expected}. Give the env one flat Box of floats, from gymnasium.spaces.flatten_space where all its "
-        "parts are such, and translate in its step (gymnasium.spaces.unflatten); discrete parts alone may be "
-        "numbered, for ActionShield"
-    )
+    raise ConfigurationError(f"expected a continuous Box action space of shape (m,), got {space}. {remedy}")

@@ -89,12 +89,15 @@ def checked_episodes(given: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[Episo
         observations = float_array(f"observations of episode {index}", one[0])
         actions = float_array(f"actions of episode {index}", one[1])
         episode = Episode(observations, actions[:, None] if actions.ndim == 1 else actions)
-        (rows, *n), (steps, *m) = (part.shape for part in episode)
-        widths = [part.shape[1:] for part in (found or [episode])[0]]
-        if not (len(n) == len(m) == 1 and rows == steps + 1 > 1 and widths == [(*n,), (*m,)]):
+        widths, shapes = [[part.shape[1:] for part in one] for one in ((found or [episode])[0], episode)]
+        if not (
+            shapes == widths
+            and all(len(w) == 1 for w in widths)
+            and len(observations) == len(actions) + 1 > 1
+        ):
             raise ConfigurationError(
                 f"episode {index}: expected observations of shape (T + 1, n) and actions of shape (T, m) with T of at"
-                f" least 1, and n and m as in episode 0, got {(rows, *n)} and {(steps, *m)}"
+                f" least 1, and n and m as in episode 0, got {observations.shape} and {episode.actions.shape}"
             )
         if not all(np.isfinite(part).all() for part in episode):
             raise ConfigurationError(f"episode {index} has numbers that are not finite; end it before them")
@@ -106,11 +109,6 @@ Model = Callable[[Array, Array], Array]
 """The states after a step, shape (..., n), from states, shape (..., n), and controls, shape (..., m)."""
 
 
-def measured(measure: Measure, observation: Array) -> float:
-    """A measure of an observation alone."""
-    return float(measure(View(None, observation, {})))
-
-
 def linear_model(weights: Array, states: Array, controls: Array) -> Array:
     """`x + [x, u, 1] @ weights`, affine in state and control, with weights of shape (n + m + 1, n)."""
     n = states.shape[-1]
@@ -118,25 +116,15 @@ def linear_model(weights: Array, states: Array, controls: Array) -> Array:
 
 
 def allowed_misses(scores: int, miss_rate: float) -> int:
-    """l: how many of n scores, and the next one, may be above the bound; 0: there is no finite bound.
-
-    Given the scores, the probability that the next one is above has the distribution Beta(l, n + 1 - l), if scores
-    are continuous; its mean l / (n + 1) is at most the miss rate.
-    """
+    """How many of n scores, and the next one, may be above the bound: (n + 1) miss_rate, rounded down."""
     return math.floor((scores + 1) * miss_rate + _ROUNDING)
 
 
 def upper_bound(scores: Array, miss_rate: float) -> float:
     """What the next score exceeds with a probability of at most `miss_rate`.
 
-    It is the ceil((n + 1)(1 - miss_rate))-th smallest score.
-
-    Args:
-        scores: Shape (n,), exchangeable with the next one; NaN counts as infinite.
-        miss_rate: Between 0 and 1.
-
-    Returns:
-        inf where no score may be above, or too many are infinite.
+    It is the ceil((n + 1)(1 - miss_rate))-th smallest of the scores, shape (n,), which are exchangeable with the next
+    one; NaN counts as infinite. It is infinite where no score may be above, or too many are infinite.
     """
     rank = len(scores) + 1 - allowed_misses(len(scores), miss_rate)
     if rank > len(scores):
@@ -248,7 +236,7 @@ class IdentifiedPlant(RolloutPlant):
         if self._least is not None:
             assert self._watched is not None
             self._judged += 1
-            self._missed += not measured(self._watched, observation) >= self._least
+            self._missed += not self._watched(self.view) >= self._least
             self._least = None
 
     def executed(self, control: Array | None) -> None:
@@ -258,9 +246,9 @@ class IdentifiedPlant(RolloutPlant):
             self._judged = self._missed = 0
         elif self._watched is not None and np.isfinite(self.state).all():
             predicted = self.model(self.state, control)
-            self._least = measured(self._watched, predicted) - self._first
+            self._least = self._watched(View(None, predicted, {})) - self._first
 
-    def _run(self, task: Callable[[Any], Rollout]) -> Rollout:
+    def run(self, task: Callable[[Any], Rollout]) -> Rollout:
         return task(_Stepped(self))
 
     def margins(self, measure: Measure, horizon: int) -> Array:
@@ -302,7 +290,9 @@ class IdentifiedPlant(RolloutPlant):
             for step, control in enumerate(actions[start : start + horizon]):
                 with np.errstate(over="ignore", invalid="ignore"):  # a bad model may diverge: measured here
                     state = self.model(state, control)
-                true, predicted = measured(measure, observations[start + step + 1]), measured(measure, state)
+                true, predicted = (
+                    measure(View(None, x, {})) for x in (observations[start + step + 1], state)
+                )
                 fall = predicted - true if predicted != true else 0.0  # infinite ones, too
                 falls[step] = np.inf if np.isnan(fall) else fall
         return found

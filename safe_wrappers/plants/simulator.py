@@ -254,12 +254,12 @@ class RolloutPlant(Plant):
                         action = policy(view)
             return found
 
-        found = self._run(simulated)
+        found = self.run(simulated)
         self._foreseen[control.tobytes()] = found, measure
         return found
 
     @abstractmethod
-    def _run(self, task: Callable[[Any], Rollout]) -> Rollout:
+    def run(self, task: Callable[[Any], Rollout]) -> Rollout:
         """What a task returns that steps the env, or what stands for it, from the present state."""
 
     @abstractmethod
@@ -387,7 +387,7 @@ class SimulatorPlant(RolloutPlant):
         self.exact = False
         return f"the env's step was not its simulation's: {found}"
 
-    def _run(self, task: Callable[[Any], Rollout]) -> Rollout:
+    def run(self, task: Callable[[Any], Rollout]) -> Rollout:
         return self._simulation.run(task)
 
     def margins(self, measure: Measure, horizon: int) -> Array:

@@ -122,8 +122,10 @@ class CBFActionFilter(LayerWrapper):
 
     @property
     def constraints(self) -> list[Constraint]:
-        """The constraints, on their plant, with the added margin."""
-        return [c.spec for c in self.filter.bound]
+        """The constraints with the added margin, as given but for what they found on the plant."""
+        for given, bound in zip(self.filter.constraints, self.filter.bound, strict=True):
+            vars(given).update({k: v for k, v in vars(bound.spec).items() if k in ("promise", "validated")})
+        return list(self.filter.constraints)
 
     def _filter(self, margin: float) -> SafetyFilter:
         of_actions = self._low, self._high, self._dtype, self._search

@@ -381,13 +381,12 @@ class ChunkQueue:
 
     def _joined(self, fresh: Array) -> Seam | None:
         """The blend into a chunk's rest, shape (n, m); None if none keeps the machine's limits."""
-        blend: Any = self._blend  # checked by the wrapper
         return join(
             self._sent,
             self._plan,
             fresh,
             self._control_dt,
-            blend=blend,
+            blend=self._blend,
             fewest=self._fewest,
             rate_limit=self._rate_limit,
             low=self._low,

@@ -187,11 +187,10 @@ class ActionShield(CBFActionFilter):
 
     def _take_action_space(self, env: Env) -> None:
         space = env.action_space
-        if isinstance(space, gym.spaces.Box):
-            raise ConfigurationError(f"expected discrete actions, got {space}: use CBFActionFilter")
         if not isinstance(space, gym.spaces.Discrete):
             raise ConfigurationError(
-                f"expected Discrete actions, got {space}. Give the env these, and translate its actions in its step"
+                f"expected Discrete actions, got {space}: use CBFActionFilter for a Box; else give the env these, "
+                "and translate its actions in its step"
             )
         if space.n > 1024:
             raise ConfigurationError(f"every action is tried, of which there may be 1,024; got {space}")

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.clearance import Clearance
-from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room, round_trip_ceiling
+from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
@@ -178,8 +178,8 @@ class BoundBudget:
 
     def longest_round_trip(self, video_s: float, human_s: float) -> float:
         """The longest round trip from which an operator can stop in time, s; inf where nothing approaches."""
-        delays = {"video_s": video_s, "human_s": human_s, "act_s": self._budget.act_s}
-        ceilings = round_trip_ceiling(self.clearance, self.speed, **delays, **self._stop)
+        delays_s = video_s + human_s + self._budget.act_s
+        ceilings = longest_lease(self.clearance, self.speed, delays_s=delays_s, **self._stop)
         return float(ceilings[self.speed > 0.0].min(initial=math.inf))
 
     def can_stop_after(self, command: Array, duration_s: float) -> bool:

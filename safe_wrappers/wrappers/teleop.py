@@ -124,7 +124,7 @@ class Line:
 class RoundTripCeiling:
     """The longest round trip at which an operator may still be relied on, from the clearance and speed of the moment.
 
-    See `control.watchdog.round_trip_ceiling`. A command after which the machine could not stop is refused.
+    See `control.watchdog`. A command after which the machine could not stop is refused.
 
     Args:
         budget: A `StoppingBudget` or the dict of one, whose clearance is a `Clearance` or a function of the env.

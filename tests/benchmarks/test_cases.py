@@ -75,7 +75,7 @@ def test_the_judge_means_the_limit_that_the_filter_keeps(name):
                             np.where(unlimited, -3.0, low), np.where(unlimited, 3.0, high)
                         )
                     env.plant.observe()
-                    bound.observe(bound.start())  # it was carried there, it did not move
+                    bound.observe({})  # it was carried there, it did not move
                     h, missed = float(bound.value().min()), judge.start()
                     if "disc" in name or "Maze" in name:
                         assert (h < 0.0) == (missed > 0.0)

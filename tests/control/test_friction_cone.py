@@ -65,14 +65,7 @@ def test_four_edges_along_a_contact_frame_are_mujocos_pyramid():
         assert (rows @ force <= 0.0).all() == inside
 
 
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda: friction_pyramid(UP, 0.5, 2), "edges"),
-        (lambda: friction_pyramid(UP, -0.1), "friction"),
-        (lambda: cone_excess([0, 0, math.nan], UP, 0.5), "forces must be finite"),
-    ],
-)
-def test_bad_input_is_refused(call, said):
-    with pytest.raises(ConfigurationError, match=said):
-        call()
+def test_what_is_no_pyramid_is_refused_and_an_unknown_force_has_no_excess():
+    with pytest.raises(ConfigurationError, match="edges"):
+        friction_pyramid(UP, 0.5, 2)
+    assert math.isnan(cone_excess([0, 0, math.nan], UP, 0.5))

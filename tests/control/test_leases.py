@@ -8,7 +8,6 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room
-from safe_wrappers.errors import ConfigurationError
 
 POSITIVE = st.floats(1e-3, 1e3)
 SMALL = st.floats(0.0, 2.0)
@@ -131,20 +130,14 @@ def test_standing_and_receding():
 def test_what_is_not_finite_revokes(bad, place):
     inputs = [1.0, 0.5, 1.0, 0.1, 0.0, 0.0, 0.2]
     inputs[place] = bad
-    if bad == -np.inf and place >= 3:
-        with pytest.raises(ConfigurationError, match="must not be negative"):
-            longest_lease(*inputs)
-    else:
-        assert longest_lease(*inputs) == -np.inf
+    assert longest_lease(*inputs) == -np.inf
     batch = longest_lease([1.0, bad if place == 0 else np.nan], 0.5, 1.0, 0.1)
     assert batch[0] > 0.0 and batch[1] == -np.inf  # one bad reading does not take the others along
 
 
 @pytest.mark.parametrize("name", ["delays_s", "localisation", "margin", "acceleration", "top_speed"])
-def test_what_would_lengthen_a_lease_by_mistake_is_refused(name):
-    given_ = {"delays_s": 0.1, name: -0.1}
-    with pytest.raises(ConfigurationError, match=f"{name} must not be negative, got -0.1"):
-        longest_lease(1.0, 1.0, 1.0, **given_)
+def test_what_would_lengthen_a_lease_by_mistake_revokes(name):
+    assert longest_lease(1.0, 1.0, 1.0, **{"delays_s": 0.1, name: -0.1}) == -np.inf
 
 
 @given(*[st.floats(allow_nan=True, allow_infinity=True)] * 3, *[st.floats(min_value=0.0)] * 5)
@@ -185,5 +178,4 @@ def test_a_lease_of_room_is_used_up_exactly(room, closing, delays):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_lease_of_unknown_room_is_revoked(bad):
     assert longest_lease_of_room([bad, 1.0], [1.0, bad], 0.1).tolist() == [-np.inf, -np.inf]
-    with pytest.raises(ConfigurationError, match="delays_s"):
-        longest_lease_of_room(1.0, 1.0, -0.1)
+    assert longest_lease_of_room(1.0, 1.0, -0.1) == -np.inf

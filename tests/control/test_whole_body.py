@@ -12,9 +12,9 @@ from scipy.optimize import minimize
 
 from safe_wrappers.control import whole_body
 from safe_wrappers.control.contact import friction_pyramid
+from safe_wrappers.control.projection import Status
 from safe_wrappers.control.whole_body import (
     WholeBodyProblem,
-    WholeBodyStatus,
     attainable_contact_acceleration,
     rigid_forces,
     solve_cone,
@@ -137,8 +137,8 @@ def test_elimination_changes_nothing(seed, k, extra):
         if expected is None:
             assert found.status in ("infeasible", "failed")
             continue
-        assert found.status in ("solved", "inactive")
-        if found.status == "solved":
+        assert found.status in ("projected", "inactive")
+        if found.status == "projected":
             # No worse, and better by no more than what the large program leaves inexact.
             assert -1e-5 <= cost(problem, found) - expected[1] <= 1e-7 * (1.0 + abs(expected[1]))
             assert found.control == pytest.approx(expected[0], abs=3e-3)
@@ -165,7 +165,7 @@ def assert_says_the_truth(problem, found):
     grips = problem.stance[problem.friction[problem.stance] > 0.0]
     missed = (problem.jacobians @ a - problem.wanted)[grips]
     assert found.contact_error >= np.abs(missed).max(initial=0.0) - 1e-9 * scale
-    if found.status in ("solved", "inactive"):
+    if found.status in ("projected", "inactive"):
         assert np.abs(missed).max(initial=0.0) < 1e-5 * scale
 
 
@@ -187,7 +187,7 @@ def test_a_foot_that_is_pushed_too_hard_gets_the_closest_push_of_its_cone():
     sideways, below = np.linalg.norm(nominal[:2]), weight - nominal[2]
     t = (mu * sideways + below) / (1.0 + mu * mu)
     expected = np.array([*(nominal[:2] / sideways * mu * t), weight - t])
-    assert found.status == "solved"
+    assert found.status == "projected"
     assert found.control == pytest.approx(expected, abs=1e-5)
     assert np.linalg.norm(found.forces[0, :2]) == pytest.approx(mu * found.forces[0, 2], rel=1e-5)
     # By hand: what is left, nominal minus answer, is a multiple of the cone's outer normal there.
@@ -218,7 +218,7 @@ def test_the_cone_by_a_solver_that_knows_no_cones():
         options={"ftol": 1e-12, "maxiter": 500},
     )
     found = solve_cone(problem)
-    assert found.status == "solved"
+    assert found.status == "projected"
     assert other.success
     assert cost(problem, found) == pytest.approx(other.fun, rel=1e-5)
     assert found.control == pytest.approx(other.x, abs=1e-3)
@@ -273,7 +273,7 @@ def test_a_contact_that_opens_gives_no_force_and_moves_away():
     opening = {"breaking": np.array([True]), "contact_acceleration": np.array([[0.0, 0.0, 1.0]])}
     for solve in SOLVERS.values():
         found = solve(foot([2.0, 0.0, 0.0], **opening))
-        assert found.status == "solved"
+        assert found.status == "projected"
         assert not found.forces.any()
         # m (g + 1) is the least that lifts; sideways it is free.
         assert found.control == pytest.approx([2.0, 0.0, 2.0 * 10.81], abs=1e-5)
@@ -292,7 +292,7 @@ def test_a_frictionless_contact_holds_along_its_normal_alone():
     pulled = foot([0.0, 0.0, 25.0], friction=0.0)
     for solve in SOLVERS.values():
         found = solve(pulled)
-        assert found.status == "solved"
+        assert found.status == "projected"
         assert found.control == pytest.approx([0.0, 0.0, 19.62], abs=1e-5)
         assert found.forces[0, 2] >= -1e-6
 
@@ -305,7 +305,7 @@ def test_a_limit_on_accelerations_holds():
         accelerations=(rows := np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), np.array([5.0, -2.0])),
     )
     found = solve_pyramid(problem)
-    assert found.status == "solved"
+    assert found.status == "projected"
     assert found.acceleration == pytest.approx([-2.0, 0.0, 0.0], abs=1e-6)
     lower = dataclasses.replace(problem, accelerations=(rows, np.array([-3.0, 0.0])))
     against = solve_pyramid(lower)  # up by the opening contact, down by the limit
@@ -321,14 +321,14 @@ def test_a_backend_is_not_believed(monkeypatch, lie):
         return {
             "zeros": np.array([0.0, 0.0, 50.0] + [0.0] * (n - 3))[:n],
             "huge": np.full(n, 1e9),
-            "nothing": WholeBodyStatus.FAILED,
-            "claims infeasible": WholeBodyStatus.INFEASIBLE,
+            "nothing": Status.FAILED,
+            "claims infeasible": Status.INFEASIBLE,
         }[lie]
 
     monkeypatch.setattr(whole_body, "by_daqp", backend)
     truthful = solve_pyramid(problem)
     if lie in ("nothing", "claims infeasible"):  # the second opinion has the answer
-        assert truthful.status == "solved"
+        assert truthful.status == "projected"
     else:
         assert truthful.status == "failed"
     monkeypatch.setattr(whole_body, "by_clarabel", backend)

@@ -110,7 +110,7 @@ def test_a_task_without_a_simulator_is_judged_through_the_plant_of_the_user():
             "Reacher-v5",
             "without_h",
             {},
-            r"env.judge: RowsOnly has no h \(`value`\) and cannot judge; use env.cost",
+            r"env.judge: RowsOnly has no h \(`h_along`\) and cannot judge; use env.cost",
         ),
         (
             "Pendulum-v1",

@@ -52,7 +52,6 @@ TABLE = {
     "FetchReach-v4": ({}, None),
 }
 """Env id -> changes of the recipe; a wrapper that starts where the filter is needed."""
-BATCHED = ("SafePointGoal1-v0", "SafePointGoal2-v0")
 
 
 def pair(make, constraints, mode=AutoresetMode.NEXT_STEP, envs=ENVS, **options):
@@ -108,9 +107,6 @@ def play(alike, together, actions, seed=6):
         for result, other in zip(results[:4], others[:4], strict=True):
             np.testing.assert_equal(result, other)
         assert_same(results[4], others[4])
-        if together.constraint_batch is not None:
-            kept = [together.constraint_batch.memory(i) for i in range(together.num_envs)]
-            assert kept == [single.filter.memories[0] for single in alike.envs]
         finals = results[4].get("final_info", {}).get("cbf/intervened", False)
         changed += int(np.sum(results[4]["cbf/intervened"] | finals))
         ended = results[2] | results[3]
@@ -132,7 +128,6 @@ def test_it_is_a_vector_env_of_filtered_envs(env_id):
         functools.partial(made, env_id, inner or (lambda env: env)), recommended(env_id, **changes)
     )
     assert play(alike, together, script(alike)) > 3
-    assert (together.constraint_batch is not None) == (env_id in BATCHED)
     assert [single.filter_calls for single in together.filters] == [
         single.filter_calls for single in alike.envs
     ]
@@ -184,10 +179,9 @@ def test_what_is_written_has_the_dtype_of_the_space_in_which_an_env_may_compute(
 
 
 @pytest.mark.parametrize("options", [{"plant": lambda: sw.MujocoPlant(delay_s=0.02)}, {"margin": 0.05}])
-def test_a_delay_is_decided_one_by_one_and_a_margin_together(options):
+def test_with_a_delay_or_a_margin(options):
     make = functools.partial(made, "SafePointGoal1-v0", AtHazard)
     alike, together = pair(make, recommended("SafePointGoal1-v0"), **options)
-    assert (together.constraint_batch is None) == ("plant" in options)
     assert play(alike, together, script(alike)) > 3
 
 

@@ -89,7 +89,7 @@ def too_fast():
 
 def failing(env, control):
     """The filter's own measure: the largest violation in shares of the constraint's scale."""
-    return max(-c.slack(control) / c.scale for c in env.filter.bound)
+    return max(-c.slack(control) / c.spec.scale for c in env.filter.bound)
 
 
 def compared(env, steps, monkeypatch):

@@ -127,17 +127,11 @@ class Pair(NamedTuple):
 
 
 class ShownEpisode(NamedTuple):
-    """The evaluation episode that is looked at in every arm and condition.
+    """The evaluation episode that is looked at in every arm and condition."""
 
-    Attributes:
-        seed: The training seed of the policies.
-        episode_seed: Of the episode.
-        reason: How it was chosen, for the page.
-    """
-
-    seed: int
+    seed: int  # of the training
     episode_seed: int
-    reason: str
+    reason: str  # how it was chosen, for the page
 
 
 def compared_pairs(experiment: ExperimentConfig) -> list[Pair]:

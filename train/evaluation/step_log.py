@@ -25,33 +25,19 @@ MOST_STEPS: Final = 20_000
 
 @dataclass(frozen=True)
 class StepLog:
-    """T steps of one run (or several) under one condition; floats are float32.
-
-    Attributes:
-        episode_seed: Shape (T,).
-        step: The step's number in its episode, from 0, shape (T,); likewise what follows without another shape.
-        intervened: The filter changed the action.
-        violated: The task's own truth saw a cost, at the step's end or at any substep.
-        correction: L2, action units.
-        proposed: The policy's action, shape (T, action size).
-        refused: Which constraints refused the boxed proposal, shape (T, constraints).
-        coordinates: The state in which the step began, shape (T, coordinates).
-        constraint_names: Shape (constraints,).
-        coordinate_names: With units, shape (coordinates,).
-        left_out: Steps beyond `MOST_STEPS` that were not kept.
-    """
+    """T steps of one run (or several) under one condition; shape (T,) where no other is said."""
 
     episode_seed: NDArray[np.int64]
-    step: NDArray[np.int32]
-    intervened: NDArray[np.bool_]
-    violated: NDArray[np.bool_]
-    correction: NDArray[np.float32]
-    proposed: NDArray[np.float32]
-    refused: NDArray[np.bool_]
-    coordinates: NDArray[np.float32]
-    constraint_names: NDArray[np.str_]
-    coordinate_names: NDArray[np.str_]
-    left_out: int
+    step: NDArray[np.int32]  # in its episode, from 0
+    intervened: NDArray[np.bool_]  # the filter changed the action
+    violated: NDArray[np.bool_]  # the task's own truth saw a cost, at the step's end or at any substep
+    correction: NDArray[np.float32]  # L2, action units
+    proposed: NDArray[np.float32]  # the policy's action, shape (T, action size)
+    refused: NDArray[np.bool_]  # which constraints refused the boxed proposal, shape (T, constraints)
+    coordinates: NDArray[np.float32]  # the state in which the step began, shape (T, coordinates)
+    constraint_names: NDArray[np.str_]  # shape (constraints,)
+    coordinate_names: NDArray[np.str_]  # with units, shape (coordinates,)
+    left_out: int  # steps beyond `MOST_STEPS` that were not kept
 
     def __len__(self) -> int:
         return len(self.step)

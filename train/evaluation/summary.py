@@ -221,21 +221,13 @@ def judged_by(experiment: ExperimentConfig, judged: bool) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """One arm's metric over B bins of steps.
+    """One arm's metric over B bins of steps."""
 
-    Attributes:
-        steps: Middles of the bins, shape (B,).
-        iqm: Over seeds, shape (B,).
-        low: The interval's lower end, of two seeds the range's, shape (B,); None of one seed.
-        high: Likewise.
-        seeds: Each seed's own, shape (seeds, B).
-    """
-
-    steps: Array
-    iqm: Array
-    low: Array | None
+    steps: Array  # middles of the bins, shape (B,)
+    iqm: Array  # over seeds, shape (B,)
+    low: Array | None  # the interval's lower end, of two seeds the range's, shape (B,); None of one seed
     high: Array | None
-    seeds: Array
+    seeds: Array  # each seed's own, shape (seeds, B)
 
 
 def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) -> Curve | None:

@@ -178,7 +178,7 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         judging: The filter around the same task, whose constraints are used; it is never stepped.
 
     Raises:
-        ConfigurationError: It is no CBFActionFilter, one of them has no h (`value`), or the filter
+        ConfigurationError: It is no CBFActionFilter, one of them has no h (`h_along`), or the filter
             has a plant of the user's own with a delay, which does not see the present state.
     """
 
@@ -192,9 +192,9 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         its_filter: SafetyFilter = judging.get_wrapper_attr("filter")
         for constraint in its_filter.bound:
             if not constraint.measures_state:
+                kind = type(constraint.spec).__name__
                 raise ConfigurationError(
-                    f"env.judge: {type(constraint.spec).__name__} has no h (`value`) and cannot judge; use env.cost: "
-                    "module:function"
+                    f"env.judge: {kind} has no h (`h_along`) and cannot judge; use env.cost: module:function"
                 )
         self._plant = its_filter.plant
         self._constraints = its_filter.bound

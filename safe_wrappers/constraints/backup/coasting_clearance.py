@@ -36,7 +36,7 @@ class CoastingClearance(DetourClearance):
     best.
 
     Proved, for obstacles that stand still, and as far as `margin` covers the forecast's error: from a state whose way
-    to rest is clear (`value` >= 0) there is always an admissible control, and every physics substep is clear.
+    to rest is clear (h >= 0) there is always an admissible control, and every physics substep is clear.
 
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.

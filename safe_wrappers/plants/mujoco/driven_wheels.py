@@ -42,10 +42,9 @@ class DrivenWheels:
         self._joints = np.array([plant.named("joint", name) for name in names])
         for joint, name in zip(self._joints, names, strict=True):
             if m.jnt_type[joint] != HINGE:
-                hinges = [m.joint(j).name for j in np.flatnonzero(m.jnt_type == HINGE)]
-                there = ", ".join(filter(None, hinges))
+                hinges = filter(None, (m.joint(j).name for j in np.flatnonzero(m.jnt_type == HINGE)))
                 wanted = f"joint {name!r} is no hinge, so it is no wheel's axle"
-                raise ConfigurationError(f"{wanted}; hinges are {there}")
+                raise ConfigurationError(f"{wanted}; hinges are {', '.join(hinges)}")
         self.dofs = m.jnt_dofadr[self._joints]
         direct = np.isin(m.actuator_trntype, AT_A_JOINT)
         self._drives = direct & (m.actuator_trnid[:, 0] == self._joints[:, None])
@@ -58,10 +57,10 @@ class DrivenWheels:
                 wanted = f"no actuator drives joint {name!r} directly, so its slip cannot be limited"
                 raise ConfigurationError(f"{wanted}; driven are {', '.join(driven) or 'none'}")
             if others.any():  # `drive` does not model them
-                found = [m.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(others)]
+                found = ", ".join(m.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(others))
                 raise ConfigurationError(
-                    f"joint {name!r} is also driven by {', '.join(found)} through a tendon or a site, which its slip "
-                    "limit would not hold back; drive wheels by actuators on their own joints"
+                    f"joint {name!r} is also driven by {found} through a tendon or a site, which its slip limit "
+                    "would not hold back; drive wheels by actuators on their own joints"
                 )
         self._bodies = m.jnt_bodyid[self._joints]
         self._roots = m.body_rootid[self._bodies]
@@ -91,21 +90,18 @@ class DrivenWheels:
         Within a physics step; or, where its torque may be clamped and counts as constant, within a control step.
         Measured, with twice that: 40 to 99 % of harmless commands are changed.
         """
-        m = plant.model
-        inertia_of = self.constants(plant).inertia
-        clamped = m.actuator_forcelimited.astype(bool)
-        for wheel, drives in enumerate(self._drives):
-            for i in np.flatnonzero(drives & (m.actuator_biastype == _AFFINE_BIAS)):
-                steps = plant.substeps if clamped[i] else 1
-                stiffness = -float(m.actuator_gear[i, 0] ** 2 * m.actuator_biasprm[i, 2])
-                share = stiffness * steps * float(m.opt.timestep) / float(inertia_of[wheel])
-                if share > 1.0:
-                    longest = "a control step (its torque is clamped)" if clamped[i] else "a physics step"
-                    raise UnsupportedEnvError(
-                        f"the speed servo {m.actuator(int(i)).name or self.names[wheel]!r} is too stiff for a slip "
-                        f"limit: it settles within {longest}, so that its torque says nothing of the ground. Use a "
-                        f"motor, or a kv of at most {-0.99 * float(m.actuator_biasprm[i, 2]) / share:.3g}"
-                    )
+        m, inertias = plant.model, self.constants(plant).inertia
+        for wheel, i in np.argwhere(self._drives & (m.actuator_biastype == _AFFINE_BIAS)):
+            clamped, kv = bool(m.actuator_forcelimited[i]), -float(m.actuator_biasprm[i, 2])
+            span_s = (plant.substeps if clamped else 1) * float(m.opt.timestep)
+            share = float(m.actuator_gear[i, 0] ** 2) * kv * span_s / float(inertias[wheel])
+            if share > 1.0:
+                longest = "a control step (its torque is clamped)" if clamped else "a physics step"
+                raise UnsupportedEnvError(
+                    f"the speed servo {m.actuator(int(i)).name or self.names[wheel]!r} is too stiff for a slip "
+                    f"limit: it settles within {longest}, so that its torque says nothing of the ground. Use a "
+                    f"motor, or a kv of at most {0.99 * kv / share:.3g}"
+                )
 
     def motion(self, plant: MujocoPlant) -> tuple[Array, Array, Array]:
         """Of each wheel, shapes (n,): its rate about its axle, rad/s, positive ahead; its centre's speed, m/s.
@@ -116,16 +112,12 @@ class DrivenWheels:
         mujoco.mj_comPos(m, d)
         mujoco.mj_comVel(m, d)
         axle = d.xaxis[self._joints]
-        level = np.sqrt(axle[:, 0] ** 2 + axle[:, 1] ** 2)
+        level = np.hypot(axle[:, 0], axle[:, 1])
         level = np.where(level > _FLAT, level, np.inf)  # a wheel that lies flat does not roll
         ahead_x, ahead_y = axle[:, 1] / level, -axle[:, 0] / level
-        velocity = d.cvel[self._bodies]
-        turn, move = velocity[:, :3], velocity[:, 3:]
-        arm = d.geom_xpos[self._geoms] - d.subtree_com[self._roots]
-        vx = move[:, 0] + turn[:, 1] * arm[:, 2] - turn[:, 2] * arm[:, 1]
-        vy = move[:, 1] + turn[:, 2] * arm[:, 0] - turn[:, 0] * arm[:, 2]
-        rate = (turn * axle).sum(axis=1)
-        return rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx
+        turn, move = np.hsplit(d.cvel[self._bodies], 2)
+        vx, vy, _ = (move + np.cross(turn, d.geom_xpos[self._geoms] - d.subtree_com[self._roots])).T
+        return (turn * axle).sum(axis=1), ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx
 
     def loads(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
         """Vertical force of the ground on each wheel, shape (n,), N, from an env's model and contacts."""
@@ -156,15 +148,14 @@ class DrivenWheels:
 def _round_geom(plant: MujocoPlant, joint: int) -> int:
     m = plant.model
     name, body = m.joint(joint).name, int(m.jnt_bodyid[joint])
-    round_ones = [g for g in range(m.ngeom) if m.geom_bodyid[g] == body and int(m.geom_type[g]) in _ROUND]
-    touching = [g for g in round_ones if m.geom_contype[g] or m.geom_conaffinity[g]]
-    named = [g for g in touching or round_ones if m.geom(g).name == name]
-    found = (named or touching or round_ones or [-1])[0]
-    radius = float(m.geom_size[found, 0]) if found >= 0 else 0.0
+    found = [g for g in np.flatnonzero(m.geom_bodyid == body).tolist() if int(m.geom_type[g]) in _ROUND]
+    # False sorts before True, and the order in the model decides the rest.
+    found.sort(key=lambda g: (not (m.geom_contype[g] or m.geom_conaffinity[g]), m.geom(g).name != name))
+    radius = float(m.geom_size[found[0], 0]) if found else 0.0
     if not (math.isfinite(radius) and radius > 0.0):
-        has = f"a radius of {radius} m" if found >= 0 else "no sphere, cylinder or capsule"
+        has = f"a radius of {radius} m" if found else "no sphere, cylinder or capsule"
         raise ConfigurationError(
             f"wheel {name!r} needs a radius above zero, read from a geom of its body {m.body(body).name!r}, which "
             f"has {has}"
         )
-    return found
+    return found[0]

@@ -49,8 +49,7 @@ class LineOfSight:
         self.body = int(getattr(model, f"{self._kind}_bodyid")[self._id])
         if view_deg is None:
             view_deg = 360.0 if camera is None else _angle_of_view(model, self._id)
-        self._cosine = math.cos(math.radians(0.5 * min(view_deg, 360.0)))
-        self._all_around = view_deg >= 360.0
+        self._cosine = -2.0 if view_deg >= 360.0 else math.cos(math.radians(0.5 * view_deg))
         self._range = range_m
         self._inside = np.eye(model.nbody, dtype=bool)  # whether body i is body j or a descendant of it
         for body in range(1, model.nbody):
@@ -84,13 +83,10 @@ class LineOfSight:
             points: Shape (n, 3), m.
             bodies: Id of the body that each point is on, which does not hide it; -1 for none; shape (n,).
         """
-        eye = self.position
+        eye, axis = self.position, self.rotation[:, 2] * (-1.0 if self._kind == "cam" else 1.0)
         offsets = points - eye
-        lengths = np.sqrt((offsets * offsets).sum(axis=1))
-        seen = lengths <= self._range
-        if not self._all_around:
-            axis = self.rotation[:, 2] * (-1.0 if self._kind == "cam" else 1.0)
-            seen &= offsets @ axis >= lengths * self._cosine - 1e-12
+        lengths = np.linalg.norm(offsets, axis=1)
+        seen = (lengths <= self._range) & (offsets @ axis >= lengths * self._cosine - 1e-12)
         which = np.flatnonzero(seen & (lengths > _SKIN_M))
         if not which.size:
             return np.asarray(seen)

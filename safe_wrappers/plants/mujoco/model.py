@@ -57,35 +57,24 @@ def names(model: mujoco.MjModel, kind: str, pattern: str = "*") -> list[str]:
     return [n for n in every if n and fnmatchcase(n, pattern)]
 
 
-class Frames(Remade):
-    """Named frames of a machine: the body that carries each, and a view of its origin in the data."""
+class Frames:
+    """Jacobians of the named frames of a machine."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._model, self._data = model, data
-        self._known: dict[tuple[str, str], tuple[int, Array]] = {}
-        self._jacobian: Array = np.zeros((3, model.nv))
-        self._rate: Array = np.zeros((3, model.nv))
+        self._known: dict[tuple[str, str], tuple[int, int]] = {}
 
-    def of(self, kind: str, name: str) -> tuple[int, Array]:
-        """The body that carries a frame, and the frame's origin, shape (3,), m."""
+    def jacobian(self, kind: str, name: str, compute: Any = mujoco.mj_jac) -> tuple[Array, Array]:
+        """A frame's origin, shape (3,), m, and its Jacobian, or with `mj_jacDot` the rate of that, shape (3, nv)."""
         if (kind, name) not in self._known:
             handle = named(self._model, kind, name)
             body = handle if kind == "body" else int(getattr(self._model, f"{kind}_bodyid")[handle])
-            positions = getattr(self._data, {"body": "xpos", "site": "site_xpos", "geom": "geom_xpos"}[kind])
-            self._known[kind, name] = body, positions[handle]
-        return self._known[kind, name]
-
-    def jacobian(self, kind: str, name: str) -> tuple[Array, Array]:
-        """The origin, and its Jacobian, shape (3, nv)."""
-        body, p = self.of(kind, name)
-        mujoco.mj_jac(self._model, self._data, self._jacobian, None, p, body)
-        return p, self._jacobian
-
-    def jacobian_rate(self, kind: str, name: str) -> Array:
-        """The time derivative of the Jacobian, shape (3, nv)."""
-        body, p = self.of(kind, name)
-        mujoco.mj_jacDot(self._model, self._data, self._rate, None, p, body)
-        return self._rate
+            self._known[kind, name] = body, handle
+        body, handle = self._known[kind, name]
+        p = getattr(self._data, "xpos" if kind == "body" else f"{kind}_xpos")[handle].copy()
+        jacobian = np.zeros((3, self._model.nv))
+        compute(self._model, self._data, jacobian, None, p, body)
+        return p, jacobian
 
 
 def fixed_bodies(model: mujoco.MjModel) -> NDArray[np.bool_]:
@@ -148,34 +137,23 @@ PLACES: Final = ("body_pos", "geom_pos")
 """Likewise, where fixed bodies and geoms are."""
 
 
-def read_fields(model: mujoco.MjModel) -> list[str]:
-    """The model's arrays of numbers that a plant or a constraint may read; colours and names are not."""
-    return [
-        name
-        for name in dir(model)
-        if name.startswith(_READ)
-        and not name.endswith(_DRAWN)
-        and isinstance(getattr(model, name), np.ndarray)
-    ]
+def fields_of(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
+    """The arrays that a plant or a constraint may read, without colours and names; the options of the physics."""
+    read = [n for n in dir(model) if n.startswith(_READ) and not n.endswith(_DRAWN)]
+    arrays = [n for n in read if isinstance(getattr(model, n), np.ndarray)]
+    return arrays, [n for n in dir(model.opt) if not n.startswith("_")]
 
 
 def different_fields(model: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
     """The arrays, and options of the physics, in which two models differ."""
-    found = [n for n in read_fields(model) if not np.array_equal(getattr(model, n), getattr(other, n))]
-    one, two = model.opt, other.opt
-    return found + [
-        f"opt.{n}" for n in option_fields(model) if not np.array_equal(getattr(one, n), getattr(two, n))
-    ]
-
-
-def option_fields(model: mujoco.MjModel) -> list[str]:
-    """The options of the physics: gravity, wind, flags, integrator, ..."""
-    return [name for name in dir(model.opt) if not name.startswith("_")]
+    arrays, options = fields_of(model)
+    of = [(n, model, other, n) for n in arrays] + [(f"opt.{n}", model.opt, other.opt, n) for n in options]
+    return [shown for shown, one, two, n in of if not np.array_equal(getattr(one, n), getattr(two, n))]
 
 
 def every_constant(model: mujoco.MjModel) -> "Constants":
     """All arrays of numbers, and all options."""
-    return Constants(model, read_fields(model), option_fields(model))
+    return Constants(model, *fields_of(model))
 
 
 class Constants(Remade):

@@ -420,7 +420,7 @@ class MujocoPlant(Plant):
         if not self._forwarded:
             mujoco.mj_comPos(self.model, data)  # for the Jacobian
         p, jacobian = self.frames.jacobian(kind, name)
-        return p.copy(), jacobian @ self.qvel
+        return p, jacobian @ self.qvel
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
         """Position p, m, and velocity v, m/s, of a named "body", "site" or "geom", and its acceleration, m/s^2.
@@ -429,8 +429,8 @@ class MujocoPlant(Plant):
         """
         drift, effect = self.acceleration
         p, jacobian = self.frames.jacobian(kind, name)
-        rate = self.frames.jacobian_rate(kind, name)
-        return p.copy(), jacobian @ self.qvel, jacobian @ drift + rate @ self.qvel, jacobian @ effect
+        _, rate = self.frames.jacobian(kind, name, mujoco.mj_jacDot)
+        return p, jacobian @ self.qvel, jacobian @ drift + rate @ self.qvel, jacobian @ effect
 
     def attribute(self, name: str) -> Any:
         found = getattr(self._raw, name, None)

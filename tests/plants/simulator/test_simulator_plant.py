@@ -295,7 +295,7 @@ def test_noise_that_begins_after_the_check_is_flagged_at_its_first_step(seen):
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # said once
         assert env.step(np.array([0.1]))[4]["cbf/mismatch"]
-    assert own.promise == "best effort"
+    assert env.constraints[0].promise == "best effort"
 
 
 class Rewards(gym.Wrapper):
