@@ -18,7 +18,7 @@ import safe_wrappers as sw
 from benchmarks.cases import PROTECTED, Case
 from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, Count, encode, font
 from benchmarks.tables import options
-from safe_wrappers.drawing.scene import find_renderer, set_size
+from safe_wrappers.wrappers.safety_overlay import find_renderer, set_size
 
 ROOT = Path(__file__).parents[1]
 FILMS = ROOT / "docs" / "static" / "gallery"

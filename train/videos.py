@@ -23,9 +23,8 @@ from PIL import Image
 from rich.console import Console
 
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.scene import find_renderer, set_size
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
+from safe_wrappers.wrappers.safety_overlay import SafetyOverlay, find_renderer, set_size
 
 from .config import ArmConfig, ExperimentConfig, FilterConfig
 from .evaluation.evaluate import ShownEpisode, conditions, shown_episode

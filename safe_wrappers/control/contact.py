@@ -6,14 +6,14 @@ direction. It does not say that a foothold carries the load.
 
 **Impact.** One mass on one massless linear spring without damping, `m x'' = -k x - m a`, `x(0) = 0`, `x'(0) = v`, up
 to the first peak of the deflection x. Not modelled: stiffness that grows with depth, damping, a pad at the end of its
-stroke, a second contact. Masses and stiffnesses are positive; speeds of approach that are negative count as at rest.
+stroke, a second contact. **Braking after contact is too late**: the peak comes a quarter of a period after the touch,
+typically 20 to 50 ms, and a brake that acts later does not reduce it. So protection needs clearance before contact.
 
-**Braking after contact is too late.** The peak comes a quarter of a period after the touch, typically 20 to 50 ms. A
-brake that acts later does not reduce it (`braked_deflection`), so protection needs clearance before contact.
+Arguments are numbers or arrays that broadcast. They are not checked: masses and stiffnesses are positive, NaN gives
+NaN; speeds of approach that are negative count as at rest.
 
 Source: appendix "Rigid Body Contact Mechanics", "Non-smooth collision manifolds and velocity jumps", "Elastodynamic
-impact force and compliance deformation" and "Physical contact feasibility constraints". Arguments are numbers or
-arrays that broadcast; they are not checked, and NaN gives NaN.
+impact force and compliance deformation" and "Physical contact feasibility constraints".
 """
 
 import math

@@ -89,17 +89,11 @@ def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> tupl
 
 
 class Motion(NamedTuple):
-    """Motion model of one track: `p' = v`, `v' = (mean_velocity - v) / reversion_s + w`.
+    """Motion model of one track: `p' = v`, `v' = (mean_velocity - v) / reversion_s + w`."""
 
-    Attributes:
-        intensity: Of the acceleration noise w, q, shape (d, d), m^2/s^3.
-        reversion_s: Time constant with which the velocity reverts to its mean, s; inf for none.
-        mean_velocity: Shape (d,), m/s.
-    """
-
-    intensity: Array
-    reversion_s: float
-    mean_velocity: Array
+    intensity: Array  #: of the acceleration noise w, shape (d, d), m^2/s^3
+    reversion_s: float  #: time constant with which the velocity reverts to its mean, s; inf for none
+    mean_velocity: Array  #: shape (d,), m/s
 
     def matrices(self) -> tuple[Array, Array, Array]:
         """A (2d, 2d), the constant drift b (2d,) and the noise intensity Q (2d, 2d) of `x' = A x + b + w`."""

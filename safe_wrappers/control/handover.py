@@ -249,32 +249,24 @@ _UNITS: Final = {
     "torque": "N m",
     "torque_slew": "N m/s",
 }
-_DERIVATIVES: Final = {"velocity": 1, "acceleration": 2, "jerk": 3}
 
 
 @dataclass(frozen=True)
 class SeamLimits:
     """What a machine was measured to bear, for `ChunkHandover(limits=)`; what is None is not judged.
 
-    Each is one number for all entries of a command, or one for each of them.
-
-    Attributes:
-        velocity: Action units per s.
-        acceleration: Action units per s^2.
-        jerk: Action units per s^3.
-        torque: Of commands that are positions of joints: that which the joint needs, by inverse dynamics of the env's
-            MuJoCo model, N m.
-        torque_slew: N m/s, likewise.
+    Each is one number for all entries of a command, or one for each of them. Torques are for commands that are
+    positions of joints: those which the joints need, by inverse dynamics of the env's MuJoCo model.
 
     Raises:
         ConfigurationError: A limit that is not positive, or none at all.
     """
 
-    velocity: float | Sequence[float] | None = None
-    acceleration: float | Sequence[float] | None = None
-    jerk: float | Sequence[float] | None = None
-    torque: float | Sequence[float] | None = None
-    torque_slew: float | Sequence[float] | None = None
+    velocity: float | Sequence[float] | None = None  #: action units per s
+    acceleration: float | Sequence[float] | None = None  #: action units per s^2
+    jerk: float | Sequence[float] | None = None  #: action units per s^3
+    torque: float | Sequence[float] | None = None  #: N m
+    torque_slew: float | Sequence[float] | None = None  #: N m/s
 
     def __post_init__(self) -> None:
         for name, unit in _UNITS.items():
@@ -305,15 +297,10 @@ def _entries(name: str, value: Any, unit: str) -> float | tuple[float, ...] | No
 
 
 class SeamCheck:
-    """Whether quintic blends and chunks keep limits.
+    """Whether quintic blends and chunks of m controls keep a machine's limits.
 
-    Args:
-        limits: Of the machine.
-        controls: m, entries of a command.
-        control_dt: Control interval, s.
-        torques: Where `limits.needs_dynamics`: of positions, velocities and accelerations of the joints, shape (k, m)
-            each, the torques that they take, (k, m), N m.
-        inertia: Likewise: of joint positions, shape (k, m), the inertia matrices, (k, m, m), kg m^2.
+    Where `limits.needs_dynamics`, `torques` gives those that positions, velocities and accelerations of the joints
+    take, N m, all of shape (k, m), and `inertia` the matrices of joint positions, shape (k, m, m), kg m^2.
     """
 
     def __init__(
@@ -325,11 +312,8 @@ class SeamCheck:
         inertia: Callable[[Array], Array] | None = None,
     ) -> None:
         self._control_dt, self._torques, self._inertia = control_dt, torques, inertia
-        every = {name: limits.of(name, controls) for name in _UNITS}
-        self._bounds = {
-            d: every[name] for name, d in _DERIVATIVES.items() if getattr(limits, name) is not None
-        }
-        self._torque, self._slew = every["torque"], every["torque_slew"]
+        self._bounds = [limits.of(name, controls) for name in ("velocity", "acceleration", "jerk")]
+        self._torque, self._slew = limits.of("torque", controls), limits.of("torque_slew", controls)
 
     def accepts(self, sent: Array, new: Array, steps: int) -> bool:
         """Whether a quintic of `join` that bridges `steps` commands keeps all limits up to its end.
@@ -337,7 +321,7 @@ class SeamCheck:
         Torques are judged at every quarter of a control step, and where an acceleration is largest or smallest.
         """
         curve = bridge(sent, new, steps, self._control_dt)
-        if any((peaks(curve, d) > bound * _ROUNDING).any() for d, bound in self._bounds.items()):
+        if any((peaks(curve, d) > bound * _ROUNDING).any() for d, bound in enumerate(self._bounds, 1)):
             return False
         if self._torques is None:
             return True
@@ -357,5 +341,4 @@ class SeamCheck:
 
     def shortest_fade(self, change: Array) -> float:
         """The shortest smoothstep, s, that changes a held command by (m,) within the limits but those of torque."""
-        spans = [shortest_blend(change, bound, d) for d, bound in self._bounds.items()]
-        return float(np.max(spans, initial=0.0))
+        return float(np.max([shortest_blend(change, bound, d) for d, bound in enumerate(self._bounds, 1)]))

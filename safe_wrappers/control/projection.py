@@ -33,9 +33,7 @@ _LARGEST: Final = 1e150  # from here on squares may overflow
 _OVERFLOWING: Final = 1e300  # an offset from here on asks for nothing
 _SHORTEST: Final = 1e-150  # rows below this are zero
 _ROUNDING: Final = 1e-15  # share of the numbers that are compared which round-off may leave
-_OPTIMAL: Final = (
-    1e-9  # what the multipliers' control may differ from the answer by, as a share of the controls
-)
+_OPTIMAL: Final = 1e-9  # share of the controls by which the multipliers' control may miss the answer
 _DOWNHILL: Final = 1e-4  # likewise of a least squares answer
 _SOFT: Final = 1e-10  # weight of the distance from the nominal beside squared violations
 _FAR: Final = 1e8  # from the nominal, in the program's units: nobody looks for a control farther away
@@ -58,17 +56,11 @@ class Status(StrEnum):
 
 
 class Projection(NamedTuple):
-    """An answer that has been checked.
+    """An answer that has been checked."""
 
-    Attributes:
-        control: Shape (m,), always finite and inside the box.
-        status: See `Status`; compares equal to its string.
-        violation: Largest `normals @ control - offsets` over all rows, at least 0, in row units.
-    """
-
-    control: Array
-    status: Status
-    violation: float
+    control: Array  #: shape (m,), always finite and inside the box
+    status: Status  #: compares equal to its string
+    violation: float  #: largest `normals @ control - offsets` over all rows, at least 0, in row units
 
 
 def project(
@@ -100,7 +92,7 @@ def project(
         raise ConfigurationError(f"expected {wanted}; got {u.shape}, {a.shape} and {b.shape}")
     lo, hi = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     try:
-        lo, hi = np.broadcast_to(lo, u.shape), np.broadcast_to(hi, u.shape)
+        lo, hi = (end if end.shape == u.shape else np.full(u.shape, end) for end in (lo, hi))
     except ValueError:
         raise ConfigurationError(f"expected bounds of shape {u.shape}; got {lo.shape}, {hi.shape}") from None
     return project_unchecked(u, a, b, lo, hi)
@@ -142,13 +134,10 @@ def _half_width(low: float, high: float) -> float:
 
 @compiled
 def _scale(box: float, length: float, values: float, widest: float) -> float:
-    """What a residual is compared with, row units.
+    """What a residual is compared with, row units: how far the row's value changes over half of the box, or `values`.
 
-    Args:
-        box: How far the row's value changes over half of the box.
-        length: Of the normal: what it changes by over one control unit.
-        values: Size of the two numbers that the row compares.
-        widest: Half of the box's largest width, control units.
+    The length is that of the normal, `values` the size of the two numbers that the row compares, `widest` half of the
+    box's largest width, control units.
     """
     if widest <= _ORDINARY:
         return box

@@ -71,16 +71,11 @@ class Wheel:
     feedback of a speed servo, stepped with implicit damping as MuJoCo's Euler integrators do: `w+ = decay w + gain
     (tau - r F)`, exactly. Solved for F it is a traction-force observer; other torques on the axle (dry friction, a
     spring) appear in F.
-
-    Attributes:
-        radius: r, m, > 0.
-        inertia: I about the axle, rotor included, kg m^2, > 0.
-        damping: b of the axle, N m s/rad, >= 0.
     """
 
-    radius: Array
-    inertia: Array
-    damping: Array
+    radius: Array  #: r, m, > 0
+    inertia: Array  #: I about the axle, rotor included, kg m^2, > 0
+    damping: Array  #: b of the axle, N m s/rad, >= 0
 
     def response(
         self, timestep: float, substeps: int, feedback: Array | float = 0.0, implicit: bool = False

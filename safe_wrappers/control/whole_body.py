@@ -46,45 +46,32 @@ _RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class WholeBodyProblem:
-    """One instant of a robot in contact.
+    """One instant of a robot in contact."""
 
-    Attributes:
-        inertia: M, shape (nv, nv), positive definite.
-        bias: h, shape (nv,): Coriolis, centrifugal and gravity forces minus passive ones, on the left-hand side.
-        actuation: B, shape (nv, nu): generalised force per control.
-        jacobians: J_k of the contact points, shape (k, 3, nv); k may be 0.
-        drift: `dJ/dt qvel` of the contact points, shape (k, 3), m/s^2.
-        normals: Unit normals, pointing at the body that the forces push, shape (k, 3).
-        friction: Coefficients, at least 0, shape (k,). At 0 a contact acts along its normal only.
-        lower: Smallest control, shape (nu,).
-        upper: Largest control, shape (nu,).
-        nominal: The control whose distance is minimised, shape (nu,).
-        contact_acceleration: Wanted at the contact points, shape (k, 3), m/s^2; None is zero.
-        force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces of equal effect.
-        breaking: Contacts that are to open, shape (k,): force 0, normal acceleration at least the wanted; None: none.
-        first_tangents: Direction of each pyramid's first edge, shape (k, 3); None for a default.
-        accelerations: Rows `G qacc <= g`, shapes (m, nv) and (m,), as of `predicted_position_rows`; None: none.
-    """
-
-    inertia: Array
-    bias: Array
-    actuation: Array
-    jacobians: Array
-    drift: Array
-    normals: Array
-    friction: Array
-    lower: Array
-    upper: Array
-    nominal: Array
-    contact_acceleration: Array | None = None
-    force_weight: float = 1e-8
+    inertia: Array  #: M, shape (nv, nv), positive definite
+    bias: Array  #: h, shape (nv,): Coriolis, centrifugal and gravity forces minus passive ones
+    actuation: Array  #: B, shape (nv, nu): generalised force per control
+    jacobians: Array  #: J_k of the contact points, shape (k, 3, nv); k may be 0
+    drift: Array  #: `dJ/dt qvel` of the contact points, shape (k, 3), m/s^2
+    normals: Array  #: unit normals, pointing at the body that the forces push, shape (k, 3)
+    friction: Array  #: coefficients, at least 0, shape (k,); at 0 a contact acts along its normal only
+    lower: Array  #: smallest control, shape (nu,)
+    upper: Array  #: largest control, shape (nu,)
+    nominal: Array  #: the control whose distance is minimised, shape (nu,)
+    contact_acceleration: Array | None = (
+        None  #: wanted at the contact points, shape (k, 3), m/s^2; None is zero
+    )
+    force_weight: float = 1e-8  #: of the squared forces, per N^2: it chooses among forces of equal effect
     breaking: NDArray[np.bool_] | None = None
-    first_tangents: Array | None = None
-    accelerations: tuple[Array, Array] | None = None
-    stance: NDArray[np.intp] = field(init=False)
-    """Indices of the contacts that are to stay."""
-    opening: NDArray[np.intp] = field(init=False)
-    """Indices of the contacts that are to open."""
+    """Contacts that are to open, shape (k,): force 0, normal acceleration at least the wanted; None: none."""
+    first_tangents: Array | None = (
+        None  #: direction of each pyramid's first edge, shape (k, 3); None: a default
+    )
+    accelerations: tuple[Array, Array] | None = (
+        None  #: rows `G qacc <= g`, shapes (m, nv) and (m,); None: none
+    )
+    stance: NDArray[np.intp] = field(init=False)  #: indices of the contacts that are to stay
+    opening: NDArray[np.intp] = field(init=False)  #: indices of the contacts that are to open
     wanted: Array = field(init=False)
     """Wanted `J qacc`: `contact_acceleration`, or zeros, minus the drift, shape (k, 3)."""
 

@@ -68,9 +68,8 @@ def _refuse_finalizers(env: Env) -> None:
 
 def _is_drawn(value: Any) -> bool:
     """Whether a value is a window, a renderer or a picture, which no copy needs."""
-    kind = type(value)
-    package = getattr(kind, "__module__", "").partition(".")[0]  # SWIG's types have no module
-    return package in _DRAWING or kind.__name__.endswith(("Renderer", "Viewer"))
+    package = getattr(type(value), "__module__", "").partition(".")[0]  # SWIG's types have no module
+    return package in _DRAWING or type(value).__name__.endswith(("Renderer", "Viewer"))
 
 
 class EnvCopier:
@@ -105,13 +104,9 @@ class EnvCopier:
         envs = list(_envs_of(self._env))
         memo: dict[int, Any] = {id(one): object.__new__(type(one)) for one in envs}
         values = [value for one in envs for value in vars(one).values()]
-        for value in values:
-            if isinstance(value, _SHARED):
-                memo[id(value)] = value
-            elif isinstance(value, mujoco.MjModel):
-                memo[id(value)] = self._model(value)
-            elif _is_drawn(value):
-                memo[id(value)] = None
+        memo |= {id(value): value for value in values if isinstance(value, _SHARED)}
+        memo |= {id(value): None for value in values if _is_drawn(value)}
+        memo |= {id(value): self._model(value) for value in values if isinstance(value, mujoco.MjModel)}
         memo |= {id(value): self._copy_of_data(value) for value in values if isinstance(value, mujoco.MjData)}
         for one in envs:
             attributes: dict[str, Any] = memo[id(one)].__dict__
@@ -286,27 +281,17 @@ def _answers(env: Env, actions: list[Any]) -> list[tuple[Any, float, bool, bool]
 
 
 def differing(name: str, one: Any, other: Any, tolerance: float = 0.0) -> str | None:
-    """Where a simulated part of an answer differs from the env's, in words; None: nowhere.
-
-    Floats may differ by the tolerance, as a share of those above 1.
-    """
+    """Where a simulated part of an answer differs from the env's, floats by more than a share; None: nowhere."""
     if isinstance(one, dict | tuple | list):
         keys = one.keys() if isinstance(one, dict) else range(len(one))
         parts = (differing(f"{name}[{key!r}]", one[key], other[key], tolerance) for key in keys)
         return next(filter(None, parts), None)
     a, b = np.asarray(one), np.asarray(other)
-    if a.dtype != b.dtype:  # a vector env's observations have the dtype of the space
-        a = a.astype(b.dtype)
+    a = a.astype(b.dtype)  # a vector env's observations have the dtype of the space
     if a.shape != b.shape:
         return f"its {name} has shape {a.shape} instead of {b.shape}"
-    if a.tobytes() == b.tobytes():
-        return None
-    equal = (a == b) | ((a != a) & (b != b))
-    if tolerance and b.dtype.kind == "f":
-        equal |= np.isclose(a, b, tolerance, tolerance)
-    unequal = np.argwhere(~np.atleast_1d(equal))
-    if not len(unequal):
-        return None  # zeros of another sign
-    at = tuple(unequal[0].tolist())
-    one, other = (np.atleast_1d(array)[at].item() for array in (a, b))
-    return f"its {name}{list(at) if a.ndim else ''} is {one!r} instead of {other!r}"
+    close = np.isclose(a, b, tolerance, tolerance, equal_nan=True) if b.dtype.kind in "fc" else a == b
+    for at in map(tuple, np.argwhere(~np.atleast_1d(close))[:1].tolist()):
+        one, other = (np.atleast_1d(array)[at].item() for array in (a, b))
+        return f"its {name}{list(at) if a.ndim else ''} is {one!r} instead of {other!r}"
+    return None

@@ -15,10 +15,7 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant
 # The envs add the turn to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum.
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])
 _METRES_PER_UNIT = 0.05
-_FINGERS = (
-    "robot0:l_gripper_finger_joint",
-    "robot0:r_gripper_finger_joint",
-)  # zeroed if the gripper is blocked
+_FINGERS = tuple(f"robot0:{side}_gripper_finger_joint" for side in "lr")  # zeroed if the gripper is blocked
 
 
 class DisplacementRecorder(Recorder):
@@ -58,9 +55,6 @@ class DisplacementRecorder(Recorder):
     def braking(self, data: mujoco.MjData) -> Array:
         """No displacement, shape (4,)."""
         return np.zeros(4)
-
-
-_WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, SingularityMargin"
 
 
 class DisplacementPlant(MujocoPlant):
@@ -137,6 +131,7 @@ class DisplacementPlant(MujocoPlant):
     def require_acceleration(self, asker: str) -> NoReturn:
         """Raise an error that says what can be used instead."""
         raise UnsupportedEnvError(
-            f"{asker} needs the acceleration that an action causes; on a {type(self).__name__} an action is a "
-            f"displacement of the gripper, from which none follows. Constraints that forecast work: {_WORKS}"
+            f"{asker} needs the acceleration that an action causes; on a DisplacementPlant an action is a "
+            "displacement of the gripper, from which none follows. Constraints that forecast work: Workspace, "
+            "JointPositionLimit, JointSpeedLimit, SpeedLimit, SingularityMargin"
         )

@@ -215,15 +215,15 @@ class IdentifiedPlant(RolloutPlant):
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         refuse_changed_actions(env)
-        super().bind(env)
         widths = [part.shape[1:] for part in self.fit_episodes[0]]
-        shapes = env.observation_space.shape, self.lower.shape
+        shapes = env.observation_space.shape, env.action_space.shape or (1,)
         for name, space, have in zip(Episode._fields, shapes, widths, strict=True):
             if space != have:
                 raise UnsupportedEnvError(
                     f"the model was fitted to {name} of shape {have}, {name_of(env)} has {space}; log episodes "
                     "of this env, with the wrappers that are inside the filter (such as FlattenObservation)"
                 )
+        super().bind(env)
         self.view = View(None, np.zeros(widths[0]), {})
 
     @property

@@ -75,6 +75,8 @@ class RolloutPlant(Plant):
     """Whether rollouts were checked to be what the env does, its noise included."""
     substeps: int = 1
     """Physics substeps of a control step that are known of."""
+    discrete: bool = False
+    """Whether actions are whole numbers."""
     judges_substeps: bool = False
     """Whether rollouts can be measured at each of them, by a measure of the env alone."""
     lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
@@ -87,24 +89,21 @@ class RolloutPlant(Plant):
 
     def __init__(self, control_dt: float | None) -> None:
         self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
-        self._foreseen: dict[bytes, tuple[Rollout, Measure | None]] = {}
+        self._foreseen: dict[bytes, tuple[Any, float | None, Measure | None]] = {}
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         refuse_second_env(getattr(self, "_env", None), env)
         space = env.action_space
-        if isinstance(space, gym.spaces.Box) and len(space.shape) == 1:
-            if not space.is_bounded():
-                raise UnsupportedEnvError(
-                    f"expected bounded actions, got {space}; bound the env's action space"
-                )
-            self.lower, self.upper = space.low.astype(float), space.high.astype(float)
-        elif isinstance(space, gym.spaces.Discrete):
+        self.discrete = isinstance(space, gym.spaces.Discrete)
+        if isinstance(space, gym.spaces.Discrete):
             self.lower = np.array([float(space.start)])
             self.upper = self.lower + float(space.n - 1)
+        elif isinstance(space, gym.spaces.Box) and len(space.shape) == 1 and space.is_bounded():
+            self.lower, self.upper = space.low.astype(float), space.high.astype(float)
         else:
             raise UnsupportedEnvError(
-                f"expected a Box of shape (m,) or a Discrete action space, got {space}; give "
-                "the env one of these from gymnasium.spaces.flatten_space, and gymnasium.spaces.unflatten in its step"
+                f"expected bounded actions of shape (m,) in a Box, or Discrete ones, got {space}; give the env one "
+                "of these from gymnasium.spaces.flatten_space, and gymnasium.spaces.unflatten in its step"
             )
         if self._given_control_dt is not None or env.has_wrapper_attr("dt"):
             self._control_dt = check_timing(env, self._given_control_dt)
@@ -125,13 +124,10 @@ class RolloutPlant(Plant):
 
     @property
     def f(self) -> NoReturn:
-        """Raises: nothing is known of it."""
-        self.require_acceleration("f")
+        """Raises, as `g` does: nothing is known of them."""
+        self.require_acceleration("f or g")
 
-    @property
-    def g(self) -> NoReturn:
-        """Raises likewise."""
-        self.require_acceleration("g")
+    g = f
 
     def attribute(self, name: str) -> Any:
         return read_attribute(self._env, name)
@@ -149,11 +145,6 @@ class RolloutPlant(Plant):
     def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
         """Step the env; a discrete action is a control, and becomes what the space has."""
         return super().step(env, self.action(action) if self.discrete else action)
-
-    @property
-    def discrete(self) -> bool:
-        """Whether actions are whole numbers."""
-        return not isinstance(self._space, gym.spaces.Box)
 
     def neighbours(self, control: Array, points: Array, more: Sequence[Array] = ()) -> list[Array]:
         """Other controls, the nearest first: all of discrete ones.
@@ -189,9 +180,9 @@ class RolloutPlant(Plant):
         """
         given = numbers_of(action)
         wanted = f"{of} must be a finite action of {self._space}, got {shown(action)}"
-        if given is None or np.atleast_1d(given).shape != self.lower.shape:
+        control = np.zeros(0) if given is None else np.atleast_1d(given).astype(np.float64)
+        if control.shape != self.lower.shape:
             raise ConfigurationError(wanted)
-        control = np.atleast_1d(given).astype(np.float64)
         if not np.isfinite(control).all():
             raise NotFiniteError(wanted)
         clipped = np.clip(control, self.lower, self.upper)
@@ -255,7 +246,7 @@ class RolloutPlant(Plant):
             return found
 
         found = self.run(simulated)
-        self._foreseen[control.tobytes()] = found, measure
+        self._foreseen[control.tobytes()] = found.observations[0], found.first, measure
         return found
 
     @abstractmethod
@@ -378,10 +369,10 @@ class SimulatorPlant(RolloutPlant):
         """
         if not self.check_steps or self._sent not in self._foreseen:
             return ""
-        foreseen, measure = self._foreseen[self._sent]
-        found = differing("observation", foreseen.observations[0], self.view.observation, _ROUNDING)
+        observation, value, measure = self._foreseen[self._sent]
+        found = differing("observation", observation, self.view.observation, _ROUNDING)
         if found is None and measure is not None:
-            found = differing("h", foreseen.first, measure(self.view), _ROUNDING)
+            found = differing("h", value, measure(self.view), _ROUNDING)
         if found is None:
             return ""
         self.exact = False

@@ -1,26 +1,46 @@
 """SafetyOverlay: draws into the env's frames what the filter knows and does."""
 
+from collections import deque
+from collections.abc import Iterable, Sequence
+from itertools import chain, combinations, pairwise, product
 from typing import Any, ClassVar, Final
 
+import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import ArrayLike
 
-from safe_wrappers import info as keys
 from safe_wrappers.checks import Array
-from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
+from safe_wrappers.constraints.obstacles import Plain, Plane, TrackedDiscs
 from safe_wrappers.constraints.points import Workspace
-from safe_wrappers.drawing.marks import THIN, Mark, ball, block, edges, line, pad, ring, spatial
-from safe_wrappers.drawing.scene import Strip, arrows, find_renderer, put
+from safe_wrappers.control.numerics.shapes import BLOCK, PLANE
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.strip import ACTIONS, STEPS, with_strip, words_of
 
-_MODES: Final = ("rgb_array", "human")
-_PAD_M: Final = 0.4  # half of the square that is drawn of a plane
-_LISTS: Final = ("obstacles", "keep_out", "untouched")
+Mark = dict[str, Any]
+"""One shape, as `add_marker` of Gymnasium's viewers takes it."""
+
+KEEP_OUT: Final = (0.95, 0.15, 0.1, 0.4)  # red, green, blue and opacity
+LIMIT: Final = (0.95, 0.15, 0.1, 0.9)
+WAY: Final = (1.0, 0.72, 0.05, 0.95)
+ESTIMATE: Final = (0.55, 0.3, 0.8, 0.35)
+MOST_MARKS: Final = 500
+"""Of one frame. Gymnasium's scene has room for 1000 shapes, the model's own among them."""
+
+_PIECES: Final = 30  # the most of one way
+_THIN: Final = 0.012  # m: half the width of a line
+_FLOOR: Final = 0.02  # m: the height at which what has no height is drawn, just above a floor at 0
+_UP: Final = np.array([0.0, 0.0, 1.0])
+_CIRCLE: Final = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.linspace(0.0, 2.0 * np.pi, 17)])
+_LENGTH, _THICKNESS = 4.0, 0.3  # of the longest arrow, in sizes of the body
 
 
 class SafetyOverlay(LayerWrapper):
@@ -53,7 +73,7 @@ class SafetyOverlay(LayerWrapper):
 
     def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
-        if env.render_mode not in _MODES:
+        if env.render_mode not in ("rgb_array", "human"):
             raise ConfigurationError(
                 f"SafetyOverlay draws into the frames of {name_of(env)}, whose render_mode is {env.render_mode!r}: "
                 "make the env with gym.make(..., render_mode='rgb_array'), or 'human' for a window"
@@ -65,17 +85,16 @@ class SafetyOverlay(LayerWrapper):
             )
         self._record({})
         self._inside = filter_inside(env)
-        self._strip = Strip()
+        self._infos: deque[dict[str, Any]] = deque(maxlen=STEPS)
+        self._bounds: tuple[Array, Array] | None = None
         if isinstance(env.action_space, spaces.Box) and env.action_space.is_bounded():
-            self._strip = Strip(np.ravel(env.action_space.low), np.ravel(env.action_space.high))
-        self._last: dict[str, Any] | None = None
+            self._bounds = np.ravel(env.action_space.low), np.ravel(env.action_space.high)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env; the strip begins anew."""
-        self._last = None
+        self._infos.clear()
         observation, info = self.env.reset(seed=seed, options=options)
-        self._last = dict(info)
-        self._strip.begin(info)
+        self._infos.append(dict(info))
         return observation, info
 
     def step(self, action: Any) -> Step:
@@ -83,26 +102,23 @@ class SafetyOverlay(LayerWrapper):
         if self.render_mode == "human":
             self._prepare()
         observation, reward, terminated, truncated, info = self._pass_on(action)
-        self._last = dict(info)
-        self._strip.add(info)
+        self._infos.append(dict(info))
         return observation, reward, terminated, truncated, info
 
     def render(self) -> Any:
         """The env's frame with the overlay, of the same shape."""
         self._prepare()
         frame = self.env.render()
-        return self._strip.on(frame) if isinstance(frame, np.ndarray) else frame
+        return with_strip(frame, self._infos, self._bounds) if isinstance(frame, np.ndarray) else frame
 
     def marks(self) -> list[Mark]:
         """What is drawn into the scene in the present state; nothing before a reset, or without a filter."""
-        if self._last is None or self._inside is None:
+        if not self._infos or self._inside is None:
             return []
-        bound = self._inside.look()
-        found = [mark for constraint in bound for mark in marks_of(constraint.spec)]
-        proposed, executed = (self._last.get(key) for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION))
-        if bound and proposed is not None and executed is not None:
-            specs = [constraint.spec for constraint in bound]
-            found += arrows(self._inside.plant, specs, proposed, executed)
+        specs = [bound.spec for bound in self._inside.look()]
+        found = [one for spec in specs for one in marks_of(spec)]
+        if specs and all(key in self._infos[-1] for key in ACTIONS):
+            found += _arrows(self._inside.plant, specs, self._infos[-1])
         return found
 
     def _prepare(self) -> None:
@@ -110,52 +126,124 @@ class SafetyOverlay(LayerWrapper):
         renderer = find_renderer(self.env)
         if renderer is None:
             return
-        put(self.marks(), renderer, str(self.render_mode))
-        if self.render_mode == "human":
-            viewer = renderer._get_viewer("human")
-            for word in self._strip.words:
-                viewer.add_overlay(2, word, "")  # mjGRID_BOTTOMLEFT
+        viewer = renderer._get_viewer(str(self.render_mode))
+        for one in self.marks()[:MOST_MARKS]:
+            viewer.add_marker(**one)
+        for word in words_of(self._infos[-1]) if self.render_mode == "human" and self._infos else ():
+            viewer.add_overlay(2, word, "")  # mjGRID_BOTTOMLEFT
+
+
+def find_renderer(env: Env) -> Any | None:
+    """The `MujocoRenderer` of an env, or of the robot's env that it holds, as a maze does; None: it has none."""
+    raw: Any = env.unwrapped
+    held = [raw, *(inner for inner in vars(raw).values() if isinstance(inner, gym.Env))]
+    return next(filter(None, (getattr(one, "mujoco_renderer", None) for one in held)), None)
+
+
+def set_size(env: Env, width: int, height: int) -> None:
+    """Have an env of which no frame has been asked yet draw frames of this size, px; others stay as they are."""
+    renderer = find_renderer(env)
+    if renderer is not None:
+        renderer.width, renderer.height = width, height
+        drawn = renderer.model.vis.global_
+        drawn.offwidth, drawn.offheight = width, height
 
 
 def marks_of(spec: Any) -> list[Mark]:
-    """A constraint in the present state: its obstacles with what is kept free before them, its points, their way.
-
-    Args:
-        spec: On its plant. Where it has `points`, they are drawn along the trajectory from the present state.
-    """
-    inset = spec.margin + spec.state_error + getattr(spec, "radius", 0.0)
-    way = np.zeros((1, 0, 3)) if not hasattr(spec, "points") else spec.points(spec.model.rollout(None))
-    found = [mark for j in range(way.shape[1]) for mark in line("way", way[:, j], THIN)]
-    found += [ball("way", point, max(getattr(spec, "radius", 0.0), THIN)) for point in way[-1]]
-    at = way[0, 0] if way.shape[1] else np.zeros(3)
-    obstacles = [obstacle for name in _LISTS for obstacle in getattr(spec, name, ())]
+    """A constraint on its plant, now: its obstacles with what is kept free before them, its points and their way."""
+    radius = getattr(spec, "radius", 0.0)
+    inset = spec.margin + spec.state_error + radius
+    way = _spatial(spec.points(spec.model.rollout(None))) if hasattr(spec, "points") else np.zeros((1, 0, 3))
+    way = way[np.unique(np.linspace(0, len(way) - 1, _PIECES + 1, dtype=int))]
+    found = [line for j in range(way.shape[1]) for line in _lines(WAY, way[:, j])]
+    found += [mark("SPHERE", WAY, point, [max(radius, _THIN), 0.0, 0.0]) for point in way[-1]]
+    obstacles = [one for name in ("obstacles", "keep_out", "untouched") for one in getattr(spec, name, ())]
     if isinstance(spec, Workspace):
         low, high = spec.low or [None] * 3, spec.high or [None] * 3
         if None in (*low, *high):
-            units = np.eye(3)
-            obstacles += [Plane(units[i] * v, units[i]) for i, v in enumerate(low) if v is not None]
-            obstacles += [Plane(units[i] * v, -units[i]) for i, v in enumerate(high) if v is not None]
+            walls = zip([*low, *high], np.vstack([np.eye(3), -np.eye(3)]), strict=True)
+            obstacles += [Plane(abs(normal) * v, normal) for v, normal in walls if v is not None]
         else:
-            found += edges("limit", np.array(low) + inset, np.array(high) - inset, THIN / 3.0)
-    return found + [mark for obstacle in obstacles for mark in _marks(obstacle, spec.plant, inset, at)]
+            corners = [*product(*np.transpose([np.array(low) + inset, np.array(high) - inset]))]
+            edges = [ends for ends in combinations(np.array(corners), 2) if (ends[0] != ends[1]).sum() == 1]
+            found += [line for ends in edges for line in _lines(LIMIT, ends, _THIN / 3.0)]
+    here = way[0, 0] if way.shape[1] else np.zeros(3)
+    return found + [one for obstacle in obstacles for one in _around(obstacle, spec.plant, inset, here)]
 
 
-def _marks(obstacle: Any, plant: Plant, inset: float, point: Array) -> list[Mark]:
+def _around(obstacle: Any, plant: Plant, inset: float, here: Array) -> list[Mark]:
     """An obstacle of the library's kinds, larger by an inset, m; of a plane the part nearest to a point."""
-    if isinstance(obstacle, Disc | Discs | Sphere):
-        centers, radius = obstacle.centers(plant), obstacle.radius + inset
-        if centers.shape[1] == 2:
-            return [mark for center in centers for mark in ring("limit", center, radius)]
-        return [ball("keep out", center, radius) for center in centers]
-    if isinstance(obstacle, Box):
-        return [block("keep out", obstacle.center, np.array(obstacle.half_size) + inset)]
-    if isinstance(obstacle, Plane):
-        normal = spatial(obstacle.normal, 0.0)
-        at, of = spatial(point), spatial(obstacle.point, 0.0)
-        foot = at - ((at - of) @ normal - inset) * normal
-        return [pad("keep out", foot, normal, _PAD_M)]
     if isinstance(obstacle, TrackedDiscs):
         centers, halves = (part[0] for part in obstacle.boxes(plant, np.zeros(1)))
         sizes = halves + obstacle.radius + inset
-        return [block("estimate", *one) for one in zip(centers, sizes, strict=True)]
-    return []
+        return [mark("BOX", ESTIMATE, *box) for box in zip(_spatial(centers), _spatial(sizes), strict=True)]
+    found = []
+    for kind, d, *numbers in obstacle.surfaces(plant) if isinstance(obstacle, Plain) else ():
+        first, second = _spatial(numbers[: int(d)]), np.array(numbers[3:])
+        if kind == PLANE:
+            foot = here - ((here - first) @ second - inset) * second
+            found.append(mark("BOX", KEEP_OUT, foot, [0.4, 0.4, 0.004], second))
+        elif kind == BLOCK:
+            found.append(mark("BOX", KEEP_OUT, first, _spatial(second[: int(d)] + inset)))
+        elif d == 3:
+            found.append(mark("SPHERE", KEEP_OUT, first, [second[0] + inset, 0.0, 0.0]))
+        else:
+            found += _lines(LIMIT, first + (second[0] + inset) * _CIRCLE)
+    return found
+
+
+def _arrows(plant: Plant, specs: Sequence[Any], info: dict[str, Any]) -> list[Mark]:
+    """Two at a machine, the executed one above; none where it is not known which way an action pushes."""
+    if isinstance(plant, DisplacementPlant):
+        body, ways = plant.named("body", plant.gripper), np.eye(3, plant.lower.size)
+        at, _ = plant.motion("body", plant.gripper)
+    elif isinstance(plant, MujocoPlant) and plant.lower.size <= 2:  # an arrow shows no more numbers
+        bodies = [(getattr(spec, "body", None), *getattr(spec, "bodies", ())) for spec in specs]
+        named = [plant.named("body", name) for name in chain(*bodies) if name]
+        moving = np.unique(plant.model.jnt_bodyid)
+        if not named and len(moving) != 1:
+            return []
+        body = named[0] if named else int(moving[0])
+        data, jacobian = plant.forward(), np.zeros((3, plant.model.nv))
+        mujoco.mj_jacBodyCom(plant.model, data, jacobian, None, body)
+        at, ways = data.xipos[body].copy(), jacobian @ plant.acceleration[1]  # 0 where it only turns
+    else:
+        return []
+    # The longest push of a corner of the box has the full length; beyond `acting_range` nothing pushes harder.
+    low, high = plant.acting_range
+    reach = float(np.linalg.norm(np.abs(ways) @ np.maximum(np.abs(low), np.abs(high))))
+    size = float(plant.model.geom_rbound[plant.model.geom_bodyid == body].max(initial=0.0))
+    width, scale, found = _THICKNESS * size, _LENGTH * size / max(reach, 1e-9), []
+    for height, (key, colour) in zip((1.0, 1.7), ACTIONS.items(), strict=True):
+        vector = ways @ np.clip(info[key], low, high) * scale
+        length = float(np.linalg.norm(vector))
+        if length > width:  # a shorter one is all head
+            rgba, tail = (*np.array(colour) / 255.0, 1.0), at + height * size * _UP
+            # MuJoCo draws an arrow half as long as its size says.
+            found.append(mark("ARROW", rgba, tail, [width, width, 2.0 * length], vector))
+    return found
+
+
+def mark(shape: str, colour: Sequence[float], position: Array, size: ArrayLike, along: Array = _UP) -> Mark:
+    """A shape about a point (an arrow from it), its z axis along a vector, its size as for `mujoco.mjv_initGeom`."""
+    turn, axes = np.zeros(4), np.zeros(9)
+    mujoco.mju_quatZ2Vec(turn, along)
+    mujoco.mju_quat2Mat(axes, turn)
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")
+    return {"type": kind, "pos": position, "size": np.array(size), "mat": axes, "rgba": colour}
+
+
+def _lines(colour: Sequence[float], points: Iterable[Array], width: float = _THIN) -> list[Mark]:
+    """Thin boxes from each point to the next one, shape (3,), m: of many, round rods would cost most of a frame."""
+    return [
+        mark("BOX", colour, (a + b) / 2.0, [width, width, float(np.linalg.norm(b - a)) / 2.0], b - a)
+        for a, b in pairwise(points)
+    ]
+
+
+def _spatial(points: ArrayLike) -> Array:
+    """Points of one to three coordinates in space, shape (..., 3): what lacks a height lies on the floor."""
+    given = np.asarray(points, dtype=np.float64)
+    whole = np.full((*given.shape[:-1], 3), [0.0, 0.0, _FLOOR])
+    whole[..., : given.shape[-1]] = given
+    return whole

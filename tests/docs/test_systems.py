@@ -41,7 +41,7 @@ def reached(start):
     seen, left = set(), [start]
     while left:
         for one in GRAPH[left.pop()] & GRAPH.keys():
-            if one not in seen and not (PACKAGE / one.replace(".", "/")).is_dir():
+            if one not in seen and not (PACKAGE / one.replace(".", "/") / "__init__.py").exists():
                 seen.add(one)
                 left.append(one)
     return seen

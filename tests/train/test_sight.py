@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import safe_wrappers  # noqa: F401  (registers its envs)
-from safe_wrappers.drawing.scene import find_renderer
 from safe_wrappers.train.videos import for_film
+from safe_wrappers.wrappers.safety_overlay import find_renderer
 
 ROBOTS = {
     "SafePointGoal1-v0": "agent",

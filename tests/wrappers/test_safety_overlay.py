@@ -5,87 +5,18 @@ import subprocess
 import sys
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
-from gymnasium.spaces import Box
 
 import safe_wrappers as sw
-from benchmarks import car_drivers
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.scene import MOST_MARKS, put
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.safety_overlay import KEEP_OUT, LIMIT, MOST_MARKS, WAY
 
 TASK = "SafePointGoal1-v0"
-
-
 RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
-
-
-def make(task=TASK, wrap=sw.protect):
-    return wrap(gym.make(task, render_mode="rgb_array"))
-
-
-class Plain(gym.Env):
-    """Draws frames by itself, without MuJoCo."""
-
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
-    action_space = Box(-1.0, 1.0, (1,), np.float32)
-    observation_space = Box(-1.0, 1.0, (1,), np.float32)
-    closed = 0
-
-    def __init__(self, render_mode="rgb_array"):
-        self.render_mode = render_mode
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), 0.0, False, False, {keys.COST: 1.0}
-
-    def render(self):
-        return np.full((200, 300, 3), 255, np.uint8)
-
-    def close(self):
-        self.closed += 1
-
-
-class Viewer:
-    """What Gymnasium's viewers have, and nothing that draws."""
-
-    def __init__(self):
-        self.markers, self.words, self.frames = [], [], []
-
-    def add_marker(self, **marker):
-        self.markers.append(marker)
-
-    def add_overlay(self, place, text, more):
-        self.words.append(text)
-
-
-class Renderer:
-    def __init__(self):
-        self.viewer, self.modes = Viewer(), []
-
-    def _get_viewer(self, mode):
-        self.modes.append(mode)
-        return self.viewer
-
-
-# What is refused ----------------------------------------------------------------------------------------------
-
-
-def test_an_env_without_frames_is_refused_with_the_line_to_write():
-    with pytest.raises(
-        ConfigurationError, match=r"render_mode is None: .*gym.make\(\.\.\., render_mode='rgb_array'"
-    ):
-        sw.SafetyOverlay(sw.protect(gym.make(TASK)))
-    with pytest.raises(ConfigurationError, match="'depth_array'"):
-        sw.SafetyOverlay(sw.protect(gym.make(TASK, render_mode="depth_array")))
-
-
-# Nothing is changed -------------------------------------------------------------------------------------------
 
 
 def crossing(env):
@@ -107,34 +38,27 @@ STACKS = {
         sw.StoppingBudget(sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"]), acceleration=30.0),
     ),
 }
-DRIVERS = {
-    TASK: lambda env, rng: lambda: np.array([1.0, 0.0]),
-    "SafeCarGoal1-v0": car_drivers.hazard_seeking,
-}
-"""Who meets the filter sooner than corners of the action space do."""
+STRAIGHT = {TASK: [1.0, 0.0], "SafeCarGoal1-v0": [1.0, 1.0]}
+"""Into a hazard; elsewhere corners of the action space meet the filter soon."""
 
 
-def episode(env, looking):
-    task = env.spec.id
-    act = DRIVERS[task](env.unwrapped, np.random.default_rng(0)) if task in DRIVERS else None
-    rng = np.random.default_rng(0)
+def episode(task, looking):
+    """What it gives, in full, and whether the filter has acted."""
+    env = STACKS[task](gym.make(task, render_mode="rgb_array"))
+    env = sw.SafetyOverlay(env) if looking else env
+    ahead, rng, space = STRAIGHT.get(task), np.random.default_rng(0), env.action_space
     around = {"agent": [0, 0, 0], "hazards": [[0.6, 0.0], [-0.6, 0.0], [0.0, 0.6], [0.0, -0.6]]}
-    seen = [env.reset(seed=0, options={"layout": around} if act else None)]
-    space = env.action_space
-    for step in range(100 if act else 40):
-        if act:
-            action = act()
-        elif step % 10 == 0:
-            action = np.where(rng.random(space.shape) < 0.5, space.low, space.high)
+    seen = [env.reset(seed=0, options={"layout": around} if ahead else None)]
+    for step in range(100 if ahead else 40):
+        if step % 10 == 0:
+            action = ahead or np.where(rng.random(space.shape) < 0.5, space.low, space.high)
         if looking and step % 3 == 0:
             env.marks()
             env.marks()
-        seen.append(env.step(action.astype(space.dtype)))
-    return seen, env.unwrapped.np_random.bit_generator.state
-
-
-def plain(seen):
-    return json.dumps(seen, default=lambda v: v.tobytes().hex() if isinstance(v, np.ndarray) else repr(v))
+        seen.append(env.step(np.array(action, space.dtype)))
+    whole = [seen, env.unwrapped.np_random.bit_generator.state]
+    text = json.dumps(whole, default=lambda v: v.tobytes().hex() if isinstance(v, np.ndarray) else repr(v))
+    return text, any(step[-1].get(keys.CBF_INTERVENED) for step in seen)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -142,100 +66,142 @@ def plain(seen):
 def test_observations_rewards_infos_and_random_numbers_are_those_without_it(task):
     if "Fetch" in task or "Maze" in task:
         gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    bare, bare_random = episode(make(task, STACKS[task]), False)
-    env = sw.SafetyOverlay(make(task, STACKS[task]))
-    drawn, drawn_random = episode(env, True)
-    assert plain(drawn) == plain(bare)
-    assert drawn_random == bare_random
-    if "Rover" not in task:
-        assert any(step[-1][keys.CBF_INTERVENED] for step in bare[1:])
+    bare, intervened = episode(task, False)
+    assert episode(task, True)[0] == bare
+    assert intervened or "Rover" in task
 
 
-# Pictures -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("task", list(STRAIGHT))
+def test_every_disc_has_a_ring_where_the_margin_begins(task):
+    env = sw.SafetyOverlay(sw.protect(gym.make(task, render_mode="rgb_array")))
+    env.reset(seed=0)
+    centers = env.unwrapped.hazard_positions
+    rods = [mark for mark in env.marks() if mark["rgba"] == LIMIT]
+    ends = [mark["pos"] - mark["size"][2] * mark["mat"].reshape(3, 3)[:, 2] for mark in rods]
+    rings = np.reshape(ends, (len(centers), -1, 3))[..., :2]
+    radii = np.linalg.norm(rings - centers[:, None], axis=2)
+    np.testing.assert_allclose(radii, 0.2 + env.get_wrapper_attr("constraints")[0].margin)
+    np.testing.assert_allclose(rings.mean(axis=1), centers, atol=1e-9)
 
 
-def test_another_env_gets_a_strip_on_a_frame_of_the_same_shape_and_closes_twice():
-    env = sw.SafetyOverlay(Plain())
+def test_planes_are_moved_by_what_is_kept_free():
+    keep = sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"], radius=0.1, margin=0.05, state_error=0.01)
+    env = gym.make("InvertedPendulum-v5", render_mode="rgb_array")
+    env = sw.SafetyOverlay(sw.CBFActionFilter(env, [keep]))
+    env.reset(seed=0)
+    env.step(np.array([3.0], np.float32))
+    left, right, point = (
+        mark for colour in (KEEP_OUT, WAY) for mark in env.marks() if mark["rgba"] == colour
+    )
+    np.testing.assert_allclose([left["pos"][0], right["pos"][0]], [-0.74, 0.74])
+    for pad in (left, right):
+        np.testing.assert_allclose(np.abs(pad["mat"].reshape(3, 3)[:, 2]), [1.0, 0.0, 0.0], atol=1e-12)
+    assert point["pos"][0] == env.unwrapped.data.qpos[0] and point["size"][0] == 0.1
+
+
+class Renderer:
+    """What Gymnasium's renderers and viewers have, and nothing that draws."""
+
+    def __init__(self):
+        self.markers, self.words, self.modes = [], [], []
+
+    def _get_viewer(self, mode):
+        self.modes.append(mode)
+        return self
+
+    def add_marker(self, **marker):
+        self.markers.append(marker)
+
+    def add_overlay(self, place, text, more):
+        self.words.append(text)
+
+
+def overlay(renderer, mode="rgb_array"):
+    """Around a task whose frames are white."""
+    env = gym.make(TASK, render_mode="rgb_array")
+    env.unwrapped.mujoco_renderer, env.unwrapped.render_mode = renderer, mode
+    env.unwrapped.render = lambda: np.full((200, 300, 3), 255, np.uint8)
+    return sw.SafetyOverlay(sw.protect(env))
+
+
+def test_an_env_without_frames_is_refused_with_the_line_to_write():
+    with pytest.raises(ConfigurationError, match=r"is None: .*gym.make\(\.\.\., render_mode='rgb_array'"):
+        overlay(Renderer(), None)
+    with pytest.raises(ConfigurationError, match="'depth_array'"):
+        overlay(Renderer(), "depth_array")
+    with pytest.raises(ConfigurationError, match="windows of MuJoCo envs alone"):
+        overlay(None, "human")
+
+
+def test_another_env_gets_a_strip_on_a_frame_of_the_same_shape():
+    env = overlay(None)
     env.reset(seed=0)
     quiet = env.render()
-    env.step(np.zeros(1, np.float32))
+    env.step(np.ones(2, np.float32))
     frame = env.render()
-    assert frame.shape == (200, 300, 3) and (frame[:100] == 255).all()
-    assert (frame != quiet).any()  # the step costs
-    env.close()
-    env.close()
-    assert env.unwrapped.closed == 2
+    assert frame.shape == (200, 300, 3) and (frame[:172] == 255).all()
+    assert (frame != quiet).any()
 
 
 def test_a_frame_s_marks_are_those_of_the_present_state_and_never_too_many():
-    env = sw.SafetyOverlay(make())
-    env.reset(seed=0)
     renderer = Renderer()
-    put(env.marks() * 100, renderer, "rgb_array")
-    assert len(renderer.viewer.markers) == MOST_MARKS and renderer.modes == ["rgb_array"]
+    env = overlay(renderer)
+    assert not env.marks()
+    env.reset(seed=0)
     first = env.marks()
     for _ in range(10):
         env.step(np.array([1.0, 0.0], np.float32))
-    at = [mark.position[:2] for mark in env.marks() if mark.role == "way"]
-    assert min(np.linalg.norm(p - env.unwrapped.agent_position) for p in at) < 0.05
-    assert len(first) > 8 * 12
+    at = [mark["pos"][:2] for mark in env.marks() if mark["type"] == mujoco.mjtGeom.mjGEOM_ARROW]
+    np.testing.assert_allclose(at, [env.unwrapped.agent_position] * 2, atol=0.05)
+    env.marks = lambda: 100 * first
+    env.render()
+    assert len(renderer.markers) == MOST_MARKS < 100 * len(first) and renderer.modes == ["rgb_array"]
 
 
 def test_a_window_gets_marks_and_words_before_each_step():
-    task = gym.make(TASK, render_mode="rgb_array")
-    renderer = task.unwrapped.mujoco_renderer = Renderer()
-    task.unwrapped.render_mode = "human"
-    task.unwrapped.render = lambda: None
-    env = sw.SafetyOverlay(sw.protect(task))
+    renderer = Renderer()
+    env = overlay(renderer, "human")
     env.reset(seed=0)
-    assert not renderer.viewer.markers
+    assert not renderer.markers
     env.step(np.zeros(2, np.float32))
-    assert renderer.viewer.markers and renderer.viewer.words[0] == "as proposed"
-    assert renderer.viewer.words[1].startswith("margin ") and set(renderer.modes) == {"human"}
+    assert len(renderer.markers) > 8 * 12 and renderer.words[0] == "as proposed"
+    assert renderer.words[1].startswith("margin ") and set(renderer.modes) == {"human"}
 
-
-# With GL ------------------------------------------------------------------------------------------------------
 
 SCRIPT = """
 import gymnasium as gym, numpy as np, safe_wrappers as sw
+from safe_wrappers.wrappers.safety_overlay import WAY, find_renderer, mark
 
 def run(overlay):
     env = sw.protect(gym.make("SafePointGoal1-v0", render_mode="rgb_array", width=320, height=240))
     env = sw.SafetyOverlay(env) if overlay else env
-    seen = [env.reset(seed=0)[0]]
-    frames = [env.render()]
-    for _ in range(8):
-        seen.append(env.step(np.array([1.0, 0.5], np.float32))[0])
-        frames.append(env.render())
+    env.reset(seed=0)
+    steps = [(env.step(np.array([1.0, 0.5], np.float32))[0], env.render()) for _ in range(8)]
     env.close()
     env.close()
-    return np.array(seen), np.array(frames)
+    return map(np.array, zip(*steps))
 
-bare, plain = run(False)
-drawn, shown = run(True)
+(bare, plain), (drawn, shown) = run(False), run(True)
 assert (bare == drawn).all()
-assert plain.shape == shown.shape
-strip = round(0.14 * 240)
 different = (plain != shown).any(axis=-1)
+strip = round(0.14 * 240)
 assert different[:, -strip:].mean() > 0.9, different[:, -strip:].mean()
 above = different[:, :-strip].mean()
 assert 0.002 < above < 0.2, above  # rings and arrows, and the floor as it was
 
-# An arrow ends where its mark says.
-from safe_wrappers.drawing.marks import arrow, ball
-from safe_wrappers.drawing.scene import find_renderer, put
-
+# An arrow ends at half of its size.
 env = gym.make("SafePointGoal0-v0", render_mode="rgb_array", width=320, height=240, default_camera_config={
     "distance": 6.0, "elevation": -90.0, "azimuth": 90.0, "lookat": np.zeros(3)})
 env.reset(seed=0)
 
-def at(mark):
+def at(*drawn):
     before = env.render().astype(int)
-    put([mark], find_renderer(env), "rgb_array")
+    find_renderer(env)._get_viewer("rgb_array").add_marker(**mark(*drawn))
     return np.argwhere(np.abs(env.render() - before).sum(axis=-1) > 60)[:, 1]
 
-tip = at(ball("executed", [1.0, 0.0, 0.5], 0.05)).mean()
-assert abs(at(arrow("executed", [0.0, 0.0, 0.5], [1.0, 0.0, 0.0], 0.05)).max() - tip) < 4
+along, up = np.eye(3)[[0, 2]]
+tip = at("SPHERE", WAY, along + up / 2, [0.05, 0.0, 0.0]).mean()
+assert abs(at("ARROW", WAY, up / 2, [0.05, 0.05, 2.0], along).max() - tip) < 4
 print("drawn")
 """
 

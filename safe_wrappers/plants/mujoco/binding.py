@@ -75,14 +75,14 @@ def checked_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
             "instead, or say where it keeps them: MujocoPlant(model=lambda env: ..., data=lambda env: ...)"
         )
     model: mujoco.MjModel = source.model if given is None else copy.copy(given)
-    wanted, sizes = ((m.nq, m.nv, m.nu) for m in (source.model, model))
-    if sizes != wanted:
-        must = "the plant's model must have the env's joints and actuators"
-        raise ConfigurationError(f"{must}: expected (nq, nv, nu) = {wanted}, got {sizes}")
-    expected, timestep = source.model.opt.timestep, model.opt.timestep
-    if not np.isclose(timestep, expected, rtol=1e-9):
-        must = "the plant's model must take the env's physics steps"
-        raise ConfigurationError(f"{must}: expected a timestep of {expected} s, got {timestep} s")
+    for what, read in (
+        ("joints and actuators (nq, nv, nu)", lambda m: (m.nq, m.nv, m.nu)),
+        ("timestep, s", lambda m: m.opt.timestep),
+    ):
+        expected, found = read(source.model), read(model)
+        if not np.allclose(found, expected, rtol=1e-9, atol=0.0):
+            wrong = f"the plant's model must have the env's {what}: expected {expected}, got {found}"
+            raise ConfigurationError(wrong)
     if model.opt.integrator > _LAST_INTEGRATOR:
         raise UnsupportedEnvError(
             "the model's integrator is 'discrete' (MuJoCo 3.13 and later), whose accelerations are those of a "
@@ -124,28 +124,26 @@ def physics_steps(raw: Any, source: Any = None, control_dt: float | None = None)
             )
         return said
     steps = positive("control_dt", control_dt, "s") / timestep
-    if round(steps) < 1 or not np.isclose(steps, round(steps), rtol=1e-6):
-        raise ConfigurationError(
-            f"control_dt = {control_dt} s is not a whole number of physics steps of {timestep} s: {steps:g}"
+    count = round(steps)
+    if count < 1 or not np.isclose(steps, count, rtol=1e-6):
+        wrong = f"is not a whole number of physics steps of {timestep} s: {steps:g}"
+        raise ConfigurationError(f"control_dt = {control_dt} s {wrong}")
+    if said not in (None, count):
+        wrong = (
+            f"is {count} physics steps of {timestep} s, but {raw} takes {said} with one action: leave it out"
         )
-    if said not in (None, round(steps)):
-        raise ConfigurationError(
-            f"control_dt = {control_dt} s is {round(steps)} physics steps of {timestep} s, but {raw} takes {said} "
-            "with one action: leave control_dt out"
-        )
-    return round(steps)
+        raise ConfigurationError(f"control_dt = {control_dt} s {wrong}")
+    return count
 
 
 def actions_are_controls(space: gym.Space[Any], lower: Array, upper: Array) -> bool:
     """Whether an action space is the model's control range, shapes (nu,), where there is one."""
+    if not isinstance(space, gym.spaces.Box) or space.shape != lower.shape:
+        return False
     limited = np.isfinite(lower)
     rounding = 0.5e-6 * (upper - lower)[limited]
-    return (
-        isinstance(space, gym.spaces.Box)
-        and space.shape == lower.shape
-        and np.allclose(space.low[limited], lower[limited], atol=rounding)
-        and np.allclose(space.high[limited], upper[limited], atol=rounding)
-    )
+    ends = (space.low, lower), (space.high, upper)
+    return all(np.allclose(one[limited], other[limited], atol=rounding) for one, other in ends)
 
 
 def moves_by_displacement(raw: Any) -> bool:

@@ -48,7 +48,13 @@ class LineOfSight:
         self._id = named(model, "site", site or "") if camera is None else named(model, "camera", camera)
         self.body = int(getattr(model, f"{self._kind}_bodyid")[self._id])
         if view_deg is None:
-            view_deg = 360.0 if camera is None else _angle_of_view(model, self._id)
+            view_deg = 360.0
+            if camera is not None:
+                kinds = model.cam_projection if hasattr(model, "cam_projection") else model.cam_orthographic
+                if kinds[self._id]:
+                    is_flat = "is orthographic: its fovy is a length, not an angle; give view_deg"
+                    raise ConfigurationError(f"the camera {camera!r} {is_flat}")
+                view_deg = float(model.cam_fovy[self._id])
         self._cosine = -2.0 if view_deg >= 360.0 else math.cos(math.radians(0.5 * view_deg))
         self._range = range_m
         self._inside = np.eye(model.nbody, dtype=bool)  # whether body i is body j or a descendant of it
@@ -102,14 +108,3 @@ class LineOfSight:
         itself = (own >= 0) & self._inside[blocker, np.maximum(own, 0)]
         seen[which] = ~hitting | itself | (at >= lengths[which] - _SKIN_M)
         return np.asarray(seen)
-
-
-def _angle_of_view(model: mujoco.MjModel, camera: int) -> float:
-    """The camera's own `fovy`, degrees."""
-    flat = model.cam_projection if hasattr(model, "cam_projection") else model.cam_orthographic
-    if flat[camera]:
-        raise ConfigurationError(
-            f"the camera {model.camera(camera).name!r} is orthographic: its fovy is a length, not an angle; give "
-            "view_deg"
-        )
-    return float(model.cam_fovy[camera])
