@@ -259,7 +259,7 @@ def worst_case(longer: float, seed: tuple[int, ...]) -> dict[str, Any]:
     env, steps = leased(cart, drive), 0
     env.reset(options={"drive": drive})
     with mock.patch(
-        "safe_wrappers.wrappers.stopping_budget.longest_lease",
+        "safe_wrappers.wrappers.stopping.longest_lease",
         lambda *a, **k: longer * longest_lease(*a, **k),
     ):
         while not (cart.touched or cart.at_rest):

@@ -70,12 +70,13 @@ _MATTER = {
     " BoundEscapeClearance.backup min/max",
     "control/backup/point_decision.py": "backup not; _stopped_at not",
     "constraints/predictive_shield.py": "PredictiveShield.plan comparison; PredictiveShield._after not",
-    "wrappers/action_shield.py": "ActionShield.step not; ActionShield.action_masks not",
-    "wrappers/admission.py": "Admission.admits not",
-    "wrappers/stopping_budget.py": "BoundBudget.longest_time not; BoundBudget.can_stop_after not",
-    "wrappers/lease_expiry.py": "LeaseExpiry.step not; LeaseExpiry._accept not; LeaseExpiry._grant min/max",
-    "wrappers/chunk_queue.py": "ChunkQueue.submit min/max; ChunkQueue._admitted comparison; ChunkQueue._sendable not",
-    "wrappers/chunk_handover.py": "ChunkHandover.step not; ChunkHandover._submit not",
+    "wrappers/presets.py": "ActionShield.step not; ActionShield.action_masks not",
+    "wrappers/stopping.py": "BoundBudget.longest_time not; BoundBudget.can_stop_after not",
+    "wrappers/lease_expiry.py": (
+        "LeaseExpiry.step not; LeaseExpiry._accepted not; LeaseExpiry._grant min/max; Admission.admits not"
+    ),
+    "wrappers/chunk_handover.py": "ChunkHandover.step not; ChunkHandover._submit not; ChunkQueue.submit min/max;"
+    " ChunkQueue.next comparison; ChunkQueue._sendable not",
 }
 MATTER = [Mutant(file, *one.rsplit(" ", 1)) for file, of in _MATTER.items() for one in of.split("; ")]
 """What a filter must never get wrong, the first mistake of a kind in a function each; all that was tried by hand

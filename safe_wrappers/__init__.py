@@ -16,21 +16,18 @@ from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 from safe_wrappers.plants import AnalyticPlant, IdentifiedPlant, MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.wrappers import faults, occlusion, teleop
-from safe_wrappers.wrappers.action_shield import ActionShield
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
-from safe_wrappers.wrappers.cost_function import CostFunction
-from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation
+from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation, StuckEscape
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
-from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
-from safe_wrappers.wrappers.presets import SlipLimiter, WholeBodyFilter
+from safe_wrappers.wrappers.occlusion import OcclusionPenalty
+from safe_wrappers.wrappers.presets import ActionShield, SlipLimiter, WholeBodyFilter
 from safe_wrappers.wrappers.protect import protect
-from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.recording import CostFunction, RecordInterventions
 from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
-from safe_wrappers.wrappers.stopping_budget import StoppingBudget
-from safe_wrappers.wrappers.stuck_escape import StuckEscape
-from safe_wrappers.wrappers.teleop_channel import TeleopChannel
+from safe_wrappers.wrappers.stopping import StoppingBudget
+from safe_wrappers.wrappers.teleop import TeleopChannel
 from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter
 
 __all__ = [

@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from safe_wrappers import info as keys
 from safe_wrappers.diagnosis import Diagnosis, diagnose
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.recording import RecordInterventions
 
 from .evaluation.evaluate import typical_seed
 from .files import say, write_bytes, write_text

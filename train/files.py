@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.wrappers.record_interventions import read_episodes
+from safe_wrappers.wrappers.recording import read_episodes
 
 Row = Mapping[str, int | float | bool | str]
 _PATIENCE_S: Final = 5.0

@@ -26,7 +26,7 @@ class InterventionCallback(BaseCallback):
         >>> import gymnasium as gym
         >>> from stable_baselines3 import PPO
         >>> from safe_wrappers.sb3 import InterventionCallback
-        >>> from safe_wrappers.wrappers.record_interventions import RecordInterventions
+        >>> from safe_wrappers.wrappers.recording import RecordInterventions
         >>> env = RecordInterventions(gym.make("Pendulum-v1"))
         >>> model = PPO("MlpPolicy", env, n_steps=256, n_epochs=1, device="cpu")
         >>> _ = model.learn(256, callback=InterventionCallback())

@@ -17,7 +17,6 @@ from safe_wrappers.wrappers.layer import (
     CommandReceiver,
     Env,
     LayerWrapper,
-    Reset,
     Step,
     WrapperRng,
     action_array,
@@ -81,18 +80,15 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
         same = sum(isinstance(inner, type(self)) for inner in faults)
         self._nested = bool(faults)
         self.random = WrapperRng(type(self).__name__ + (f" {same + 1}" if same else ""))
-        self._start()
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env, and what is on its way; the random numbers start anew with a seed."""
-        self.started = False
-        observation, info = self.env.reset(seed=seed, options=options)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self.random.reset(self.env, seed)
-        self._start()
+        self._steps_done, self._observed_s = 0, 0.0
+        space: Any = self.env.action_space
+        self._last = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
         self.begin()
         info[keys.FAULT_ACTIVE] = False
-        self.started = True
-        return observation, info
+        return observation
 
     def step(self, action: Any) -> Step:
         """Carry the action, or not, and step the env with what arrives."""
@@ -133,12 +129,6 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
     @abstractmethod
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
         """What arrives at the robot now, of what the policy gave now; None if a fault outside lost it."""
-
-    def _start(self) -> None:
-        self._steps_done = 0
-        self._observed_s = 0.0
-        space: Any = self.env.action_space
-        self._last = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
 
 
 def probability(name: str, value: float) -> float:

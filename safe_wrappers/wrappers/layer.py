@@ -4,14 +4,16 @@ import inspect
 import math
 import warnings
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final, SupportsFloat
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from safe_wrappers import info as keys
 from safe_wrappers.checks import OF_NUMBERS, numbers_of, shown
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import PlantTemplate
@@ -34,7 +36,7 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
 
     layer: ClassVar[Layer]
     started: bool = False
-    """Of those that remember commands: whether there is an episode, since the last reset has not failed."""
+    """Whether there is an episode, since the last reset has not failed."""
 
     def __init__(self, env: Env) -> None:
         refuse_vector_env(env, type(self).__name__)
@@ -53,10 +55,34 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
                 if isinstance(env, gym.wrappers.OrderEnforcing):
                     env._has_reset = False
 
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
+        """Reset the env, and forget the last episode; random numbers start anew with a seed."""
+        self.started = False
+        observation, info = self.env.reset(seed=seed, options=options)
+        observation = self._begin(observation, info, seed)
+        self.started = True
+        return observation, info
+
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        """Begin an episode by what the env's reset has returned: fill in the info, and return the observation."""
+        return observation
+
     def _refuse_without_reset(self) -> None:
         """Commands of another episode, or of none, are not executed."""
         if not self.started:
             raise gym.error.ResetNeeded("call reset before step; the last one may have failed")
+
+    def _make_steps(self, count: int, step: Callable[[], Step]) -> Step:
+        """Make some control steps, fewer where the episode ends: rewards summed up, infos merged."""
+        total: Any = 0.0
+        infos = []
+        for _ in range(count):
+            observation, reward, terminated, truncated, info = step()
+            total += float(reward)
+            infos.append(dict(info))  # the env may use the same one again
+            if terminated or truncated:
+                break
+        return observation, total, terminated, truncated, keys.merged(infos)
 
     def _pass_on(self, action: Any) -> Step:
         """Step the env with an action that this wrapper only passes on, to the env itself if it is finite."""
@@ -124,11 +150,16 @@ def refuse_vector_env(env: Any, name: str) -> None:
         )
 
 
-class WrapperRng:
-    """Random numbers apart from the env's, which paired runs need unchanged; a reset's seed starts them anew.
+def mujoco_env(env: Env, name: str) -> Any:
+    """The unwrapped env, or an error if it has no MuJoCo model and data."""
+    raw: Any = env.unwrapped
+    if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
+        raise UnsupportedEnvError(f"{name} needs an env with MuJoCo's .model and .data; {raw} has none")
+    return raw
 
-    The env's first seed is used where none was ever given. `stream` keeps it apart from others of the same seed.
-    """
+
+class WrapperRng:
+    """Random numbers of a `stream` apart from the env's; a reset's seed starts them anew, at first the env's own."""
 
     def __init__(self, stream: str) -> None:
         self._stream = zlib.crc32(stream.encode())
@@ -161,14 +192,14 @@ def whole_steps(time_s: float, control_dt: float) -> int:
 class CommandReceiver:
     """Base of `ChunkHandover`, `LeaseExpiry`, `TeleopChannel` and the faults.
 
-    What carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call
-    the action was made from the newest observation.
+    What carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call the
+    action was made from the newest observation.
     """
 
     control_dt: float
     """Control interval, s."""
-    _steps_done: int
-    _observed_s: float | None
+    _steps_done: int = 0
+    _observed_s: float | None = 0.0
 
     @property
     def now_s(self) -> float:

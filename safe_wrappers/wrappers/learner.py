@@ -1,5 +1,6 @@
-"""Wrappers for who learns through a filter: what it sees, is paid for, and how often it decides."""
+"""For policies behind a filter: what they see and are paid for, how often they decide, and a way out where stuck."""
 
+from collections import deque
 from collections.abc import Sequence
 from typing import Any, ClassVar, Final
 
@@ -7,22 +8,21 @@ import numpy as np
 from gymnasium import spaces
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, whole_number
+from safe_wrappers.checks import Array, non_negative, positive, whole_number
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
-from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng, action_array
 
 
 class ActionRepeat(LayerWrapper):
     """Executes an action for several control steps, each of which the filter inside checks anew.
 
-    Rewards are summed up, and the info keys of this library merged over the control steps (`safe_wrappers.info`). A
-    learner explores farther with actions that last, and sees sooner what the filter makes of them: at 50 control
-    steps per second, the noise of a Gaussian policy averages out before the robot has moved.
+    Rewards are summed up, and the info keys of this library merged over the control steps (`safe_wrappers.info`).
+    Exploration noise that lasts moves a robot farther than noise that averages out at 50 control steps per second.
 
     Args:
         env: A filter, recorders and penalties, which count control steps, belong inside.
@@ -47,15 +47,7 @@ class ActionRepeat(LayerWrapper):
 
     def step(self, action: Any) -> Step:
         """Step the env with the same action until `repeat` control steps are made or the episode ends."""
-        total: Any = 0.0
-        infos = []
-        for _ in range(self.repeat):
-            observation, reward, terminated, truncated, info = self._pass_on(action)
-            total += float(reward)
-            infos.append(info)
-            if terminated or truncated:
-                break
-        return observation, total, terminated, truncated, keys.merged(infos)
+        return self._make_steps(self.repeat, lambda: self._pass_on(action))
 
 
 class AdaptionPenalty(LayerWrapper):
@@ -64,8 +56,7 @@ class AdaptionPenalty(LayerWrapper):
     The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty + per_correction * c` for a
     correction c = |a_safe - a| (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023).
 
-    Wrappers that scale or clip rewards belong inside, and `RecordInterventions` and SB3's `Monitor` too. Not
-    for hindsight replay, which asks the task for rewards anew.
+    Wrappers that scale or clip rewards belong inside. Not for hindsight replay, which asks the task for rewards anew.
 
     Args:
         env: With a `CBFActionFilter` inside.
@@ -92,9 +83,7 @@ class AdaptionPenalty(LayerWrapper):
 
     def __init__(self, env: Env, penalty: float = 0.0, per_correction: float = 0.0) -> None:
         LayerWrapper.__init__(self, env)
-        if filter_inside(env) is None:
-            example = "AdaptionPenalty(sw.protect(env), penalty=...)"
-            raise ConfigurationError(f"AdaptionPenalty needs a CBFActionFilter inside: {example}")
+        needed_filter(env, "AdaptionPenalty(sw.protect(env), penalty=...)")
         self.penalty = non_negative("penalty", penalty, "the task's reward")
         self.per_correction = non_negative("per_correction", per_correction, "reward per action unit")
         if not (self.penalty or self.per_correction):
@@ -103,15 +92,9 @@ class AdaptionPenalty(LayerWrapper):
             )
         self._record({"penalty": self.penalty, "per_correction": self.per_correction})
 
-    def of(self, correction: float) -> float:
-        """The penalty of a changed step, in units of the task's reward, for a correction in action units."""
-        return self.penalty + self.per_correction * correction
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Resets the env; its info holds the keys of a step, as 0."""
-        observation, info = self.env.reset(seed=seed, options=options)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         info[keys.ADAPTION_PENALTY] = 0.0
-        return observation, info
+        return observation
 
     def step(self, action: Any) -> Step:
         """Steps the env; an unchanged step's reward passes through untouched."""
@@ -121,9 +104,93 @@ class AdaptionPenalty(LayerWrapper):
         if info.get(keys.CBF_ESCAPING, False):  # StuckEscape gave the filter another action than this one
             changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))
         if changed:
-            penalty = self.of(float(correction))
+            penalty = self.penalty + self.per_correction * float(correction)
             reward = float(reward) - penalty
         info[keys.ADAPTION_PENALTY] = penalty
+        return observation, reward, terminated, truncated, info
+
+
+class StuckEscape(LayerWrapper):
+    """Proposes another action for a while, in the policy's place, where policy and filter are stuck.
+
+    Stuck means: in the last `after_s` more than half of the policy's actions were changed by the filter or replaced
+    by this wrapper, and the rewards of these steps add up to `progress` at most. Then an action that was drawn at
+    random is proposed for `escape_s`, which the filter inside checks like any other. A deadlock is ended by chance,
+    not by a plan. Meanwhile the filter's keys are about the drawn action: an escape is `cbf/escaping`, not
+    `cbf/intervened`.
+
+    Args:
+        env: With a `CBFActionFilter` inside.
+        after_s: The time without progress, s.
+        progress: The sum of rewards, in the task's units, up to which there is none.
+        escape_s: For how long another action is proposed, s; 0 reports alone.
+
+    Info, at every step: ``cbf/stuck``, ``cbf/escaping`` (bool).
+
+    Raises:
+        ConfigurationError: No filter inside, or times that are not.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.StuckEscape(sw.protect(gym.make("SafePointGoal1-v0")), after_s=2.0, progress=0.1)
+        >>> _ = env.reset(seed=0)
+        >>> env.step(env.action_space.sample())[4]["cbf/stuck"]
+        False
+    """
+
+    layer: ClassVar = Layer.ESCAPE
+
+    _drawn: Array
+
+    def __init__(
+        self,
+        env: Env,
+        after_s: float = 2.0,
+        progress: float = 0.0,
+        escape_s: float = 1.0,
+    ) -> None:
+        arguments = dict(locals())
+        LayerWrapper.__init__(self, env)
+        self._inside = needed_filter(env, "StuckEscape(sw.protect(env))")
+        if not (isinstance(progress, int | float | np.number) and np.isfinite(progress)):
+            raise ConfigurationError(f"progress is a finite sum of rewards, got {progress!r}")
+        control_dt = self._inside.plant.control_dt
+        self._window = max(1, round(positive("after_s", after_s, "s") / control_dt))
+        self._escape = round(non_negative("escape_s", escape_s, "s") / control_dt)
+        self._record(arguments)
+        self.progress = float(progress)
+        self._rng = WrapperRng("StuckEscape")
+
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        self._rng.reset(self.env, seed)
+        self._rewards: deque[float] = deque(maxlen=self._window)
+        self._changed: deque[bool] = deque(maxlen=self._window)
+        self._left = 0
+        info[keys.CBF_STUCK] = info[keys.CBF_ESCAPING] = False
+        return observation
+
+    def step(self, action: Any) -> Step:
+        """Step the env with the policy's action, or with the drawn one."""
+        escaping = self._left > 0
+        sent = action
+        if escaping:
+            own = action_array(action, self._drawn.shape, np.float64)
+            sent = self._drawn
+        observation, reward, terminated, truncated, info = self.env.step(sent)
+        if escaping:
+            self._left -= 1
+            info[keys.CBF_NONFINITE] |= not np.isfinite(own).all()
+        self._rewards.append(float(reward))
+        self._changed.append(info[keys.CBF_INTERVENED] or escaping)
+        full = len(self._rewards) == self._window
+        stuck = full and 2 * sum(self._changed) > self._window and sum(self._rewards) <= self.progress
+        if stuck and self._escape and self._left == 0 and not escaping:
+            plant, space = self._inside.plant, self._inside.action_space
+            assert isinstance(space, spaces.Box)  # the filter takes no other
+            low, high = np.maximum(plant.lower, space.low), np.minimum(plant.upper, space.high)
+            self._drawn = self._rng.draw.uniform(low, high).astype(space.dtype)
+            self._left = self._escape
+        info[keys.CBF_STUCK], info[keys.CBF_ESCAPING] = stuck, escaping
         return observation, reward, terminated, truncated, info
 
 
@@ -134,9 +201,9 @@ KEY: Final = "filter"
 class FilterObservation(LayerWrapper):
     """Appends to the observation what the filter decides by, so that the filtered task is Markov for the learner.
 
-    The features are bounded in [-1, 1] and have the same shape at every step: of each constraint its
-    `features` (the smallest h; of obstacles the nearest ones, their direction, clearance and closing
-    speed; the side of a detour), then the last correction, in shares of the action box.
+    The features are bounded in [-1, 1] and have the same shape at every step: of each constraint its `features` (the
+    smallest h; of obstacles the nearest ones, their direction, clearance and closing speed; the side of a detour),
+    then the last correction, in shares of the action box.
 
     It shows the constraints' truth, for example exact positions where the task's own observation has a lidar. So
     compare with an unfiltered learner that sees the same: without a filter inside, give the constraints.
@@ -221,3 +288,11 @@ class FilterObservation(LayerWrapper):
         else:  # the state is not a number, and nothing was judged
             parts = [np.full(count, np.nan) for count in self._counts]
         return self._with_numbers(observation, KEY, np.concatenate([*parts, shares]))
+
+
+def needed_filter(env: Env, example: str) -> CBFActionFilter:
+    """The filter inside, or an error that shows how to have one."""
+    inside = filter_inside(env)
+    if inside is None:
+        raise ConfigurationError(f"{example.partition('(')[0]} needs a CBFActionFilter inside: {example}")
+    return inside

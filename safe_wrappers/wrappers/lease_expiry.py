@@ -4,22 +4,31 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import mujoco
+import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive, settings_from
 from safe_wrappers.control.handover import smoothstep
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.control.watchdog import admits, checked_limits, jerk_limited_time
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
+from safe_wrappers.plants.mujoco.binding import actions_are_controls
+from safe_wrappers.plants.mujoco.model import control_range
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.admission import Admission
-from safe_wrappers.wrappers.commands import CommandGate, FallbackController
-from safe_wrappers.wrappers.layer import Env, Reset, Step, action_array, whole_steps
-from safe_wrappers.wrappers.stopping_budget import BoundBudget, BudgetLike, budget_from
+from safe_wrappers.wrappers.layer import Env, Step, action_array, whole_steps
+from safe_wrappers.wrappers.stopping import (
+    BoundBudget,
+    CommandGate,
+    FallbackController,
+    StoppingBudget,
+    bound_plant,
+)
 
 
 class LeaseExpiry(CommandGate):
@@ -30,10 +39,10 @@ class LeaseExpiry(CommandGate):
     (`set_observation_time`). One of the same observation is executed under the old lease; one that is older, from the
     future or not finite is refused.
 
-    **What it guarantees.** If braking, acceleration, delays and bounds are what they are declared to be and the
-    clearance does not shrink by itself, the machine stops inside it whenever commands stop coming, whatever the
-    commands did. While leases last, commands in the action space pass bit for bit. **What it does not.** It does not
-    check what a fresh command does; `CBFActionFilter` belongs inside. Close to an obstacle no command gets a lease.
+    **What it guarantees.** If all bounds are what they are declared to be and the clearance does not shrink by
+    itself, the machine stops inside it whenever commands stop coming, whatever the commands did. While leases last,
+    commands in the action space pass bit for bit. **What it does not.** It does not check what a fresh command does;
+    `CBFActionFilter` belongs inside.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -51,8 +60,8 @@ class LeaseExpiry(CommandGate):
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
 
-    Info, at every step: ``lease/remaining_s`` (float), ``lease/refused``, ``lease/braking``
-    (bool); without a filter inside ``executed_action`` and ``action/clipped`` (float).
+    Info, at every step: ``lease/remaining_s`` (float), ``lease/refused``, ``lease/braking`` (bool); without a filter
+    inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
         ConfigurationError: A missing or negative bound or time, a clearance that is neither, or a wrong order.
@@ -70,15 +79,15 @@ class LeaseExpiry(CommandGate):
     """
 
     layer: ClassVar = Layer.LEASE
+    _whose: ClassVar = "policy's"
+    _not_sent: ClassVar = "the command in force goes on under its lease"
 
     _fallback: FallbackController
-    _executed: Array | None
-    _blend: tuple[Array, int] | None
 
     def __init__(
         self,
         env: Env,
-        budget: BudgetLike,
+        budget: StoppingBudget | dict[str, Any],
         *,
         detect_s: float = 0.0,
         confirm_s: float = 0.0,
@@ -94,7 +103,7 @@ class LeaseExpiry(CommandGate):
         arguments = dict(locals())
         CommandGate.__init__(self, env, control_dt)
         refuse_changed_actions(env)
-        plant, budget = own_plant(plant), budget_from(budget)
+        plant, budget = own_plant(plant), settings_from(StoppingBudget, budget, "budget")
         limits = dict(motion_limits) if isinstance(motion_limits, Mapping) else motion_limits
         self._record(arguments, budget=plain_data(budget), motion_limits=limits, plant=plant)
         self._max_lease_s = positive("max_lease_s", max_lease_s, "s")
@@ -111,52 +120,39 @@ class LeaseExpiry(CommandGate):
         delays = {"detect_s": detect_s, "confirm_s": confirm_s, "age_s": age_s}
         detect, confirm, age = (non_negative(name, value, "s") for name, value in delays.items())
         self._delays_s = detect + confirm + age + self._same_s  # by which a step may outlast its lease
-        self._budget = BoundBudget(budget, env)
-        plant = self._budget.plant_of(plant)
-        self._fallback = FallbackController(env, fallback, plant, self._budget.constraint)
-        self._budget.bind(plant, self._fallback.constraint)
+        plant = bound_plant(env, plant, fallback, budget.clearance)
+        self._budget = BoundBudget(budget, env, plant)
+        self._fallback = FallbackController(env, fallback, plant, self._budget.bound)
         self._admission = None if motion_limits is None else Admission(env, motion_limits, self._low.size)
-        self._start({})
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; no command is in force."""
-        self.started = False
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._fallback.reset()
-        self._budget.reset()
-        self._start(info)
-        info[keys.LEASE_REMAINING_S] = 0.0
-        info.update(dict.fromkeys((keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
-        self.started = True
-        return observation, info
-
-    def _start(self, info: dict[str, Any]) -> None:
-        super()._start(info)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._until_s = self._newest_s = -math.inf
         self._command = self._rest()
-        self._executed = None
+        self._executed: Array | None = None
         self._braking = self._chunk_refused = False
-        self._blend = None
+        self._blend: tuple[Array, int] | None = None  # from what, and how many of its steps are done
+        self._budget.observe()
+        info[keys.LEASE_REMAINING_S] = 0.0
+        info[keys.LEASE_REFUSED] = info[keys.LEASE_BRAKING] = False
+        return super()._begin(observation, info, seed)
 
     def step(self, action: Any) -> Step:
         """Execute the action under its lease, the command in force under its own, or the fallback."""
         self._refuse_without_reset()
-        given = self._inside(action_array(action, self._shape), "policy's")
+        given = self._inside(action_array(action, self._shape))
         now = self.now_s
-        arrived, fresh, refused = self._accept(given, now)
-        if fresh:
-            refused |= not self._grant(now)
+        command, refused = self._accepted(given, now)
         covered = now + self.control_dt <= self._until_s + self._same_s
         if covered:
-            if arrived:
-                self._command = given
-            if self._braking:
-                self._braking, self._blend = False, self._start_blend()
+            self._command = self._command if command is None else command
+            if self._braking and self._executed is not None and self._blend_steps:
+                self._blend = self._boxed(self._executed), 0
             # The env gets a copy as well: it may scale in place what is still in force.
-            sent = self._command.copy() if self._blend is None else self._blended(self._command)
+            sent = self._command.copy() if self._blend is None else self._blended(*self._blend)
         else:
-            self._braking, self._blend = True, None
+            self._blend = None
             sent = self._fallback.command().astype(self._dtype)
+        self._braking = not covered
         self._executed, answer = self._execute(sent)
         self._observed_s = self.now_s
         info = answer[4]
@@ -171,20 +167,19 @@ class LeaseExpiry(CommandGate):
         self._chunk_refused |= not admitted
         return admitted
 
-    def _accept(self, command: NDArray[Any], now: float) -> tuple[bool, bool, bool]:
-        """Whether there is a command that may be executed, whether it is a fresh one, whether one was refused."""
-        observed_s, refused, newest_s = self._observed_s, self._chunk_refused, self._newest_s
+    def _accepted(self, given: NDArray[Any] | None, now: float) -> tuple[NDArray[Any] | None, bool]:
+        """The command that may be executed, if there is one; whether one was refused. A fresh one gets a lease."""
+        observed_s, refused = self._observed_s, self._chunk_refused
         self._chunk_refused = False
         if observed_s is None:
-            return False, False, refused
+            return None, refused
         from_future = observed_s > now + self._same_s
-        finite = self._is_finite(command, "policy's", "the command in force goes on under its lease")
-        if from_future or observed_s < newest_s - self._same_s or not finite:
-            return False, False, True
-        fresh = observed_s > newest_s + self._same_s
-        if fresh:
+        if given is None or from_future or observed_s < self._newest_s - self._same_s:
+            return None, True
+        if observed_s > self._newest_s + self._same_s:
             self._newest_s = observed_s
-        return True, fresh, refused
+            refused |= not self._grant(now)
+        return given, refused
 
     def _grant(self, now: float) -> bool:
         """A new lease for the fresh command; False, and none at all, where it would not last."""
@@ -196,16 +191,51 @@ class LeaseExpiry(CommandGate):
         self._until_s = now + lease if granted else -math.inf
         return granted
 
-    def _start_blend(self) -> tuple[Array, int] | None:
-        """From what was executed last, and how many steps of the blend are done; None where there is nothing to."""
-        if self._executed is None or self._blend_steps == 0:
-            return None
-        return self._boxed(self._executed), 0
-
-    def _blended(self, target: Any) -> Any:
-        """In the box, so that rounding to its dtype makes no infinity of anything."""
-        assert self._blend is not None
-        start, done = self._blend
+    def _blended(self, start: Array, done: int) -> Any:
+        """The way back to the command in force; in the box, so that rounding makes no infinity of anything."""
         weight = float(smoothstep((done + 1.0) / (self._blend_steps + 1.0)))
         self._blend = (start, done + 1) if done + 1 < self._blend_steps else None
-        return (start * (1.0 - weight) + weight * self._boxed(target)).astype(self._dtype)
+        return (start * (1.0 - weight) + weight * self._boxed(self._command)).astype(self._dtype)
+
+
+class Admission:
+    """Refuses chunks that no motion within the limits could follow to their end; a necessary condition only.
+
+    With arrival "moving" the end may be passed at any speed; with "rest" the machine must be able to stand there in
+    time. Where it is, the lengths and velocities of the MuJoCo actuators say; `controls` is m.
+    """
+
+    def __init__(self, env: Env, motion_limits: Any, controls: int) -> None:
+        model: Any = getattr(env.unwrapped, "model", None)
+        if not isinstance(model, mujoco.MjModel):
+            raise UnsupportedEnvError("motion_limits are for MuJoCo's actuators, whose lengths are read")
+        if not actions_are_controls(env.action_space, *control_range(model)):
+            units = "actions are in other units than the lengths of the actuators"
+            raise ConfigurationError(f"motion_limits: {units}, so that these are no setpoints")
+        try:
+            acceleration, speed, self._rest = _limits(**motion_limits)
+            self._acceleration, self._speed = (np.broadcast_to(x, (controls,)) for x in (acceleration, speed))
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, ConfigurationError):
+                raise
+            wanted = f"each a number or one for each of the {controls} action components"
+            raise ConfigurationError(
+                'motion_limits is {"max_acceleration": ..., "max_speed": ..., "arrival": "moving" or "rest"}, '
+                f"{wanted}; got {motion_limits!r}"
+            ) from None
+        self._raw: Any = env.unwrapped
+
+    def admits(self, end: Array, duration_s: float) -> bool:
+        """Whether a chunk may be executed that ends with a command (m,) after so many seconds."""
+        position, velocity = self._raw.data.actuator_length, self._raw.data.actuator_velocity
+        if self._rest:
+            states = (position, velocity, 0.0), (end, 0.0, 0.0)
+            return jerk_limited_time(*states, self._acceleration, self._speed) <= duration_s
+        return bool(admits(end, position, velocity, duration_s, self._speed, self._acceleration).all())
+
+
+def _limits(
+    max_acceleration: Any, max_speed: Any = math.inf, arrival: str = "moving"
+) -> tuple[Array, Array, bool]:
+    """The limits, and whether the machine must be able to stand at the end."""
+    return *checked_limits(max_acceleration, max_speed), {"moving": False, "rest": True}[arrival]

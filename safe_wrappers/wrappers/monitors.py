@@ -8,7 +8,6 @@ from typing import Any, ClassVar, Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.control.contact import complementarity_residuals, normal_and_tangential
@@ -25,16 +24,11 @@ from safe_wrappers.plants.mujoco.contacts import (
 from safe_wrappers.plants.mujoco.dynamics import MomentumReader
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, mujoco_env
 
 
 class StepMonitor(LayerWrapper, ABC):
-    """Makes each control step of a MuJoCo env once more, visits its physics, and warns once where it ends elsewhere.
-
-    Raises:
-        UnsupportedEnvError: No MuJoCo model.
-        ConfigurationError: A `ChunkHandover` inside, whose step is many control steps, or a second of its kind.
-    """
+    """Makes each control step of a MuJoCo env once more and visits its physics; warns where it ends elsewhere."""
 
     layer: ClassVar = Layer.MONITOR
     partial: ClassVar[str]
@@ -44,25 +38,20 @@ class StepMonitor(LayerWrapper, ABC):
 
     def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
-        raw: Any = env.unwrapped
-        name = type(self).__name__
-        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
-            raise UnsupportedEnvError(f"{name} needs an env with MuJoCo's .model and .data; {raw} has none")
-        self._replay = Replay(raw)
+        self._raw = mujoco_env(env, type(self).__name__)
+        self._replay = Replay(self._raw)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; its info holds the keys of a step, as of nothing."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._begin(self.unwrapped.model)  # type: ignore[attr-defined]
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         info.update(copy.deepcopy(self.nothing), **{self.partial: False})
-        return observation, info
+        self._forget()
+        return observation
 
     def step(self, action: Any) -> Step:
         """Step the env, and look at the physics of that step."""
         self._replay.before()
         answer = self._pass_on(action)
-        raw: Any = self.unwrapped
-        self._begin(raw.model)
+        raw = self._raw
+        self._forget()
         whole = self._replay.after(self._visit)
         if not whole:
             message = (
@@ -70,14 +59,14 @@ class StepMonitor(LayerWrapper, ABC):
                 f"substeps, or MuJoCo has reset it; only the contacts left behind are read (info[{self.partial!r}])"
             )
             self._warn_once("partial", message)
-            self._begin(raw.model)
+            self._forget()
             self._visit(raw.data, float(raw.model.opt.timestep))
         answer[4].update(self._figures(raw.data) | {self.partial: not whole})
         return answer
 
     @abstractmethod
-    def _begin(self, model: mujoco.MjModel) -> None:
-        """Forget what was visited; the env may have made itself another model, or was unpickled."""
+    def _forget(self) -> None:
+        """Forget what was visited; the env may have made itself another model."""
 
     @abstractmethod
     def _visit(self, data: mujoco.MjData, time_s: float) -> None:
@@ -92,8 +81,7 @@ class ContactMonitor(StepMonitor):
     """Reports forces and violations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
-    of its own, from the state before it and with the inputs that the env has left. An env that changes its inputs or
-    its state between substeps cannot be replayed.
+    of its own. An env that changes its inputs or its state between substeps cannot be replayed (`contact/partial`).
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
@@ -102,8 +90,8 @@ class ContactMonitor(StepMonitor):
             bodies is in each list.
 
     Info, at every step: ``contact/peak_force`` (N), ``contact/penetration`` (m), ``contact/residual`` (N m; 0 for
-    rigid contacts), NaN where the simulation's contacts are not finite, and
-    ``contact/partial`` (bool), see `safe_wrappers.info`. After a reset they are 0 and False.
+    rigid contacts), NaN where the simulation's contacts are not finite, and ``contact/partial`` (bool), see
+    `safe_wrappers.info`. After a reset they are 0 and False.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model.
@@ -131,25 +119,24 @@ class ContactMonitor(StepMonitor):
         against: Sequence[str] | None = None,
     ) -> None:
         StepMonitor.__init__(self, env)
-        raw: Any = env.unwrapped
-        self._contacts = Contacts(raw.model, bodies, against)
+        self._contacts = Contacts(self._raw.model, bodies, against)
         self.bodies = None if bodies is None else list(bodies)
         self.against = None if against is None else list(against)
         self._record({"bodies": self.bodies, "against": self.against})
-        self._begin(raw.model)
+        self._forget()
 
     @property
     def peak_bodies(self) -> tuple[str, str] | None:
         """Names of the two bodies that had the `contact/peak_force` of the last step; None where there was none."""
         if self._peak_bodies is None:
             return None
-        model = self.unwrapped.model  # type: ignore[attr-defined]
+        model = self._raw.model
         first, second = (model.body(i).name if i < model.nbody else "" for i in self._peak_bodies)
         return first, second
 
-    def _begin(self, model: mujoco.MjModel) -> None:
-        if self._contacts.model is not model:
-            self._contacts = Contacts(model, self.bodies, self.against)
+    def _forget(self) -> None:
+        if self._contacts.model is not self._raw.model:
+            self._contacts = Contacts(self._raw.model, self.bodies, self.against)
         self._gaps: list[float] = []
         self._forces: list[float] = []
         self._peak = 0.0
@@ -186,18 +173,16 @@ PRESSING: Final = 0.01
 class BalanceMonitor(StepMonitor):
     """Reports momentum, used friction and support of a robot on fixed ground; changes nothing.
 
-    Like `ContactMonitor` it makes each control step once more, and looks at the robot's contacts with what does not
-    move at every evaluation of the physics. There is a zero moment point only while three or more contact points, not
-    on a line, are in one plane (within 1 cm and 0.05 rad) and something presses on it. Torsional and rolling friction
-    and forces of the env's own are left out.
+    It sees the physics as `ContactMonitor` does, and the robot's contacts with what does not move. There is a zero
+    moment point only while three or more contact points, not on a line, are in one plane (within 1 cm and 0.05 rad)
+    and something presses on it. Torsional and rolling friction and forces of the env's own are left out.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
         bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves.
 
     Info, at every step: ``balance/linear_momentum`` (kg m/s), ``balance/angular_momentum`` (kg m^2/s), arrays (3,),
-    ``balance/friction_used``, ``balance/zmp_margin`` (m), and ``balance/partial`` (bool), see `safe_wrappers.info`.
-    After a reset they are 0 and False, the margin NaN.
+    ``balance/friction_used``, ``balance/zmp_margin`` (m; NaN without one), and ``balance/partial`` (bool).
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.
@@ -225,73 +210,56 @@ class BalanceMonitor(StepMonitor):
 
     def __init__(self, env: Env, bodies: Sequence[str] | None = None) -> None:
         StepMonitor.__init__(self, env)
-        raw: Any = env.unwrapped
-        self._robot = _Robot(raw.model, bodies)
+        self._take(bodies)
         self.bodies = None if bodies is None else list(bodies)
         self._record({"bodies": self.bodies})
 
-    def _begin(self, model: mujoco.MjModel) -> None:
-        if self._robot.model is not model:
-            self._robot = _Robot(model, self.bodies)
-        self._robot.contacts.clear()
+    def _take(self, bodies: Sequence[str] | None) -> None:
+        """Find the robot in the env's model."""
+        model = self._model = self._raw.model
+        own = chosen_bodies(model, "bodies", bodies)[:-1]
+        for i, parent in enumerate(model.body_parentid):  # a parent's id is smaller than its children's
+            own[i] |= own[parent]
+        moving = own & ~fixed_bodies(model) & (model.body_mass > 0.0)
+        which = "of this model" if bodies is None else f"of bodies={list(bodies)}"
+        if not moving.any():
+            raise ConfigurationError(f"no body {which} moves and has mass")
+        if not (can_touch_the_world(model) & own).any():
+            raise UnsupportedEnvError(f"no body {which} can touch the fixed world with friction")
+        self._own, self._massive = own, np.flatnonzero(moving)
+        self._contacts, self._momentum = ContactReader(model), MomentumReader(model, own)
+
+    def _forget(self) -> None:
+        if self._model is not self._raw.model:
+            self._take(self.bodies)
+        self._contacts.clear()
 
     def _visit(self, data: mujoco.MjData, time_s: float) -> None:
-        self._robot.contacts.read(data)
+        self._contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
         figures: dict[str, Any] = copy.deepcopy(self.nothing)
-        found, momentum = self._robot.grounded(), self._robot.momentum.read(data)
+        momentum = self._momentum.read(data)
         if momentum is not None:
             figures[keys.BALANCE_LINEAR_MOMENTUM] = momentum.linear
             figures[keys.BALANCE_ANGULAR_MOMENTUM] = momentum.angular
-        return figures if found is None or not found.steps else figures | self._of_contacts(found)
+        found = self._contacts.forecast(finite=True)
+        mine = self._own[found.body]
+        arrays = ("step", "body", "point", "normal", "force", "friction")
+        found = found._replace(**{name: getattr(found, name)[mine] for name in arrays})
+        finite = all(np.isfinite(array).all() for array in (found.point, found.normal, found.force))
+        return figures | self._of_contacts(found) if finite and found.steps else figures
 
     def _of_contacts(self, found: ContactForecast) -> dict[str, Any]:
         """The figures of finite contacts."""
         normal, tangential = normal_and_tangential(found.force, found.normal)
         held = found.friction * normal
-        loaded = (normal >= PRESSING * self._robot.weight_n()) & (held > 0.0)
+        gravity = np.linalg.norm(self._model.opt.gravity)
+        weight_n = self._model.body_mass[self._massive].sum() * gravity  # now: an env may change masses
+        loaded = (normal >= PRESSING * weight_n) & (held > 0.0)
         used = np.linalg.norm(tangential[loaded], axis=1) / held[loaded]
         distances = support_distances(found.step, found.point, found.normal, found.force)
         return {
             keys.BALANCE_FRICTION_USED: float(used.max(initial=0.0)),
             keys.BALANCE_ZMP_MARGIN: float(distances.min()) if distances.size else keys.NOT_JUDGED,
         }
-
-
-class _Robot:
-    """The bodies that are the robot, and what reads them."""
-
-    def __init__(self, model: mujoco.MjModel, roots: Sequence[str] | None) -> None:
-        self.model = model
-        self._own = _trees(model, roots)
-        moving = self._own & ~fixed_bodies(model) & (model.body_mass > 0.0)
-        which = "of this model" if roots is None else f"of bodies={list(roots)}"
-        if not moving.any():
-            raise ConfigurationError(f"no body {which} moves and has mass")
-        if not (can_touch_the_world(model) & self._own).any():
-            raise UnsupportedEnvError(f"no body {which} can touch the fixed world with friction")
-        self._massive = np.flatnonzero(moving)
-        self.contacts = ContactReader(model)
-        self.momentum = MomentumReader(model, self._own)
-
-    def weight_n(self) -> float:
-        """Now: an env may change masses."""
-        return float(self.model.body_mass[self._massive].sum() * np.linalg.norm(self.model.opt.gravity))
-
-    def grounded(self) -> ContactForecast | None:
-        """Its contacts with the fixed world that have been read; None where they are no finite numbers."""
-        found = self.contacts.forecast(finite=True)
-        mine = self._own[found.body]
-        arrays = ("step", "body", "point", "normal", "force", "friction")
-        found = found._replace(**{name: getattr(found, name)[mine] for name in arrays})
-        finite = all(np.isfinite(array).all() for array in (found.point, found.normal, found.force))
-        return found if finite else None
-
-
-def _trees(model: mujoco.MjModel, roots: Sequence[str] | None) -> NDArray[np.bool_]:
-    """Which bodies are, or hang from, the named ones, shape (nbody,); None is all."""
-    own = chosen_bodies(model, "bodies", roots)[:-1]
-    for i, parent in enumerate(model.body_parentid):  # a parent's id is smaller than its children's
-        own[i] |= own[parent]
-    return own

@@ -1,14 +1,17 @@
-"""What an `OcclusionPenalty` is made of: sensors, inertial units and tracks."""
+"""OcclusionPenalty: what is not seen is estimated, and not to see costs reward; with its sensors and tracks."""
 
-from collections.abc import Callable, Sequence, Sized
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from
+from safe_wrappers import info as keys
+from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.control.dead_reckoning import (
     DeadReckoning,
     from_sensor,
@@ -16,11 +19,15 @@ from safe_wrappers.control.dead_reckoning import (
     rigid_transform,
     to_sensor,
 )
-from safe_wrappers.control.estimation import Motion
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.control.estimation import Motion, Tracks, largest_deviation, unobservable_directions
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
+from safe_wrappers.plants.env_checks import read_attribute
+from safe_wrappers.plants.mujoco.binding import physics_steps
 from safe_wrappers.plants.mujoco.line_of_sight import LineOfSight
 from safe_wrappers.plants.mujoco.model import named
-from safe_wrappers.serialize import plain_numbers
+from safe_wrappers.serialize import plain_data, plain_numbers
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, mujoco_env
 
 __all__ = ["Imu", "Sensor", "Track"]
 
@@ -29,14 +36,11 @@ __all__ = ["Imu", "Sensor", "Track"]
 class Imu:
     """An accelerometer and a gyroscope at a site of the sensor's body, from which follows where the body is.
 
-    It integrates by itself, as such units do, and reports at the end of each control step.
-
     Args:
         site: Name of the site; its axes are those of the readings.
         accelerometer_std: Of the noise of a control step's mean acceleration, m/s².
         gyro_std: Of the noise of a control step's mean turn rate, and of that at its end, rad/s.
-        fix_every_s: How often the true pose and velocity of the body are given to the reckoning, s; None: at a reset
-            alone.
+        fix_every_s: How often the reckoning gets the body's true pose and velocity, s; None: at a reset alone.
 
     Raises:
         ConfigurationError: A number outside its range.
@@ -59,13 +63,8 @@ class EgoMotion(DeadReckoning):
     """Where a sensor's body is taken to be, by dead reckoning from the readings of its `Imu`.
 
     Attributes:
-        specific_force: Mean of the accelerometer's readings over the last step, in the axes of its middle, shape
-            (3,), m/s².
+        specific_force: Mean reading over the last step, in the axes of its middle, shape (3,), m/s².
         rate: The gyroscope's reading at its end, shape (3,), rad/s.
-
-    Raises:
-        ConfigurationError: An `Imu` on another body than the sensor.
-        UnknownNameError: No site of that name.
     """
 
     def __init__(self, imu: Imu, sight: LineOfSight) -> None:
@@ -82,11 +81,6 @@ class EgoMotion(DeadReckoning):
         self._since_fix_s = 0.0
         self._at_site = np.zeros(3), np.eye(3)
 
-    @property
-    def rotation(self) -> Array:
-        """The body's axes as columns, shape (3, 3)."""
-        return np.asarray(self.orientation.as_matrix())
-
     def fix_now(self) -> None:
         """Take the body's true motion, at the state that was read last."""
         sight = self._sight
@@ -98,12 +92,7 @@ class EgoMotion(DeadReckoning):
         self._since_fix_s = 0.0
 
     def read(self, time_s: float, noise: Array) -> None:
-        """Read what the step to the present state did, and reckon on.
-
-        Args:
-            time_s: Length of the step.
-            noise: Nine standard normal numbers: of the mean acceleration, the mean turn rate, and that at the end.
-        """
+        """Read what the step to the present state, of `time_s`, did; with nine standard normal numbers as noise."""
         if time_s <= 0.0:
             return
         velocity, axes = self._at_site
@@ -133,17 +122,16 @@ class EgoMotion(DeadReckoning):
 class Sensor:
     """A camera, or any other sensor that needs a line of sight, on a body of the model.
 
-    It measures the tracked point's position (and velocity) relative to itself, in its own axes, with Gaussian noise.
+    It measures positions (and velocities) relative to itself, in its own axes, with Gaussian noise.
 
     Args:
         camera: Name of a camera in the model, which looks along its own -z; or
         site: name of a site, which looks along its own z.
         view_deg: Full opening angle of the cone that it sees, degrees. None: a camera's `fovy`, a site's all around.
-        range_m: Farther away it sees nothing, m; None: as far as there is.
+        range_m: Range of sight, m; None: no end.
         position_std: Of a measured position along each axis, m. None: it does not measure positions.
         velocity_std: Of a measured velocity along each axis, m/s. None: it does not measure velocities.
-        imu: An `Imu` on the same body, from which the estimator reckons where that body is, or the dict of one; None:
-            it knows.
+        imu: An `Imu` on the same body, or the dict of one, by which it reckons where that body is; None: it knows.
 
     Raises:
         ConfigurationError: Both or neither of camera and site, nothing measured, or a number outside its range.
@@ -193,7 +181,7 @@ class Sensor:
             turned, believed = np.eye(3), eye
         else:
             # From the world's axes to where the body's believed orientation puts what is seen along them.
-            turned = ego.rotation @ np.array(sight.data.xmat[sight.body]).reshape(3, 3).T
+            turned = ego.orientation.as_matrix() @ np.array(sight.data.xmat[sight.body]).reshape(3, 3).T
             believed = ego.position + turned @ (eye - body)
         parts = []
         if self.position_std is not None:
@@ -209,13 +197,6 @@ class Sensor:
         return np.concatenate(parts, axis=1)
 
 
-def sensor_from(given: Any) -> Sensor:
-    """A sensor itself, the name of a camera, or the dict of a recorded one."""
-    if isinstance(given, str):
-        return Sensor(camera=given)
-    return settings_from(Sensor, given, "sensor", ", or the name of a camera")
-
-
 @dataclass
 class Track:
     """What an `OcclusionPenalty` follows: bodies of the model, or points that the env publishes, and how they move.
@@ -225,9 +206,8 @@ class Track:
     Args:
         bodies: Name of a body, or a pattern ("car*", "car[012]") for every body that fits, in the model's order.
         published: Instead of bodies: name of an attribute of the env, positions of shape (k, 2) or (k, 3), m.
-        acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds
-            q t^3 / 3 to the variance of a position. A number, or one per coordinate (0 along a coordinate that does
-            not wander). It has no default.
+        acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3, a number or one per coordinate:
+            after t seconds unseen it adds q t^3 / 3 to the variance of a position. It has no default.
         reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
         mean_velocity: m/s, one per coordinate; None: zeros.
         start_position_std: m, a number or one per coordinate.
@@ -292,31 +272,248 @@ def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = Fal
     return values
 
 
-class Tracked(NamedTuple):
-    """One thing that is tracked."""
+class OcclusionPenalty(LayerWrapper):
+    """Estimates what a sensor on the robot sees, and sees no more, and takes a penalty off the reward for not seeing.
 
-    track: Track  # which it belongs to
-    name: str  # the body's, or the attribute's with an index
-    body: int  # in the model; -1 for a published point
+    After every step it casts a ray to each tracked point. What is in sight is measured, with noise, and updates the
+    track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says. Permission to rely on a
+    track expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead. The filter belongs outside:
+    its `TrackPermission` and `TrackedDiscs` read the estimates. If things move and the sensor errs as declared, the
+    errors have the covariances that are given; these are no hard bounds, and say nothing of what is not tracked.
 
+    Args:
+        env: Its unwrapped env has MuJoCo's `.model` and `.data`.
+        tracks: Each a `Track`, or the dict of a recorded one.
+        sensor: A `Sensor`, or the name of a camera in the model.
+        tolerance: Position error that the task can bear, m.
+        weight: Of the penalty, the mean of ``min(1, sigmas * sigma / tolerance) ** 2`` over the tracks within the
+            sensor's range; the task's reward per step.
+        sigmas: k of the bound that is compared with the tolerance.
+        axes: "xy" tracks in the plane, "xyz" in space.
+        observe: Whether the observation (other than a flat Box under "tracks") gains each track's estimated position
+            from the sensor's body (m, world axes), velocity (m/s) and deviation along each axis (m).
 
-def tracked_things(
-    model: mujoco.MjModel, tracks: Sequence[Track], published: Callable[[Track], Sized]
-) -> list[Tracked]:
-    """All that the tracks follow, in their order."""
-    things: list[Tracked] = []
-    there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
-    for track in tracks:
-        if track.bodies is None:
-            things += [Tracked(track, f"{track.published}[{i}]", -1) for i in range(len(published(track)))]
-            continue
-        found = [Tracked(track, name, b) for name, b in there.items() if fnmatchcase(name, track.bodies)]
-        if not found:
-            known = ", ".join(there) or "none"
-            raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {known}")
-        things += found
-    names = [thing.name for thing in things]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
-    return things
+    Info, at every step and at reset: ``occlusion/visible``, ``occlusion/expired`` (bool arrays, one per track),
+    ``occlusion/sigma`` (m, array), ``occlusion/penalty`` (float).
+
+    Attributes:
+        tracking: The `control.estimation.Tracks`: positions, velocities, covariances, and those ahead.
+        track_names: One per track: the body's name, or the attribute's with an index.
+        ego_motion: Where the sensor's body is taken to be (`position`, m, `velocity`, m/s) by its `Imu`, or None.
+        last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.
+        permitted: Tracks that may be relied on, bool (n,).
+
+    Raises:
+        UnsupportedEnvError: No MuJoCo model.
+        ConfigurationError: A number outside its range, a name that the model does not have, an `Imu` on another body.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = gym.make("OccludedCrossing-v0")
+        >>> cars = [sw.occlusion.Track("car*", acceleration_noise=[0.03, 0], start_position_std=[0.3, 0])]
+        >>> env = sw.OcclusionPenalty(env, cars, "eye", tolerance=1.0, weight=0.05)
+        >>> _ = env.reset(seed=0)
+        >>> info = env.step(env.action_space.sample())[4]
+        >>> info["occlusion/visible"].shape
+        (6,)
+
+    Source: appendix "Continuous Covariance Propagation and Observability".
+    """
+
+    layer: ClassVar = Layer.OCCLUSION
+
+    def __init__(
+        self,
+        env: Env,
+        tracks: Sequence[Track | dict[str, Any]],
+        sensor: Sensor | str | dict[str, Any],
+        tolerance: float,
+        weight: float = 0.0,
+        sigmas: float = 3.0,
+        axes: str = "xy",
+        observe: bool = True,
+    ) -> None:
+        arguments = dict(locals())
+        LayerWrapper.__init__(self, env)
+        raw = mujoco_env(env, "OcclusionPenalty")
+        if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
+            raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
+        self.tracks = [settings_from(Track, track, "a track") for track in tracks]
+        named_camera = Sensor(camera=sensor) if isinstance(sensor, str) else sensor
+        self.sensor = settings_from(Sensor, named_camera, "sensor", ", or the name of a camera")
+        if self.sensor.velocity_std is not None and any(t.published is not None for t in self.tracks):
+            raise ConfigurationError("velocity_std: velocities are measured of bodies alone")
+        self.tolerance = positive("tolerance", tolerance, "m")
+        self.weight = non_negative("weight", weight, "the task's reward per step")
+        self.sigmas = positive("sigmas", sigmas, "standard deviations")
+        if axes not in ("xy", "xyz"):
+            raise ConfigurationError(f"axes is 'xy' or 'xyz', got {axes!r}")
+        self.observe = true_or_false("observe", observe)
+        plain = {name: getattr(self, name) for name in ("tolerance", "weight", "sigmas")}
+        parts = {"tracks": plain_data(self.tracks), "sensor": plain_data(self.sensor)}
+        self._record(arguments, **parts, **plain, observe=self.observe)
+        self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
+        self._control_dt = physics_steps(raw) * float(raw.model.opt.timestep)
+        self._matrix, self._noise = self.sensor.matrices(self._d)
+        self._noise_root = np.linalg.cholesky(self._noise)
+        self.track_names = self._look_at(raw.model)
+        self.tracking = Tracks([track.motion(self._d) for track in self._owners])
+        self._start_std = np.stack([track.start(self._d) for track in self._owners])
+        self._state_names = [*axes, *(f"v{axis}" for axis in axes)]
+        self.last_seen_positions = np.zeros((len(self.track_names), self._d))
+        self.permitted = np.zeros(len(self.track_names), dtype=bool)
+        if self.observe:
+            size = 3 * self._d * len(self.track_names)
+            self._widen_observation("tracks", gym.spaces.Box(-np.inf, np.inf, (size,), np.float64))
+
+    def _look_at(self, model: mujoco.MjModel) -> list[str]:
+        """Resolve names on a model; the names of all that the tracks follow, in their order."""
+        s = self.sensor
+        range_m = math.inf if s.range_m is None else s.range_m
+        self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m)
+        self.ego_motion = EgoMotion(s.imu, self._sight) if isinstance(s.imu, Imu) else None
+        there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
+        names: list[str] = []
+        self._owners: list[Track] = []
+        bodies: list[int] = []  # -1 for a published point
+        for track in self.tracks:
+            if track.bodies is None:
+                found = {f"{track.published}[{i}]": -1 for i in range(len(self._published(track)))}
+            else:
+                found = {name: b for name, b in there.items() if fnmatchcase(name, track.bodies)}
+            if not found:
+                known = ", ".join(there) or "none"
+                raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {known}")
+            names += found
+            bodies += found.values()
+            self._owners += [track] * len(found)
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
+        self._bodies = np.array(bodies, dtype=np.intp)
+        self._in_model = self._bodies >= 0
+        return names
+
+    def _published(self, track: Track) -> Array:
+        points = np.asarray(read_attribute(self.env, track.published or ""), dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] not in (self._d, 3) or not len(points):
+            wanted = f"positions of shape (k, {self._d}) or (k, 3), k >= 1"
+            raise ConfigurationError(f"the env's {track.published} must be {wanted}, got {points.shape}")
+        return points
+
+    def _truth(self) -> tuple[Array, Array | None]:
+        """True positions, shape (n, 3), m, and velocities, (n, d), m/s, if the sensor measures them."""
+        sight = self._sight
+        positions = np.empty((len(self.track_names), 3))
+        if self._in_model.any():
+            positions[self._in_model] = sight.data.xpos[self._bodies[self._in_model]]
+        velocities = None
+        if self.sensor.velocity_std is not None:
+            velocities = np.empty((len(positions), self._d))
+            for i in np.flatnonzero(self._in_model):
+                velocities[i] = sight.velocity(int(self._bodies[i]))[0][: self._d]
+        for track in self.tracks:
+            if track.published is not None:
+                points = self._published(track)
+                which = [i for i, owner in enumerate(self._owners) if owner is track]
+                if len(points) != len(which):
+                    counts = f"had {len(which)} points when the wrapper was made, and has {len(points)} now"
+                    raise ConfigurationError(f"the env's {track.published} {counts}")
+                positions[which, 2] = sight.position[2]  # a point of the plane is looked at level
+                positions[which, : points.shape[1]] = points
+        return positions, velocities
+
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        """Start every track from its initial fix, and look once."""
+        self._random.reset(self.env, seed)
+        if self._sight.model is not self._raw.model:
+            names = self._look_at(self._raw.model)
+            if names != self.track_names:
+                tracked = f"{', '.join(names)} and not {', '.join(self.track_names)}"
+                raise ConfigurationError(f"the env has another model, with other things: {tracked}")
+        self._time = float(self._raw.data.time)
+        self._sight.read(self._raw.data)
+        if self.ego_motion is not None:
+            self.ego_motion.fix_now()
+        d, n = self._d, len(self.track_names)
+        truth, _ = self._truth()
+        mean = np.zeros((n, self.tracking.size))
+        mean[:, :d] = truth[:, :d] + self._start_std[:, :d] * self._random.draw.standard_normal((n, d))
+        mean[:, d:] = np.stack([motion.mean_velocity for motion in self.tracking.motions])
+        self.tracking.start(mean, self._start_std[:, :, None] ** 2 * np.eye(self.tracking.size))
+        self.last_seen_positions = mean[:, :d].copy()
+        info.update(self._look())
+        info[keys.OCCLUSION_PENALTY] = 0.0
+        return self._observed(observation)
+
+    def step(self, action: Any) -> Step:
+        """Step the env with the action as it is, and look."""
+        observation, reward, terminated, truncated, info = self._pass_on(action)
+        before, self._time = self._time, float(self._raw.data.time)
+        elapsed = self._time - before
+        if abs(elapsed - self._control_dt) < 1e-9:
+            elapsed = self._control_dt
+        if elapsed < 0.0:
+            gone = f"backwards by {-elapsed:g} s within a step"
+            raise SafeWrappersError(f"the simulation's time ran {gone}. Reset the env instead")
+        self.tracking.advance(elapsed)
+        self._sight.read(self._raw.data)
+        if self.ego_motion is not None:
+            self.ego_motion.read(elapsed, self._random.draw.standard_normal(9))
+        info.update(self._look())
+        penalty = self.weight * self._uncertainty() if self.weight else 0.0
+        info[keys.OCCLUSION_PENALTY] = penalty
+        if penalty:
+            reward = float(reward) - penalty
+        return self._observed(observation), reward, terminated, truncated, info
+
+    @property
+    def unobservable(self) -> dict[str, list[str]]:
+        """Track name -> directions of its state ("x", "vy") that the sensor cannot resolve in sight."""
+        return {
+            name: list(unobservable_directions(motion.matrices()[0], self._matrix, self._state_names))
+            for name, motion in zip(self.track_names, self.tracking.motions, strict=True)
+        }
+
+    def _look(self) -> dict[str, Any]:
+        """Measure what is in sight, and report what may be relied on."""
+        d, n = self._d, len(self.track_names)
+        truth, velocities = self._truth()
+        seen = self._sight.sees(truth, self._bodies)
+        # Drawn for every track, seen or not, so that the noise of one does not depend on another's sight.
+        noise = self._random.draw.standard_normal((n, self._noise.shape[0])) @ self._noise_root.T
+        which = np.flatnonzero(seen)
+        if which.size:
+            among = None if velocities is None else velocities[which]
+            measurements = self.sensor.measured(self._sight, d, truth[which], among, self.ego_motion)
+            measurements += noise[which]
+            self.tracking.see(which, measurements, self._matrix, self._noise)
+            if self.sensor.position_std is not None:
+                self.last_seen_positions[which] = measurements[:, :d]
+        self._sigma = largest_deviation(self.tracking.position_covariances)
+        soon = largest_deviation(self.tracking.ahead([self._control_dt])[1][0])
+        self.permitted = self.sigmas * np.maximum(self._sigma, soon) <= self.tolerance
+        return {
+            keys.OCCLUSION_VISIBLE: seen,
+            keys.OCCLUSION_SIGMA: self._sigma.copy(),
+            keys.OCCLUSION_EXPIRED: ~self.permitted,
+        }
+
+    def _uncertainty(self) -> float:
+        """Mean share of the tolerated variance that is used up, over the tracks within range."""
+        share = np.minimum(1.0, self.sigmas * self._sigma / self.tolerance) ** 2
+        if self.sensor.range_m is None:
+            return float(share.mean())
+        away = self.tracking.positions - self._sight.position[: self._d]
+        near = (away * away).sum(axis=1) <= self.sensor.range_m**2
+        return float(share[near].mean()) if near.any() else 0.0
+
+    def _observed(self, observation: Any) -> Any:
+        if not self.observe:
+            return observation
+        ego = self.ego_motion
+        body = (self._sight.data.xpos[self._sight.body] if ego is None else ego.position)[: self._d]
+        tracking = self.tracking
+        deviations = np.sqrt(np.diagonal(tracking.position_covariances, axis1=1, axis2=2))
+        flat = np.concatenate([tracking.positions - body, tracking.velocities, deviations], axis=1).ravel()
+        return self._with_numbers(observation, "tracks", flat)

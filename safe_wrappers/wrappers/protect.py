@@ -12,8 +12,8 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, Unsupport
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.simulator import SimulatorPlant
 from safe_wrappers.stack import refuse_order
-from safe_wrappers.wrappers.action_shield import ActionShield
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.presets import ActionShield
 from safe_wrappers.wrappers.recipes import EVERY, PLANTS, family_of, recipe_of
 from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, by_env, single_envs
 

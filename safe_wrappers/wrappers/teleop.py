@@ -1,21 +1,38 @@
-"""What a `TeleopChannel` is made of: links, ports, the ceiling on the round trip."""
+"""TeleopChannel: a network between the operator and the machine, and a local brake for when it is too slow."""
 
+import copy
 import heapq
 import math
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, Literal, get_args
 
-import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
+from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
+from safe_wrappers.control.teleop import ChannelLedger
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.fallback import FallbackFunction
+from safe_wrappers.plants import own_plant
+from safe_wrappers.plants.env_checks import refuse_changed_actions
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.serialize import plain_data
+from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.faults import OnOffProcess, probability
-from safe_wrappers.wrappers.layer import Env, WrapperRng
-from safe_wrappers.wrappers.stopping_budget import BoundBudget, BudgetLike, budget_from
+from safe_wrappers.wrappers.layer import SAME_STEP, Env, Step, WrapperRng, action_array
+from safe_wrappers.wrappers.stopping import (
+    BoundBudget,
+    CommandGate,
+    FallbackController,
+    StoppingBudget,
+    bound_plant,
+)
+from safe_wrappers.wrappers.teleop_coding import Packet, Port, WaveCoding
 
 __all__ = ["Link", "RoundTripCeiling"]
 
+Coding = Literal["plain", "wave"]
 _RELEASE: Final = 0.8
 """Authority comes back only when the round trip is below this share of the ceiling."""
 
@@ -53,22 +70,14 @@ class Link:
         check_fields(self, positive, ["outage_between_s", "outage_length_s"], "s")
 
 
-def link_from(name: str, given: Any) -> Link:
-    """A link itself, from the dict of one, or with that number of seconds as its delay."""
-    if isinstance(given, int | float) and not isinstance(given, bool):
-        return Link(delay_s=given)
-    return settings_from(Link, given, name, ", or a delay in s")
-
-
-class Packet(NamedTuple):
-    """A packet, by its number on the line (from 0), which packets compare by, and what it carries."""
-
-    sequence: int
-    load: Any
-
-
 class Line:
-    """The packets of one direction, with random numbers of their own; times closer than `slack_s` are the same."""
+    """The packets of one direction, with random numbers of their own; times closer than `slack_s` are the same.
+
+    Attributes:
+        newest: Of all packets that have arrived, the one that was sent last.
+    """
+
+    newest: Packet
 
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:
         self._link, self._slack_s = link, slack_s
@@ -76,103 +85,39 @@ class Line:
         between_s, length_s = link.outage_between_s, link.outage_length_s
         self._outages = None if between_s is None or length_s is None else OnOffProcess(between_s, length_s)
 
-    newest: Packet  # of all that have arrived the one that was sent last
-
     def reset(self, env: Env, seed: int | None, first: Any = None) -> None:
-        """Nothing is on its way, and `first` has arrived; call it after the env's own reset."""
+        """Nothing is on its way, and `first`, made at 0 s, has arrived; call it after the env's own reset."""
         self._random.reset(env, seed)
         if self._outages is not None:
             self._outages.begin(self._random)
-        self._coming: list[tuple[float, int, Any]] = []
+        self._coming: list[tuple[float, Packet]] = []
         self._sent = 0
         self._latest_s = -math.inf
-        self.newest = Packet(-1, first)
+        self.newest = Packet(-1, first, 0.0, None)
 
-    def send(self, load: Any, now_s: float) -> tuple[int, bool]:
-        """Send something; its number, and whether it gets lost."""
-        link, sequence = self._link, self._sent
+    def send(self, content: Any, made_s: float, wave: Array | None, now_s: float) -> tuple[int, bool]:
+        """Send a packet; its number, and whether it gets lost."""
+        link, packet = self._link, Packet(self._sent, content, made_s, wave)
         self._sent += 1
         # As many numbers for a lost packet as for one that is not: what follows stays the same.
         jitter_s = self._random.draw.uniform(0.0, link.jitter_s) if link.jitter_s else 0.0
         lost = bool(link.loss and self._random.draw.random() < link.loss)
         if self._outages is not None:
             lost |= self._outages.is_on(now_s, self._random)
-        if lost:
-            return sequence, True
-        due_s = now_s + link.delay_s + jitter_s
-        if link.in_order:
-            due_s = self._latest_s = max(due_s, self._latest_s)
-        heapq.heappush(self._coming, (due_s, sequence, load))
-        return sequence, False
+        if not lost:
+            due_s = now_s + link.delay_s + jitter_s
+            if link.in_order:
+                due_s = self._latest_s = max(due_s, self._latest_s)
+            heapq.heappush(self._coming, (due_s, packet))
+        return packet.sequence, lost
 
     def receive(self, now_s: float) -> list[Packet]:
         """What has arrived since the last call, in the order of arrival."""
         found: list[Packet] = []
         while self._coming and self._coming[0][0] <= now_s + self._slack_s:
-            _, sequence, load = heapq.heappop(self._coming)
-            found.append(Packet(sequence, load))
+            found.append(heapq.heappop(self._coming)[1])
         self.newest = max([self.newest, *found], key=lambda packet: packet.sequence)
         return found
-
-
-class Port(NamedTuple):
-    """A pair of effort and flow whose product is power, as an env publishes it."""
-
-    flow: list[int]  # entries of the action, in m/s (or rad/s)
-    effort: list[int]  # entries of the observation, in N (or N m): how the command pushes the machine now
-    feedthrough: (
-        float  # change of the effort at once per change of the flow, N s/m: a damper before the machine
-    )
-
-
-def port_of(env: Env) -> Port | None:
-    """What the env publishes; None if it publishes nothing."""
-    if not env.has_wrapper_attr("port_flow"):
-        return None
-    flow, effort = (list(env.get_wrapper_attr(name)) for name in ("port_flow", "port_effort_observed"))
-    action, observation = env.action_space, env.observation_space
-    box = isinstance(observation, gym.spaces.Box) and len(observation.shape) == 1
-    if not box or not np.issubdtype(observation.dtype or np.int64, np.floating):
-        raise ConfigurationError(f"a port needs observations of one axis and floats, got {observation}")
-    assert action.shape is not None and observation.shape is not None
-    if len(flow) != len(effort) or max(flow) >= action.shape[0] or max(effort) >= observation.shape[0]:
-        entries = f"flow {flow} and effort {effort}"
-        raise ConfigurationError(f"no port of {action} and {observation} has {entries}")
-    return Port(flow, effort, float(env.get_wrapper_attr("port_feedthrough")))
-
-
-class PortReading:
-    """The effort at the port of an env: as observed, and as the env says that it acted."""
-
-    def __init__(self, env: Env, port: Port) -> None:
-        self._env, self._port = env, port
-        self.feedthrough = port.feedthrough  # N s/m
-
-    def reset(self, observation: Array) -> None:
-        """At rest, the effort as observed."""
-        self._last_flow = np.zeros(len(self._port.flow))
-        self.effort = self.of(observation)  # at the present state and the last command, N
-
-    @property
-    def base(self) -> Array:
-        """The effort without flow, N."""
-        return self.effort - self.feedthrough * self._last_flow
-
-    def acted(self, flow: Array, observation: Array) -> Array:
-        """The effort during the step that was made with this flow, as the env publishes it, N."""
-        self._last_flow = flow
-        self.effort = self.of(observation)
-        return np.array(self._env.get_wrapper_attr("port_effort_acted"), dtype=np.float64)
-
-    def of(self, observation: Array) -> Array:
-        """The effort that an observation shows, N."""
-        return np.asarray(observation[self._port.effort], dtype=np.float64)
-
-    def replaced(self, observation: Array, effort: Array) -> Array:
-        """An observation that shows another effort."""
-        shown = np.array(observation)
-        shown[self._port.effort] = effort
-        return shown
 
 
 @dataclass(frozen=True)
@@ -191,14 +136,14 @@ class RoundTripCeiling:
         ConfigurationError: A time that cannot be, or a clearance that measures no approach.
     """
 
-    budget: BudgetLike
+    budget: StoppingBudget | dict[str, Any]
     _: KW_ONLY
     video_s: float = 0.1
     human_s: float = 0.25
     longest_s: float = 1.0
 
     def __post_init__(self) -> None:
-        budget = budget_from(self.budget)
+        budget = settings_from(StoppingBudget, self.budget, "budget")
         if not budget.measures_approach:
             name = type(budget.clearance).__name__
             raise ConfigurationError(f"{name} does not say how fast it is approached: give a Clearance")
@@ -207,34 +152,40 @@ class RoundTripCeiling:
         check_fields(self, positive, ["longest_s"], "s")
 
 
-class RoundTripWatch:
-    """Measures clearance and approach, and decides whether the operator is obeyed in the coming control step."""
+class RoundTripWatch(BoundBudget):
+    """Decides whether the operator is obeyed in the coming control step, by clearance and approach.
 
-    budget: BoundBudget  # to be bound to a plant
-    revoked: bool  # whether authority is revoked, as `judge` left it
-    readable: bool  # whether clearance and speed were finite when `look` was called
-    ceiling_s: float  # the longest round trip then, s, within `longest_s` of 0; the lowest where unreadable
+    Attributes:
+        revoked: Whether authority is revoked, as `judge` left it.
+        ceiling_s: The longest round trip at the last `look`, s, within `longest_s` of 0; the lowest where unreadable.
+    """
 
-    def __init__(self, env: Env, ceiling: RoundTripCeiling, control_dt: float, slack_s: float = 0.0) -> None:
+    ceiling_s: float
+
+    def __init__(
+        self,
+        ceiling: RoundTripCeiling,
+        env: Env,
+        plant: Plant | None,
+        control_dt: float,
+        slack_s: float = 0.0,
+    ) -> None:
+        assert isinstance(ceiling.budget, StoppingBudget)
+        super().__init__(ceiling.budget, env, plant)
         self._ceiling, self._control_dt, self._slack_s = ceiling, control_dt, slack_s
-        self.budget = BoundBudget(budget_from(ceiling.budget), env)
 
     def reset(self) -> None:
         """A new episode: authority is the operator's."""
-        self.budget.reset()
+        self.observe()
         self.revoked, self._revoked_s = False, -math.inf
         self.look()
 
     def look(self) -> None:
         """Measure the clearance of the present state."""
-        ceiling, budget = self._ceiling, self.budget
-        budget.measure()
-        self.readable = budget.readable
-        if not self.readable:
-            self.ceiling_s = -ceiling.longest_s
-            return
-        # The next look comes one control step from now.
-        highest_s = budget.longest_round_trip(ceiling.video_s, ceiling.human_s) - self._control_dt
+        self.measure()
+        ceiling, highest_s = self._ceiling, -math.inf
+        if self.readable:  # the next look comes one control step from now
+            highest_s = self.longest_round_trip(ceiling.video_s, ceiling.human_s) - self._control_dt
         self.ceiling_s = min(max(highest_s, -ceiling.longest_s), ceiling.longest_s)
 
     def judge(self, command: Array, seen_s: float, round_trip_s: float, now_s: float) -> None:
@@ -245,7 +196,211 @@ class RoundTripWatch:
         trusted = self.readable and round_trip_s <= allowed_s + self._slack_s
         if self.revoked:
             trusted = trusted and seen_s >= self._revoked_s - self._slack_s
-        trusted = trusted and self.budget.can_stop_after(command, self._control_dt)
+        trusted = trusted and self.can_stop_after(command, self._control_dt)
         if not trusted and not self.revoked:
             self._revoked_s = now_s
         self.revoked = not trusted
+
+
+class TeleopChannel(CommandGate):
+    """Puts a network between the policy, as a remote operator, and the machine.
+
+    `step(action)` sends the action up, executes what has arrived at the machine, sends the observation down, and
+    returns the newest that has arrived at the operator. Reward, termination and info are not delayed. With a ceiling,
+    the local brake (`fallback`) acts when the round trip is too long for the clearance and approach speed of the
+    moment, or when the machine could not stop by itself after the command.
+
+    **What it guarantees.** With a ceiling whose bounds are what they are declared to be, the machine stops inside the
+    clearance whatever operator and network do, from a start where it can: proved where the clearance is a distance
+    along a line that the brake acts along, best effort elsewhere or with an unverified fallback. With wave coding
+    never more energy has come out than went in, less what is in flight. **What it does not.** Passivity limits
+    neither force nor displacement.
+
+    Args:
+        env: With a one-dimensional Box action space.
+        uplink: A `Link` for actions, the dict of one, or a delay in s.
+        downlink: For observations, likewise.
+        coding: "plain" or "wave".
+        impedance: Characteristic impedance b of the waves, N s/m; for "wave".
+        ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
+        fallback: The local brake: "brake", "hold", "zero", or a function of the plant.
+        plant: For the ceiling's constraint and the fallback; None reads the env's MuJoCo model.
+        control_dt: Control interval, s; None reads the env's `dt`.
+
+    Info, at every step: ``teleop/round_trip_s``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
+    ``teleop/lost`` (int); without a filter inside ``executed_action`` and ``action/clipped`` (float).
+
+    Raises:
+        ConfigurationError: A link, an impedance or a ceiling that cannot be, or a wrong order.
+
+    Example:
+        >>> import gymnasium as gym, numpy as np, safe_wrappers as sw
+        >>> env = sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, coding="wave", impedance=40.0)
+        >>> _ = env.reset(seed=0)
+        >>> for _ in range(1000):
+        ...     info = env.step(np.array([0.1, 0.0]))[4]
+        >>> round(info["teleop/round_trip_s"], 3), info["teleop/created_j"] < 1e-8  # float32 actions
+        (0.2, True)
+    """
+
+    layer: ClassVar = Layer.CHANNEL
+    _whose: ClassVar = "operator's"
+    _not_sent: ClassVar = "it is not sent"
+
+    def __init__(
+        self,
+        env: Env,
+        uplink: Link | dict[str, Any] | float,
+        downlink: Link | dict[str, Any] | float,
+        coding: Coding = "plain",
+        impedance: float | None = None,
+        ceiling: RoundTripCeiling | dict[str, Any] | None = None,
+        fallback: str | FallbackFunction = "brake",
+        plant: Plant | None = None,
+        control_dt: float | None = None,
+    ) -> None:
+        arguments = dict(locals())
+        CommandGate.__init__(self, env, control_dt)
+        plant = own_plant(plant)
+        self.uplink, self.downlink = _link("uplink", uplink), _link("downlink", downlink)
+        limit = None if ceiling is None else settings_from(RoundTripCeiling, ceiling, "ceiling", ", or None")
+        if coding not in get_args(Coding):
+            raise ConfigurationError(f"coding is one of {', '.join(get_args(Coding))}; got {coding!r}")
+        plain = {"uplink": self.uplink, "downlink": self.downlink, "ceiling": limit}
+        self._record(arguments, plant=plant, **{name: plain_data(value) for name, value in plain.items()})
+        self._port = Port(env) if env.has_wrapper_attr("port_flow") else None
+        self._waves: WaveCoding | None = None
+        if coding == "plain" and impedance is not None:
+            raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
+        if coding == "wave":
+            if self._port is None:
+                published = "port_flow, port_effort_observed, port_feedthrough and port_effort_acted"
+                raise ConfigurationError(
+                    f'coding="wave" needs a port: {env.unwrapped!r} publishes no {published}'
+                )
+            refuse_changed_actions(env)
+            if impedance is None:
+                raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
+            self._waves = WaveCoding(self._port, self.control_dt, positive("impedance", impedance, "N s/m"))
+        self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
+        self._down = Line(self.downlink, "TeleopChannel down 0", self._same_s)
+        self._watch: RoundTripWatch | None = None
+        if limit is not None:
+            refuse_changed_actions(env)
+            plant = bound_plant(env, plant, fallback, limit.budget.clearance)  # type: ignore[union-attr]
+            self._fallback = FallbackController(env, fallback, plant)
+            self._watch = RoundTripWatch(limit, env, plant, self.control_dt, self._same_s)
+
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        self._up.reset(self.env, seed)
+        self._down.reset(self.env, seed, copy.deepcopy(observation))
+        observation = super()._begin(observation, info, seed)
+        if self._watch is not None:
+            self._watch.reset()
+        self.ledger = ChannelLedger()
+        if self._port is not None:
+            self._port.reset(observation)
+        if self._waves is not None:
+            self._waves.reset()
+        self._lost = 0
+        self._images = [0.0]  # when the image was taken that was shown after each step
+        self._report(info, 0.0)
+        return observation
+
+    def step(self, action: Any) -> Step:
+        """Send the action, step the env with what has arrived, and return what has come back."""
+        self._refuse_without_reset()
+        now_s, self._lost = self.now_s, 0
+        self._send_up(self._inside(action_array(action, self._shape)), now_s)
+        arrived = self._up.receive(now_s)
+        command, seen_s = self._in_force(arrived)
+        if self._watch is not None:
+            self._watch.judge(self._boxed(command), seen_s, now_s - seen_s, now_s)
+        if self.revoked:
+            assert self._fallback is not None
+            command = self._fallback.command().astype(self._dtype)
+        executed, (observation, reward, terminated, truncated, info) = self._execute(command)
+        # What the brake or a filter inside does is not the operator's: the channel's port stood still.
+        obeyed = not self.revoked and np.array_equal(executed, np.asarray(command, dtype=np.float64))
+        shown = self._send_down(executed, observation, obeyed)
+        if self._watch is not None:
+            self._watch.look()
+        self._report(info, now_s - seen_s)
+        return shown, reward, terminated, truncated, info
+
+    @property
+    def revoked(self) -> bool:
+        """Whether the local brake acted in the last step."""
+        return self._watch is not None and self._watch.revoked
+
+    def _send_up(self, action: NDArray[Any] | None, now_s: float) -> None:
+        """Send an action; one that is not finite, or from an image that nobody has seen yet, counts as lost."""
+        observed_s, self._observed_s = self._observed_s, now_s + self.control_dt
+        self._lost += action is None
+        if action is not None and (observed_s is None or observed_s > now_s + self._same_s):
+            self._lost += observed_s is not None
+            action = None
+        self._moved: Array | None = None
+        if action is not None and self._port is not None:
+            self._moved = self._boxed(action)[self._port.flow]  # as the machine will take it
+        wave = None if self._waves is None else self._waves.near(self._moved)
+        if action is not None and observed_s is not None:
+            step = min(max(math.floor(observed_s / self.control_dt + SAME_STEP), 0), len(self._images) - 1)
+            self._send(self._up, action, self._images[step], wave)
+
+    def _send(self, line: Line, content: Any, made_s: float, wave: Array | None) -> None:
+        sequence, lost = line.send(content, made_s, wave, self.now_s)
+        if self._waves is not None:
+            self._waves.sent(line is self._up, sequence, wave, lost)
+        self._lost += lost
+
+    def _in_force(self, arrived: list[Packet]) -> tuple[Any, float]:
+        """The command for this step, at first zero, and when the image was taken that it was made from, s."""
+        newest = self._up.newest
+        command = self._rest() if newest.content is None else newest.content.copy()
+        # What is judged is what is executed, by a filter inside too.
+        if self._watch is not None and ((command < self._low) | (command > self._high)).any():
+            command = self._boxed(command).astype(self._dtype)
+        if self._waves is None:
+            return command, newest.made_s
+        flow, seen_s = self._waves.far(arrived)
+        assert self._port is not None
+        whole = np.array(command, dtype=np.float64)
+        whole[self._port.flow] = flow
+        return self._boxed(whole).astype(self._dtype), seen_s
+
+    def _send_down(self, executed: Array, observation: Any, obeyed: bool) -> Any:
+        """Send the observation, and return the one that the operator sees; add up the energies of the tick."""
+        port, waves, wave = self._port, self._waves, None
+        if port is not None:
+            flow = executed[port.flow]
+            acted, still = port.acted(flow, observation), np.zeros(flow.size)
+            given = (acted, flow) if obeyed else (still, still)
+            wave = None if waves is None else waves.settle(*given, obeyed)
+        self._send(self._down, copy.deepcopy(observation), self.now_s, wave)
+        arrived, newest = self._down.receive(self.now_s), self._down.newest
+        self._images.append(max(self._images[-1], newest.made_s))
+        shown = copy.deepcopy(newest.content)
+        if port is not None:
+            shown = shown if waves is None else port.replaced(shown, waves.felt(arrived))
+            moved = still if self._moved is None else self._moved
+            self.ledger.add(port.of(shown), moved, *given, self.control_dt, self.stored_j)
+        return shown
+
+    @property
+    def stored_j(self) -> float:
+        """Energy of waves on their way, J; 0 for plain coding."""
+        return 0.0 if self._waves is None else self._waves.stored_j
+
+    def _report(self, info: dict[str, Any], round_trip_s: float) -> None:
+        info[keys.TELEOP_ROUND_TRIP_S] = round_trip_s
+        info[keys.TELEOP_LOST] = self._lost
+        info[keys.TELEOP_REVOKED] = self.revoked
+        info[keys.TELEOP_CREATED_J] = self.ledger.created_j
+
+
+def _link(name: str, given: Any) -> Link:
+    """A link itself, from the dict of one, or with that number of seconds as its delay."""
+    if isinstance(given, int | float) and not isinstance(given, bool):
+        return Link(delay_s=given)
+    return settings_from(Link, given, name, ", or a delay in s")

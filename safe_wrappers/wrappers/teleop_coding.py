@@ -1,120 +1,101 @@
-"""How commands and forces are written into packets: as they are, or with their energy paid for."""
+"""Ports of effort and flow, and how both are written into packets with their energy paid for."""
 
 import heapq
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, positive
-from safe_wrappers.control.teleop.passivity import ChannelLedger, effort_and_outgoing, port_energy, to_waves
-from safe_wrappers.control.teleop.wave_line import WaveLine
+from safe_wrappers.checks import Array
+from safe_wrappers.control.teleop import WaveLine, effort_and_outgoing, port_energy, to_waves
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.wrappers.layer import Env
-from safe_wrappers.wrappers.teleop import Packet, Port, PortReading
-
-Coding = Literal["plain", "wave"]
 
 
-class Up(NamedTuple):
-    """What goes from the operator to the machine."""
+class Packet(NamedTuple):
+    """What goes over the network; packets compare by their numbers."""
 
-    action: Any  # as the operator gave it
-    seen_s: float  # when the image was taken that it was made from, s
-    extra: Any  # what the coding adds
-
-
-class Down(NamedTuple):
-    """What comes back."""
-
-    observation: Any  # the env's
-    taken_s: float  # when, s
-    extra: Any  # what the coding adds
+    sequence: int  # on its line, from 0
+    content: Any  # the operator's action, or the env's observation
+    made_s: float  # when the image was taken that it was made from, or that it is, s
+    wave: Array | None  # what the coding adds
 
 
-Order = tuple[Array | None, float]
-"""The flow that replaces the port's entries of the command (None: none does); when its image was taken, s."""
-Given = tuple[Array, Array]
-"""Effort and flow with which the channel acted on the machine in one tick, shapes (m,)."""
+class Port:
+    """A pair of effort and flow whose product is power, as an env publishes it.
 
-
-class PlainCoding:
-    """Actions and observations as they are; the base of the others.
-
-    In each tick of `tick_s`, in this order: `near` (the operator moves), `sent`, `far` (what arrived is decoded), the
-    env's step, `settle` (what truly happened), `sent`, `shown`. Without a reading of a port no energies are known.
+    Attributes:
+        flow: Entries of the action, in m/s (or rad/s).
+        feedthrough: Change of the effort at once per change of the flow, N s/m: a damper before the machine.
+        effort: How the command pushes the machine at the present state and with the last command, N (or N m).
     """
 
-    def __init__(self, reading: PortReading | None, tick_s: float) -> None:
-        self._reading, self._tick_s = reading, tick_s
+    def __init__(self, env: Env) -> None:
+        names = "port_flow", "port_effort_observed"
+        self.flow, self._shown = (list(env.get_wrapper_attr(name)) for name in names)
+        action, observation = env.action_space, env.observation_space
+        box = isinstance(observation, gym.spaces.Box) and len(observation.shape) == 1
+        if not box or not np.issubdtype(observation.dtype or np.int64, np.floating):
+            raise ConfigurationError(f"a port needs observations of one axis and floats, got {observation}")
+        assert action.shape is not None and observation.shape is not None
+        fits = max(self.flow) < action.shape[0] and max(self._shown) < observation.shape[0]
+        if len(self.flow) != len(self._shown) or not fits:
+            entries = f"flow {self.flow} and effort {self._shown}"
+            raise ConfigurationError(f"no port of {action} and {observation} has {entries}")
+        self.feedthrough = float(env.get_wrapper_attr("port_feedthrough"))
+        self._env = env
 
-    def reset(self, observation: Any) -> None:
-        """A new episode, whose first observation the operator knows."""
-        self._seen_s = 0.0
-        self.ledger = ChannelLedger()
-        if self._reading is not None:
-            self._reading.reset(observation)
-            self._still = np.zeros(self._reading.effort.size)
-
-    def near(self, flow: Array | None) -> Any:
-        """The operator moves with this flow, or is not there; returns what the packet up carries besides."""
-        return None
-
-    def sent(self, up: bool, sequence: int, extra: Any, lost: bool) -> None:
-        """A packet left, up or down."""
-
-    def far(self, arrived: list[Packet], newest: Up | None) -> Order:
-        """Decode what has arrived in this tick."""
-        if newest is not None:
-            self._seen_s = newest.seen_s
-        return None, self._seen_s
-
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        """After the env's step with a flow (m,): what the packet down carries, and what the machine was given.
-
-        Where the operator was not obeyed, the channel's far port was still.
-        """
-        if self._reading is None:
-            return None, None
-        acted = self._reading.acted(flow, observation)
-        return None, (acted, flow) if obeyed else (self._still, self._still)
-
-    def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        """The observation that the operator gets, with the effort felt in this tick."""
-        return observation
-
-    def account(self, moved: Array | None, shown: Any, given: Given) -> None:
-        """Add up a tick's energies: of the operator's flow (m,), None if absent, and at the machine."""
-        assert self._reading is not None
-        felt = self._reading.of(shown)
-        moved = np.zeros_like(felt) if moved is None else moved
-        self.ledger.add(felt, moved, *given, self._tick_s, self.stored_j)
+    def reset(self, observation: Array) -> None:
+        """At rest, the effort as observed."""
+        self._last_flow = np.zeros(len(self.flow))
+        self.effort = self.of(observation)
 
     @property
-    def stored_j(self) -> float:
-        """Energy on its way, J."""
-        return 0.0
+    def base(self) -> Array:
+        """The effort without flow, N."""
+        return self.effort - self.feedthrough * self._last_flow
+
+    def acted(self, flow: Array, observation: Array) -> Array:
+        """The effort during the step that was made with this flow, as the env publishes it, N."""
+        self._last_flow = flow
+        self.effort = self.of(observation)
+        return np.array(self._env.get_wrapper_attr("port_effort_acted"), dtype=np.float64)
+
+    def of(self, observation: Array) -> Array:
+        """The effort that an observation shows, N."""
+        return np.asarray(observation[self._shown], dtype=np.float64)
+
+    def replaced(self, observation: Array, effort: Array) -> Array:
+        """An observation that shows another effort."""
+        shown = np.array(observation)
+        shown[self._shown] = effort
+        return shown
 
 
-class WaveCoding(PlainCoding):
-    """Flow and effort as waves (`impedance` in N s/m), each of which pays for what it does at the other end."""
+class WaveCoding:
+    """Flow and effort as waves (`impedance` in N s/m), each of which pays for what it does at the other end.
 
-    def __init__(self, reading: PortReading, tick_s: float, impedance: float) -> None:
-        super().__init__(reading, tick_s)
-        self._port, self._impedance = reading, impedance
+    In each tick of `tick_s`, in this order: `near` (the operator moves), `sent`, `far` (what arrived is decoded), the
+    env's step, `settle` (what truly happened), `sent`, `felt`.
+    """
 
-    def reset(self, observation: Any) -> None:
-        super().reset(observation)
-        m = self._still.size
-        self._up, self._down = (WaveLine(self._tick_s, m) for _ in range(2))
-        self._back: list[tuple[int, Array]] = []
+    def __init__(self, port: Port, tick_s: float, impedance: float) -> None:
+        self._port, self._tick_s, self._impedance = port, tick_s, impedance
+
+    def reset(self) -> None:
+        """A new episode."""
+        size = len(self._port.flow)
+        self._still = np.zeros(size)
+        self._up, self._down = (WaveLine(self._tick_s, size) for _ in range(2))
+        self._back: list[Packet] = []
         self._waiting: list[tuple[int, float]] = []
         self._incoming = self._felt = self._still
-        self._owed_j = 0.0
+        self._seen_s = self._owed_j = 0.0
 
-    def near(self, flow: Array | None) -> Any:
-        incoming = self._down.deliver(self._back)  # while the operator is away, it ends there
+    def near(self, flow: Array | None) -> Array | None:
+        """The wave in the packet up, of an operator who moves with this flow; None who is not there."""
+        incoming = self._delivered(self._down, self._back)  # while the operator is away, it ends there
         self._back = []
         if flow is None:
             self._felt = self._still
@@ -122,17 +103,19 @@ class WaveCoding(PlainCoding):
         self._felt, outgoing = effort_and_outgoing(flow, incoming, self._impedance)
         return outgoing
 
-    def sent(self, up: bool, sequence: int, extra: Any, lost: bool) -> None:
+    def sent(self, up: bool, sequence: int, wave: Any, lost: bool) -> None:
+        """A packet left, up or down."""
         line = self._up if up else self._down
-        line.send(extra, sequence)
+        line.send(wave, sequence)
         if lost:
             line.lose(sequence)
 
-    def far(self, arrived: list[Packet], newest: Up | None) -> Order:
-        wave = self._up.deliver([(packet.sequence, packet.load.extra) for packet in arrived])
+    def far(self, arrived: list[Packet]) -> tuple[Array, float]:
+        """The flow that the command gets by what has arrived; when its image was taken, s."""
+        wave = self._delivered(self._up, arrived)
         # Seen as late as the wave that is put out now, or the last one.
         for packet in arrived:
-            heapq.heappush(self._waiting, (packet.sequence, packet.load.seen_s))
+            heapq.heappush(self._waiting, (packet.sequence, packet.made_s))
         if self._waiting:
             self._seen_s = heapq.heappop(self._waiting)[1]
         # What the machine took beyond what had arrived is paid first.
@@ -147,51 +130,35 @@ class WaveCoding(PlainCoding):
         decoded = (math.sqrt(2.0 * b) * wave - self._port.base) / (b + self._port.feedthrough)
         return decoded, self._seen_s
 
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        _, given = super().settle(flow, observation, obeyed)
-        assert given is not None
+    def settle(self, effort: Array, flow: Array, obeyed: bool) -> Array:
+        """The wave in the packet down, of the effort and the flow with which the channel acted on the machine."""
         if (
             not obeyed
         ):  # a still port absorbs the wave; reflected ones would pile up in the channel without bound
-            return self._still, given
-        acted, moved = given
-        _, outgoing = to_waves(acted, moved, self._impedance)
+            return self._still
+        _, outgoing = to_waves(effort, flow, self._impedance)
         # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.
-        left = self._energy(self._incoming) - port_energy(acted, moved, self._tick_s)
+        left = self._energy(self._incoming) - port_energy(effort, flow, self._tick_s)
         energy = self._energy(outgoing)
         if left < 0.0:
             self._owed_j -= left
             outgoing = np.zeros_like(outgoing)
         elif energy > left:
             outgoing = outgoing * (math.sqrt(left / energy) * (1.0 - 1e-15))
-        return outgoing, given
+        return outgoing
 
-    def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        self._back += [(packet.sequence, packet.load.extra) for packet in arrived]
-        return self._port.replaced(observation, self._felt)
+    def felt(self, arrived: list[Packet]) -> Array:
+        """The effort that the operator feels in this tick, in which these packets arrive."""
+        self._back += arrived
+        return self._felt
 
     @property
     def stored_j(self) -> float:
-        # Of waves that have arrived and were not put out yet, too.
+        """Energy on its way, of waves that have arrived and were not put out yet too, J."""
         return sum(line.in_flight_j + line.reserve_j for line in (self._up, self._down))
+
+    def _delivered(self, line: WaveLine, arrived: list[Packet]) -> Array:
+        return line.deliver([(packet.sequence, packet.wave) for packet in arrived])  # type: ignore[misc]
 
     def _energy(self, wave: Array) -> float:
         return 0.5 * port_energy(wave, wave, self._tick_s)
-
-
-def coding_from(
-    env: Env, port: Port | None, tick_s: float, coding: Coding, impedance: float | None
-) -> PlainCoding:
-    """The coding that a channel's arguments ask for; an error if they do not go together or a port is missing."""
-    reading = None if port is None else PortReading(env, port)
-    if coding == "plain":
-        if impedance is not None:
-            raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
-        return PlainCoding(reading, tick_s)
-    if reading is None:
-        published = "port_flow, port_effort_observed, port_feedthrough and port_effort_acted"
-        raise ConfigurationError(f'coding="wave" needs a port: {env.unwrapped!r} publishes no {published}')
-    refuse_changed_actions(env)
-    if impedance is None:
-        raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
-    return WaveCoding(reading, tick_s, positive("impedance", impedance, "N s/m"))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.teleop.passivity import (
+from safe_wrappers.control.teleop import (
     ChannelLedger,
     effort_and_outgoing,
     to_waves,

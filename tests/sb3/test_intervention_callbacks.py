@@ -13,7 +13,7 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import InterventionCallback
 from safe_wrappers.wrappers.faults import RepeatedCommands
-from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.recording import RecordInterventions
 
 
 class EveryFourthStep(gym.Wrapper):

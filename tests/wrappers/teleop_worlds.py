@@ -54,5 +54,5 @@ class Energies:
             out = float(raw.port_effort_acted @ info["executed_action"]) * raw.dt
             self.out += out
             self.through += abs(out)
-        self.worst = max(self.worst, self.out + self.env._coding.stored_j - self.into)
+        self.worst = max(self.worst, self.out + self.env.stored_j - self.into)
         return observation, reward, terminated, truncated, info

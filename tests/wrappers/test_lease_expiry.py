@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.wrappers.stopping_budget import BoundBudget
+from safe_wrappers.wrappers.stopping import BoundBudget
 
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action is not finite")
 FULL = np.array([1.0, 0.0])

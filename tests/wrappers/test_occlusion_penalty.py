@@ -438,7 +438,7 @@ def test_what_is_seen_is_put_where_the_reckoned_pose_has_it():
     ego, raw = env.ego_motion, env.unwrapped
     mujoco.mj_kinematics(raw.model, raw.data)  # poses lag a substep behind after a step
     truth = raw.data.body("robot")
-    turned = Rotation.from_matrix(ego.rotation) * Rotation.from_matrix(truth.xmat.reshape(3, 3)).inv()
+    turned = ego.orientation * Rotation.from_matrix(truth.xmat.reshape(3, 3)).inv()
     assert turned.magnitude() > 0.01 and off(env) > 0.01
     for name in ("thing", "thing2"):
         apparent = ego.position + turned.apply(raw.data.body(name).xpos - truth.xpos)

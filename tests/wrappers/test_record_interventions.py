@@ -10,7 +10,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.wrappers.record_interventions import (
+from safe_wrappers.wrappers.recording import (
     COLUMNS,
     RecordInterventions,
     read_episodes,

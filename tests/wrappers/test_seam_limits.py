@@ -11,7 +11,7 @@ from scipy.interpolate import BPoly, CubicHermiteSpline
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.wrappers.chunk_queue import Upsampling
+from safe_wrappers.wrappers.chunk_handover import upsampled
 
 pytestmark = pytest.mark.filterwarnings("ignore:a command was held back:UserWarning")
 
@@ -219,7 +219,7 @@ def test_bad_limits_are_refused(limits, says):
 @pytest.mark.parametrize(("entries", "steps"), [(2, 3), (5, 4), (9, 33)])
 def test_commands_between_entries_are_the_spline_through_them(entries, steps):
     chunk = np.random.default_rng(0).normal(size=(entries, 3))
-    commands = Upsampling(entries, steps).commands(chunk)
+    commands = upsampled(chunk, steps)
     times = np.arange(entries) * steps
     spline = CubicHermiteSpline(times, chunk, np.gradient(chunk, steps, axis=0))
     assert commands == pytest.approx(spline(np.arange(times[-1] + 1)), abs=1e-12)

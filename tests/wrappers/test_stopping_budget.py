@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.wrappers.admission import Admission
-from safe_wrappers.wrappers.stopping_budget import BoundBudget
+from safe_wrappers.wrappers.lease_expiry import Admission
+from safe_wrappers.wrappers.stopping import BoundBudget
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
@@ -251,10 +251,8 @@ def measured(room, own, reserves):
     clearance = sw.constraints.Clearance([wall], braking=1.0, position=[0], velocity=[1], **own)
     cart.reset()
     # So fast a cart could be that no command is let through unseen.
-    bound = BoundBudget(sw.StoppingBudget(clearance, BRAKING, acceleration=1e3, **reserves), cart)
     plant.bind(cart)
-    bound.bind(bound.plant_of(plant))
-    bound.reset()
+    bound = BoundBudget(sw.StoppingBudget(clearance, BRAKING, acceleration=1e3, **reserves), cart, plant)
     bound.measure()
     return bound
 

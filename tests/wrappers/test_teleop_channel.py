@@ -148,7 +148,7 @@ def test_the_spec_rebuilds_it_with_all_that_it_holds():
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     actions = some_actions(env, 100)
     assert np.array_equal(rollout(env, actions)[0], rollout(again, actions)[0])
-    assert again.uplink == env.uplink and again.port == env.port
+    assert again.uplink == env.uplink
 
 
 # Wrong use ------------------------------------------------------------------------------------------------------
@@ -213,12 +213,12 @@ def traffic(made, ticks=400):
     """(sent tick, arrived tick or None) by sequence, and the order of arrival."""
     sent, came, order = {}, {}, []
     for k in range(ticks):
-        sequence, lost = made.send(k, k * TICK)
+        sequence, lost = made.send(k, 0.0, None, k * TICK)
         sent[sequence] = k
         if lost:
             came[sequence] = None
         for packet in made.receive(k * TICK):
-            assert packet.load == sent[packet.sequence] and packet.sequence not in came
+            assert packet.content == sent[packet.sequence] and packet.sequence not in came
             came[packet.sequence] = k
             order.append(packet.sequence)
     return sent, came, order

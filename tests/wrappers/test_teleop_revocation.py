@@ -8,6 +8,7 @@ from teleop_worlds import MARGIN, Energies, ceiling, channel, place
 import safe_wrappers as sw
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
 from safe_wrappers.envs.teleop_operator import TeleopOperator
+from safe_wrappers.wrappers.stopping import bound_plant
 from safe_wrappers.wrappers.teleop import RoundTripWatch
 
 NETWORKS = {
@@ -197,11 +198,7 @@ HOLD = 0.001
 
 
 def watch(env, wanted):
-    made = RoundTripWatch(env, wanted, HOLD)
-    plant = made.budget.plant_of(None)
-    if plant is not None:
-        plant.bind(env)
-    made.budget.bind(plant)
+    made = RoundTripWatch(wanted, env, bound_plant(env, None, "hold", wanted.budget.clearance), HOLD)
     made.reset()
     return made
 
@@ -229,15 +226,15 @@ def test_far_away_any_command_may_be_executed_and_close_by_only_one_that_can_be_
     looking = watch(env, ceiling())
     place(env)
     looking.look()
-    assert looking.budget.can_stop_after(np.array([0.0, 1.0]), HOLD)
+    assert looking.can_stop_after(np.array([0.0, 1.0]), HOLD)
     place(env, (0.0, ROOM - 0.001 - 0.00002))  # 20 micrometres before its margin
     looking.look()
-    assert not looking.budget.can_stop_after(np.array([0.0, 1.0]), HOLD)
+    assert not looking.can_stop_after(np.array([0.0, 1.0]), HOLD)
     for away in (0.0, -0.2, -1.0):
-        assert looking.budget.can_stop_after(np.array([0.5, away]), HOLD)
+        assert looking.can_stop_after(np.array([0.5, away]), HOLD)
     place(env, (0.0, ROOM - 0.02), (0.0, 1.0))  # it needs 0.0208 + 0.001 m to stop
     looking.look()
-    assert not looking.budget.can_stop_after(np.array([0.0, 0.0]), HOLD)
+    assert not looking.can_stop_after(np.array([0.0, 0.0]), HOLD)
 
 
 def test_the_delay_of_the_brake_is_counted(env):
@@ -245,7 +242,7 @@ def test_the_delay_of_the_brake_is_counted(env):
     for act_s, possible in ((0.0, True), (0.02, False)):
         looking = watch(env, ceiling(act_s=act_s))
         looking.look()
-        assert looking.budget.can_stop_after(np.array([0.0, 0.0]), HOLD) == possible
+        assert looking.can_stop_after(np.array([0.0, 0.0]), HOLD) == possible
 
 
 @pytest.mark.parametrize("answer", [(np.nan, 0.1), (0.1, np.inf), (-np.inf, 0.0)])
@@ -256,4 +253,4 @@ def test_what_cannot_be_read_has_no_ceiling(env, answer):
     env.reset(seed=0)
     looking.look()
     assert not looking.readable and looking.ceiling_s == -1.0
-    assert not looking.budget.can_stop_after(np.zeros(2), HOLD)
+    assert not looking.can_stop_after(np.zeros(2), HOLD)

@@ -5,11 +5,10 @@ import pytest
 from teleop_worlds import Energies, ceiling, channel, clamp, place
 
 import safe_wrappers as sw
-from safe_wrappers.control.teleop.wave_line import WaveLine
+from safe_wrappers.control.teleop import WaveLine
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 from safe_wrappers.wrappers import teleop_coding as codings
-from safe_wrappers.wrappers.teleop import Packet
-from safe_wrappers.wrappers.teleop_coding import Up, WaveCoding
+from safe_wrappers.wrappers.teleop_coding import Packet, WaveCoding
 
 B = 40.0
 NETWORKS = {
@@ -49,7 +48,7 @@ def test_waves_never_give_out_more_than_went_in_less_what_is_in_flight(network):
     assert energies.through > 0.1
     assert energies.worst <= 1e-12 * energies.through + info["teleop/created_j"] + 1e-12
     assert info["teleop/created_j"] < 1e-3 * energies.through
-    assert env._coding.ledger.net_j == pytest.approx(energies.into - energies.out, abs=1e-9)
+    assert env.ledger.net_j == pytest.approx(energies.into - energies.out, abs=1e-9)
 
 
 def test_an_operator_in_contact_gets_not_one_picojoule(seed=0):
@@ -158,7 +157,7 @@ def test_while_authority_is_revoked_the_operator_feels_a_damper_and_nothing_pile
     for _ in range(400):
         observation, *_, info = env.step(push)
         seen.append((info["teleop/revoked"], observation[5]))
-        flying.append(env._coding.stored_j)
+        flying.append(env.stored_j)
     revoked, forces = (np.array(column) for column in zip(*seen, strict=True))
     # Never more than the impedance's own damping, at the largest while nothing comes back.
     assert revoked.sum() > 100 and forces.max() == pytest.approx(B * 0.8, rel=1e-6)
@@ -168,18 +167,9 @@ def test_while_authority_is_revoked_the_operator_feels_a_damper_and_nothing_pile
 
 
 class Machine:
-    """A port whose effort is what a test says."""
+    """A port that says that it resists with nothing."""
 
-    feedthrough = 0.0
-
-    def reset(self, observation):
-        self.effort = self.base = np.zeros(1)
-
-    def acted(self, flow, observation):
-        return self.true
-
-    def replaced(self, observation, effort):
-        return effort
+    feedthrough, flow, base = 0.0, [0], np.zeros(1)
 
 
 def test_waves_in_a_queue_are_as_old_as_they_are():
@@ -193,17 +183,17 @@ def test_waves_in_a_queue_are_as_old_as_they_are():
 
 
 def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
-    machine, tick = Machine(), 0.001
-    waves = WaveCoding(machine, tick, 2.0)
-    waves.reset(np.zeros(1))
+    tick = 0.001
+    waves = WaveCoding(Machine(), tick, 2.0)
+    waves.reset()
     flows, out = [], 0.0
     for sequence in range(14):
         wave = waves.near(np.array([0.5]))  # sqrt(2 b) v = 1 sqrt(W): half a watt
         waves.sent(True, sequence, wave, False)
-        flow, _ = waves.far([Packet(sequence, Up(None, 0.0, wave))], Up(None, 0.0, wave))
+        flow, _ = waves.far([Packet(sequence, None, 0.0, wave)])
         # At first it resists with 5 N although it said 0; then as it says.
-        machine.true = np.array([5.0 if sequence == 0 else 0.0])
-        back, taken = waves.settle(flow, None, True)
+        taken = np.array([5.0 if sequence == 0 else 0.0]), flow
+        back = waves.settle(*taken, True)
         waves.sent(False, sequence, back, False)
         out += float(taken[0] @ taken[1] + 0.5 * back @ back) * tick
         flows.append(float(flow[0]))

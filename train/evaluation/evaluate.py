@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import gymnasium as gym
 
 from safe_wrappers import info as keys
-from safe_wrappers.wrappers.record_interventions import COLUMNS
+from safe_wrappers.wrappers.recording import COLUMNS
 
 from ..config import ArmConfig, EvaluationConfig, ExperimentConfig, FilterConfig
 from ..files import only_writer, read_json, read_rows, write_json, write_rows

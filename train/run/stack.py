@@ -19,14 +19,12 @@ from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.plants import MujocoPlant, default_plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.cost_function import CostFunction, refuse_own_cost
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation
+from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation, StuckEscape
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
-from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
+from safe_wrappers.wrappers.occlusion import OcclusionPenalty
 from safe_wrappers.wrappers.protect import protect
-from safe_wrappers.wrappers.record_interventions import RecordInterventions
-from safe_wrappers.wrappers.stuck_escape import StuckEscape
+from safe_wrappers.wrappers.recording import CostFunction, RecordInterventions, refuse_own_cost
 
 from ..config import NAIVE, ArmConfig, EnvConfig, FilterConfig, LearnerConfig, check_env_id
 from ..config.types import check_name

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
-from safe_wrappers.wrappers.record_interventions import COLUMNS
+from safe_wrappers.wrappers.recording import COLUMNS
 
 from ..config import ArmConfig
 from ..files import append_row, only_writer, read_rows, write_json, write_rows

@@ -1,1 +1,0 @@
-"""Passivity over a network: energy ledgers, wave variables, passivity controller."""

@@ -1,0 +1,251 @@
+"""A cost for a task that has none, and what filter and task did, per episode: CostFunction, RecordInterventions."""
+
+import csv
+import io
+import math
+import os
+import pkgutil
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from safe_wrappers import info as keys
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step
+
+COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
+"""The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""
+_OF_FIGURES: Final = tuple(dict.fromkeys(name for figure in keys.EPISODE for name in figure.of))
+
+
+Judge = Callable[[Any], float]
+"""Takes the unwrapped env, returns the cost of the step that it has just made."""
+
+
+class CostFunction(LayerWrapper):
+    """Writes ``info["cost"]`` for a task that does not judge itself; changes nothing else.
+
+    After every step, and after a reset, `fn` judges the env's state, not what happened within the control step; any
+    number above 0 is a violation. Put it next to the task.
+
+    Args:
+        env: Whose task reports no cost.
+        fn: Takes `env.unwrapped`, which it must not change, returns a finite number (or a bool); or its name,
+            "module:function". One that cannot be imported makes `env.spec.to_json()` fail.
+
+    Info, at every step and after a reset: ``cost`` (float).
+
+    Raises:
+        ConfigurationError: `fn` is no function, cannot be imported, or returned something else than a finite number;
+            the env has a cost of its own; or a wrong order.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> def too_fast(env):
+        ...     return abs(env.data.qvel[0]) > 0.5
+        >>> env = sw.CostFunction(gym.make("HalfCheetah-v5"), too_fast)
+        >>> _ = env.reset(seed=0)
+        >>> costs = [env.step(env.action_space.high)[4]["cost"] for _ in range(20)]
+        >>> sorted(set(costs))
+        [0.0, 1.0]
+    """
+
+    layer: ClassVar = Layer.COST
+
+    def __init__(self, env: Env, fn: Judge | str) -> None:
+        LayerWrapper.__init__(self, env)
+        function: Any = fn
+        if isinstance(fn, str):
+            try:
+                # Without a colon a name could also be a module's, which is no function.
+                function = pkgutil.resolve_name(fn) if ":" in fn else None
+            except (ImportError, AttributeError, ValueError) as error:
+                raise ConfigurationError(
+                    f"fn: {fn!r} ('module:function') cannot be imported: {error}"
+                ) from None
+        if not callable(function):
+            raise ConfigurationError(f"fn is a function of the env or its name 'module:function'; got {fn!r}")
+        self._record({"fn": _reference(function)})
+        self.fn: Judge = function
+
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        self._judge(info)
+        return observation
+
+    def step(self, action: Any) -> Step:
+        """Steps the env and judges where it is now."""
+        observation, reward, terminated, truncated, info = self._pass_on(action)
+        self._judge(info)
+        return observation, reward, terminated, truncated, info
+
+    def _judge(self, info: dict[str, Any]) -> None:
+        refuse_own_cost(self.unwrapped, info)
+        given = self.fn(self.unwrapped)
+        cost = np.asarray(given)
+        if cost.shape != () or cost.dtype.kind not in "biuf" or not np.isfinite(cost):
+            name = getattr(self.fn, "__name__", repr(self.fn))
+            raise ConfigurationError(f"the cost function {name} must return one finite number, got {given!r}")
+        info[keys.COST] = float(cost)
+
+
+def refuse_own_cost(task: Any, info: dict[str, Any]) -> None:
+    """A task that judges itself needs no other judge, and two would contradict each other."""
+    for key in (keys.COST, keys.COST_SUBSTEP):
+        if key in info:
+            raise ConfigurationError(f"{task} reports a cost of its own (info[{key!r}]); use one of them")
+
+
+def _reference(function: Any) -> Any:
+    """The name by which another process can import the function; the function itself where there is none."""
+    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
+    if module in (None, "__main__") or name is None:
+        return function
+    reference = f"{module}:{name}"
+    try:
+        return reference if pkgutil.resolve_name(reference) is function else function
+    except (ImportError, AttributeError, ValueError):
+        return function
+
+
+class RecordInterventions(LayerWrapper):
+    """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
+
+    Put it outside the layers that it counts, and inside `ChunkHandover` and SB3's `Monitor`. At an episode's last
+    step `info` gains `info["interventions"]`, a dict: `length`, `return` (of the task: penalties that a wrapper
+    inside has taken off are added back), and the figures of `safe_wrappers.info.EPISODE`. What nobody reported is not
+    zero: it is missing in the summary, and an empty cell in the file. The same holds for a 0 that was not reported at
+    every step; a count above 0 is a lower bound.
+
+    Args:
+        env: The env to record.
+        path: A CSV file, one for each env, that gains one row per finished episode; an existing one is continued.
+
+    Raises:
+        ConfigurationError: `path` is a folder, or a file with other columns; or a `ChunkHandover` inside.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=3))
+        >>> _ = env.reset(seed=0)
+        >>> for _ in range(3):
+        ...     _, _, _, _, info = env.step(env.action_space.low)
+        >>> print(list(info["interventions"]))  # no filter, and a task without a cost
+        ['length', 'return']
+    """
+
+    layer: ClassVar = Layer.RECORDER
+
+    def __init__(self, env: Env, path: str | os.PathLike[str] | None = None) -> None:
+        LayerWrapper.__init__(self, env)
+        text = None if path is None else os.fspath(path)
+        if text is not None:
+            _continue_file(Path(text))
+        self._record({"path": text})
+        self.path = text
+
+    @property
+    def filter_time_us(self) -> float | None:
+        """Mean time of one filter call, microseconds; None with no filter inside or before its first call."""
+        if not self.env.has_wrapper_attr("filter_seconds"):
+            return None
+        calls = int(self.env.get_wrapper_attr("filter_calls"))
+        return 1e6 * float(self.env.get_wrapper_attr("filter_seconds")) / calls if calls else None
+
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        self._return = 0.0
+        self._at_reset = _told(info)
+        self._steps: list[dict[str, Any]] = []
+        return observation
+
+    def step(self, action: Any) -> Step:
+        """Step the env; its info gains the summary at the episode's end."""
+        observation, reward, terminated, truncated, info = self._pass_on(action)
+        penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
+        self._return += float(reward) + float(penalties)
+        self._steps.append(_told(info))
+        if terminated or truncated:
+            figures = {one.name: _figure(one, self._at_reset, self._steps) for one in keys.EPISODE}
+            summary = {"length": len(self._steps), "return": self._return}
+            summary |= {name: value for name, value in figures.items() if value is not None}
+            info[keys.EPISODE_SUMMARY] = summary
+            if self.path is not None:
+                _append_row(Path(self.path), summary)
+        return observation, reward, terminated, truncated, info
+
+
+def _told(info: dict[str, Any]) -> dict[str, Any]:
+    """What a step has said of the figures, copied: an env may use its arrays again."""
+    return {name: np.array(info[name]) for name in _OF_FIGURES if name in info}
+
+
+def _figure(
+    figure: keys.EpisodeFigure, at_reset: dict[str, Any], steps: list[dict[str, Any]]
+) -> int | float | None:
+    """A figure of an episode; None if nobody reported it, or for a 0 that is not of every step. NaN is no report."""
+    how, of = figure.how, [keys.KEYS[name] for name in figure.of]
+    numbers: list[Any] = []
+    if how == "onsets":  # of entries that are True at the reset none is counted
+        flags = [step[name] for step in (at_reset, *steps) for name in figure.of if name in step]
+        first = [] if figure.of[0] in at_reset else [0] * len(flags[:1])
+        numbers = first + [int((now & ~before).sum()) for before, now in pairwise(flags)]
+    else:
+        for step in steps:
+            told = [n for key in of if key.name in step and (n := key.number(step[key.name])) == n]
+            if told:
+                above_zero = how == "count" and of[0].dtype != "int64"
+                numbers.append(max(told) > 0.0 if above_zero else told[0])
+    if how == "min":
+        return min(filter(math.isfinite, numbers), default=None)
+    if how == "last":
+        return int(numbers[-1]) if numbers else None
+    if how == "any":
+        return bool(max(numbers)) if numbers else None
+    if how == "p95":
+        return float(np.percentile(numbers, 95)) if len(numbers) == len(steps) else None
+    total = sum(numbers) if how in ("sum", "mean") else int(sum(numbers))
+    if not total and len(numbers) < len(steps):
+        return None
+    return total / len(steps) if how == "mean" else total
+
+
+def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:
+    """Read a CSV file of `RecordInterventions`: one dict per whole line, without the cells that are empty."""
+    rows = csv.DictReader(io.StringIO(_whole_lines(Path(path).read_bytes()).decode()))
+    return [{key: float(value) for key, value in row.items() if value != ""} for row in rows]
+
+
+def _whole_lines(data: bytes) -> bytes:
+    # A number cut short still reads as a number, so only the newline tells that a line is whole.
+    return data[: data.rfind(b"\n") + 1]
+
+
+def _continue_file(path: Path) -> None:
+    if path.is_dir():
+        raise ConfigurationError(f"RecordInterventions: {str(path)!r} is a folder; give a file name in it.")
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return
+    data = path.read_bytes()
+    whole = _whole_lines(data)
+    if len(whole) < len(data):
+        with path.open("rb+") as file:
+            file.truncate(len(whole))
+    header = whole.split(b"\n", 1)[0].decode(errors="replace").strip()
+    if header and header != ",".join(COLUMNS):
+        columns = f"has other columns ({header!r}; expected {','.join(COLUMNS)!r})"
+        raise ConfigurationError(f"RecordInterventions: {str(path)!r} {columns}. Give another path.")
+
+
+def _append_row(path: Path, row: dict[str, int | float | bool]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\n")
+    if not path.exists() or path.stat().st_size == 0:
+        writer.writeheader()
+    # Bools as 0 and 1, so that every cell reads back as a number.
+    writer.writerow({key: int(value) if isinstance(value, bool) else value for key, value in row.items()})
+    with path.open("a", newline="") as file:
+        file.write(text.getvalue())  # one write: a kill leaves at most one half line, at the end

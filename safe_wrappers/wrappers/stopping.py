@@ -1,0 +1,319 @@
+"""What a stop inside a clearance takes, and what decides between a command and the fallback."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers import info as keys
+from safe_wrappers.checks import Array, check_fields, non_negative, positive
+from safe_wrappers.constraints.clearance import Clearance
+from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.bound import Bound
+from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.filter.fallback import Fallback, FallbackFunction
+from safe_wrappers.plants import default_plant
+from safe_wrappers.plants.env_checks import check_actions, check_timing
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.serialize import constraint_from
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
+from safe_wrappers.wrappers.layer import SAME_STEP, CommandReceiver, Env, LayerWrapper, Step
+
+ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
+"""Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""
+
+_ROW_TOLERANCE = 1e-9
+"""Control units times normals: a row that is violated by less is kept."""
+
+
+@dataclass(frozen=True)
+class StoppingBudget:
+    """Clearance, bounds on the motion and reserves from which a stop is worked out; shared by lease and ceiling.
+
+    Args:
+        clearance: A `Clearance` or the dict of one; any other constraint, with `closing_speed`; or a function of the
+            env that returns clearances in m and approach speeds in m/s, shapes (k,).
+        braking: Verified lower bound on the deceleration of the fallback, m/s^2; None takes the constraint's own.
+        acceleration: Largest approach acceleration that any command may cause, the fallback's too, m/s^2; 0 for a
+            machine that cruises.
+        closing_speed: For constraints other than Clearance: the fastest that their value may fall, in its unit per
+            second, stopping distance and all, under any command.
+        top_speed: Bound on the approach speed, m/s; None: none.
+        localisation: Bound on the error of the clearance, m; the constraint's own is added.
+        margin: Clearance to be kept at rest, m; the constraint's own is added.
+        act_s: T_act, until the full deceleration is there, s.
+
+    Raises:
+        ConfigurationError: A bound that is missing, negative or does not belong to the clearance.
+    """
+
+    clearance: Constraint | dict[str, Any] | ClearanceFunction
+    braking: float | None = None
+    acceleration: float | None = None
+    closing_speed: float | None = None
+    top_speed: float | None = None
+    localisation: float = 0.0
+    margin: float = 0.0
+    act_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        given: Any = self.clearance
+        if isinstance(given, dict | Constraint):
+            object.__setattr__(self, "clearance", constraint_from(given))
+        elif isinstance(given, type) or not callable(given):
+            function = "a function of the env that returns clearances in m and approach speeds in m/s"
+            raise ConfigurationError(f"clearance is a constraint or {function}; got {given!r}")
+        check_fields(self, non_negative, ["localisation", "margin"], "m")
+        check_fields(self, non_negative, ["act_s"], "s")
+        check_fields(self, non_negative, ["acceleration"], "m/s^2")
+        check_fields(self, positive, ["braking"], "m/s^2")
+        check_fields(self, positive, ["top_speed"], "m/s")
+        check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
+        name = type(self.clearance).__name__
+        if not self.measures_approach:
+            if self.closing_speed is None:
+                raise ConfigurationError(f"{name} does not say how fast it is approached: give closing_speed")
+            if (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
+                raise ConfigurationError(f"{name} counts braking already: give closing_speed alone")
+            return
+        if self.braking is None and not isinstance(self.clearance, Clearance):
+            raise ConfigurationError("braking is missing: the least deceleration of the fallback, m/s^2")
+        if self.acceleration is None:
+            raise ConfigurationError("acceleration is missing: the largest that any command may cause, m/s^2")
+        if self.closing_speed is not None:
+            raise ConfigurationError("closing_speed is for constraints that measure no approach speed")
+
+    @property
+    def measures_approach(self) -> bool:
+        """Whether approach speeds are measured, and not only bounded by `closing_speed`."""
+        return not isinstance(self.clearance, Constraint) or isinstance(self.clearance, Clearance)
+
+
+def bound_plant(
+    env: Env, plant: Plant | None, fallback: str | FallbackFunction, clearance: Any = None
+) -> Plant | None:
+    """The plant given, else the default one where fallback or clearance need one, bound to the env."""
+    if plant is None and (callable(fallback) or fallback == "brake" or isinstance(clearance, Constraint)):
+        plant = default_plant(env)
+    if plant is not None:
+        plant.bind(env)
+    return plant
+
+
+class BoundBudget:
+    """A budget that measures an env, on a `bound_plant` if its clearance is a constraint.
+
+    Attributes:
+        clearance: At the last `measure`, m, shape (k,); values of a constraint that measures no approach.
+        speed: Approach speeds then, m/s, shape (k,).
+    """
+
+    clearance: Array
+    speed: Array
+
+    def __init__(self, budget: StoppingBudget, env: Env, plant: Plant | None) -> None:
+        self._budget, self._env = budget, env
+        given: Any = budget.clearance
+        braking, margin, localisation = budget.braking, budget.margin, budget.localisation
+        self.bound: Bound | None = None
+        if isinstance(given, Constraint):
+            assert plant is not None
+            margin, localisation = margin + given.margin, localisation + given.state_error
+            if isinstance(given, Clearance):  # whose rows are then those of this budget
+                braking = float(given.braking) if braking is None else braking
+                own: Any = {"braking": braking, "margin": margin, "state_error": localisation}
+                given = replace(given, **own)
+            self.bound = Bound(given, plant)
+            if not self.bound.measures_state:
+                name = type(given).__name__
+                raise ConfigurationError(f"{name} has no value that a lease could be worked out from")
+        self._stop: Any = {"localisation": localisation, "margin": margin, "braking": braking}
+
+    def observe(self) -> None:
+        """Take the present state; the constraint refuses what only a state can show."""
+        if self.bound is not None:
+            self.bound.plant.observe()
+            self.bound.observe({})
+
+    def measure(self) -> None:
+        """Read clearances and approach speeds of the present state."""
+        if self.bound is None:
+            self.clearance, self.speed = self._of_function()
+            return
+        self.observe()
+        if not np.isfinite(self.bound.plant.state).all():  # of which it may read only a part
+            self.clearance = self.speed = np.full(1, np.nan)
+        elif isinstance(self.bound.spec, Clearance):
+            self.clearance, self.speed = self.bound.spec.approach()
+        else:
+            value = np.asarray(self.bound.value(), dtype=np.float64)
+            self.clearance = value[value != np.inf]
+            self.speed = np.zeros(self.clearance.shape)
+
+    @property
+    def readable(self) -> bool:
+        """Whether all that was measured is finite."""
+        return bool(np.isfinite(self.clearance).all() and np.isfinite(self.speed).all())
+
+    def longest_time(self, delays_s: float = 0.0) -> float:
+        """The longest time that the worst command may go on from the measured state, s; zero or less: stop now.
+
+        NaN where the measurement is not finite; inf without obstacles near. `delays_s` are all delays but `act_s`, s.
+        """
+        if not self.readable:
+            return math.nan
+        budget, delays_s = self._budget, delays_s + self._budget.act_s
+        if budget.closing_speed is None:
+            top_speed = math.inf if budget.top_speed is None else budget.top_speed
+            bounds: Any = {"acceleration": budget.acceleration, "top_speed": top_speed, **self._stop}
+            times = longest_lease(self.clearance, self.speed, delays_s=delays_s, **bounds)
+        else:
+            left = self.clearance - self._stop["margin"] - self._stop["localisation"]
+            times = longest_lease_of_room(left, budget.closing_speed, delays_s)
+        return float(times.min(initial=np.inf))
+
+    def longest_round_trip(self, video_s: float, human_s: float) -> float:
+        """The longest round trip from which an operator can stop in time, s; inf where nothing approaches."""
+        delays_s = video_s + human_s + self._budget.act_s
+        ceilings = longest_lease(self.clearance, self.speed, delays_s=delays_s, **self._stop)
+        return float(ceilings[self.speed > 0.0].min(initial=math.inf))
+
+    def can_stop_after(self, command: Array, duration_s: float) -> bool:
+        """Whether the machine can stop by itself after a command of so many seconds.
+
+        By the declared bounds, whatever the command is, or by the rows of a `Clearance` (without `act_s`).
+        """
+        if self.longest_time() >= duration_s:
+            return True
+        by_rows = self.bound is not None and isinstance(self.bound.spec, Clearance)
+        if not (by_rows and self._budget.act_s == 0.0 and self.readable):
+            return False
+        assert self.bound is not None
+        rows = self.bound.rows()
+        return bool((rows.normals @ command <= rows.offsets + _ROW_TOLERANCE).all())
+
+    def _of_function(self) -> tuple[Array, Array]:
+        function: Any = self._budget.clearance
+        answer = function(self._env)
+        try:
+            clearance, speed = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in answer)
+            clearance, speed = np.broadcast_arrays(clearance, speed)
+        except (TypeError, ValueError):
+            wanted = "clearances in m and approach speeds in m/s, of one shape"
+            raise ConfigurationError(f"the clearance function must return {wanted}; got {answer!r}") from None
+        return clearance, speed
+
+
+class FallbackController:
+    """A fallback ("brake", "hold", "zero" or a function of the plant) on a `bound_plant`, by itself.
+
+    "brake" is the backup control of the constraint, if one is given and has one.
+    """
+
+    def __init__(
+        self, env: Env, choice: str | FallbackFunction, plant: Plant | None, bound: Bound | None = None
+    ) -> None:
+        space: Any = env.action_space
+        self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
+        self.plant, self._bound = plant, bound
+        known = bound is not None and bound.may_back_up
+        if choice == "brake" and plant is not None and not (known or plant.can_brake):
+            others = f'with a {type(plant).__name__} choose "hold", "zero" or a function of the plant'
+            raise ConfigurationError(f'"brake" needs a MujocoPlant; {others}')
+        self._fallback = Fallback(choice, [] if bound is None else [bound])
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        self._last = np.clip(np.zeros_like(self._low), self._low, self._high)
+        if self.plant is not None:
+            self.plant.executed(None)
+
+    def executed(self, control: Array) -> None:
+        """Keep what was sent, for "hold" and for the plant's delay."""
+        self._last = control
+        if self.plant is not None:
+            self.plant.executed(control)
+
+    def command(self) -> Array:
+        """The fallback's control at the present state: finite, inside the action box, shape (m,)."""
+        readable = True
+        if self.plant is not None:
+            self.plant.observe()
+            readable = bool(np.isfinite(self.plant.state).all())
+            if readable and self._bound is not None:
+                self._bound.observe({})
+        return self._fallback(self.plant, self._last, self._low, self._high, None, readable)
+
+
+class CommandGate(LayerWrapper, CommandReceiver):
+    """Base of `LeaseExpiry` and `TeleopChannel`; the env has a one-dimensional Box action space."""
+
+    _fallback: FallbackController | None = None
+    _whose: ClassVar[str]
+    """Whose actions it is given, in warnings."""
+    _not_sent: ClassVar[str]
+    """What happens instead with one that is not finite."""
+
+    def __init__(self, env: Env, control_dt: float | None) -> None:
+        LayerWrapper.__init__(self, env)
+        space = check_actions(env)
+        self.control_dt = check_timing(env, control_dt)
+        self._same_s = SAME_STEP * self.control_dt
+        self._shape, self._dtype = space.shape, space.dtype
+        self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))
+        self._filtered = filter_inside(env) is not None  # then the filter reports what was executed
+
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        self._steps_done, self._observed_s, self._clipped = 0, 0.0, 0.0
+        if self._fallback is not None:
+            self._fallback.reset()
+        if not self._filtered:
+            info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
+            info[keys.ACTION_CLIPPED] = 0.0
+        return observation
+
+    def _boxed(self, control: Any) -> Array:
+        """Clipped to the action box, shape (m,)."""
+        return np.clip(np.asarray(control, dtype=np.float64), self._low, self._high)
+
+    def _rest(self) -> NDArray[Any]:
+        """Zero, or the action in the box that is closest to it."""
+        return self._boxed(np.zeros(self._shape)).astype(self._dtype)
+
+    def _inside(self, action: NDArray[Any]) -> NDArray[Any] | None:
+        """The action itself, or clipped where no filter inside does that; None if it is not finite. It warns once."""
+        self._clipped = 0.0
+        if not np.isfinite(action).all():
+            message = f"the {self._whose} action is not finite ({action}); {self._not_sent}"
+            self._warn_once("nonfinite", message)
+            return None
+        if self._filtered:
+            return action
+        boxed = self._boxed(action)
+        self._clipped = math.hypot(*(boxed - action).ravel())  # 1e300 does not overflow in it
+        if not self._clipped:
+            return action
+        message = f"the {self._whose} action left the action space by {self._clipped:.3g}; it is clipped"
+        self._warn_once("outside", f"{message} (action/clipped)")
+        return boxed.astype(self._dtype)
+
+    def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:
+        """Step the env; returns what was executed, which a filter inside may have changed, and the env's answer."""
+        # Before the step: an env may scale the command in place.
+        executed = np.array(command, dtype=np.float64)
+        answer = self.env.step(command)
+        info = answer[4]
+        if self._filtered:
+            executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)
+        else:
+            info[keys.EXECUTED_ACTION] = executed.copy()
+            info[keys.ACTION_CLIPPED] = self._clipped
+        if self._fallback is not None:
+            self._fallback.executed(executed)
+        self._steps_done += 1
+        return executed, answer
