@@ -210,7 +210,6 @@ class Stance(Constraint, Model):
         wider = self.joint_tolerance or 0.0
         self._low, self._high = low - wider, high + wider
         self._qpos, self._dofs = self.plant.model.jnt_qposadr[joints], self.plant.model.jnt_dofadr[joints]
-        self.model = self
         self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
 
     def observe(self, memory: Memory) -> None:

@@ -109,7 +109,6 @@ class PredictiveShield(Constraint, Model):
                 "plant=SimulatorPlant(), and put other constraints' requirements into h"
             )
         super().setup(plant)
-        self.model = self
         if not self.plant.simulates_env and (self.sees == "env" or isinstance(self.h, str)):
             raise UnsupportedEnvError(
                 f"the rollouts of an {type(plant).__name__} have observations alone, and neither an env nor its "

@@ -48,6 +48,7 @@ class Bound:
         self.spec, self.plant = copy.copy(constraint), plant
         self.spec.report, self.spec.memory = {}, {}
         self.spec.setup(plant)
+        self.model = self.spec.model
         has_h = type(self.spec).h_along is not Constraint.h_along
         self.predicts = has_h and self.spec.predicts
         self.rows_decide = self.spec.rows_decide or not has_h
@@ -65,7 +66,7 @@ class Bound:
         self.memory = spec.memory = dict(memory)
         self._rows: HalfSpaces | None = None
         spec.observe(self.memory)
-        now = spec.h_along(spec.model.rollout(None))
+        now = spec.h_along(self.model.rollout(None))
         self._value = value = now[0] if len(now) == 1 else now.min(axis=0)
         self.least = least = float(value[0] if value.size == 1 else value.min(initial=np.inf))
         if not self.predicts:
@@ -101,10 +102,11 @@ class Bound:
             if self.max_decrease is not None:
                 memory["recent"] = (*memory.get("recent", ()), self.least)[-spec.horizon :]
             if spec.info_keys:
-                spec.h_along(spec.model.rollout(control, spec.horizon))
+                spec.h_along(self.model.rollout(control, spec.horizon))
             tangents = self._tangents
             if not (tangents is None or self.plant.has_acceleration or self._is_outside) and tangents.made:
                 memory["slopes"], memory["kept_until"] = tangents.slopes, self.plant.observation_id + _KEPT
+            self._tangents = None  # they refer to this object
         return memory
 
     def value(self) -> Array:
@@ -137,10 +139,10 @@ class Bound:
             spec, gate = self.spec, self.spec.look_ahead_below
             further = {"euler": True} if spec.euler_look_ahead else {}
             if gate is not None and not self._is_outside and self.least >= gate:
-                held = self._of(spec.model.rollout(control, 1, **further))
+                held = self._of(self.model.rollout(control, 1, **further))
                 known = held if bool((held >= gate).all()) else None
             if known is None:
-                known = self._of(spec.model.rollout(control, spec.horizon, **further))
+                known = self._of(self.model.rollout(control, spec.horizon, **further))
             self._known[key] = known
         return known
 
@@ -167,7 +169,7 @@ class Bound:
                 least = end = (1.0 - spec.decay) * np.maximum(now, 0.0)
             backup = self.backup()
             if backup is not None:
-                left = spec.h_along(spec.model.rollout(backup, spec.horizon)) - spec.margin
+                left = spec.h_along(self.model.rollout(backup, spec.horizon)) - spec.margin
                 floor = -np.inf if self._is_outside else 0.0
                 least, end = np.minimum(least, np.maximum(left.min(axis=0), floor)), np.minimum(end, left[-1])
             self._asked = least, end
@@ -186,12 +188,12 @@ class Bound:
 
         Left out are those of the control intervals after the last one in which a bound is violated most.
         """
-        spec, plant, needed = self.spec, self.plant, self.spec.horizon
+        plant, needed = self.plant, self.spec.horizon
         if not self._is_outside and needed > 1:
             left = self.slacks(control).reshape(needed, -1)
             needed = int(np.where(left.min(axis=0) < 0.0, left.argmin(axis=0), 0).max()) + 1
         box = plant.lower, plant.upper
-        return differences(lambda u: self._of(spec.model.sketch(u, needed)), control, *box)
+        return differences(lambda u: self._of(self.model.sketch(u, needed)), control, *box)
 
     def slack(self, control: Array) -> float:
         """The least of what a control leaves; >= 0: kept. Minus infinity where a number is lost."""
@@ -223,7 +225,7 @@ class Bound:
         spec = self.spec
         if not (self.predicts and spec.recovery_s and 0.0 <= self.least < spec.margin):
             return False
-        left = spec.h_along(spec.model.rollout(control, spec.horizon)).min(axis=0)
+        left = spec.h_along(self.model.rollout(control, spec.horizon)).min(axis=0)
         return bool((left >= np.maximum(np.minimum(self._value, spec.margin) - spec.at_rest, 0.0)).all())
 
     def rows(self) -> HalfSpaces:
@@ -235,7 +237,7 @@ class Bound:
         if self._rows is None:
             rows = self.spec.rows()
             if rows is None and self.predicts and not (self.plant.has_acceleration or self._far):
-                braking = getattr(self.spec.model, "braking", None)
+                braking = getattr(self.model, "braking", None)
                 rows = None if braking is None else self._about(braking())
             self._rows = HalfSpaces.none(self.plant.lower.size) if rows is None else rows
         return self._rows

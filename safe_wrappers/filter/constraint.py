@@ -8,7 +8,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.plant import Model, Plant
 
 Promise = Literal["proved", "best effort"]
 Memory = dict[str, Any]
@@ -93,7 +93,6 @@ class Constraint:
     """Whether those are looked at by Euler steps."""
 
     plant: Any
-    model: Any
     memory: Memory
     report: dict[str, Any]
 
@@ -104,7 +103,17 @@ class Constraint:
             UnsupportedEnvError: The plant does not have what the constraint needs.
             ConfigurationError: Names or numbers that do not fit the plant.
         """
-        self.plant = self.model = plant
+        self.plant = plant
+
+    @property
+    def model(self) -> Any:
+        """What predicts: what was set, else the constraint itself if it is a `Model`, else the plant."""
+        own: Any = self
+        return vars(self).get("_model", own if isinstance(self, Model) else self.plant)
+
+    @model.setter
+    def model(self, model: Any) -> None:
+        self._model = model
 
     def observe(self, memory: Memory) -> None:
         """Take the plant's present state; `memory["control"]` is what was executed before, if anything was.

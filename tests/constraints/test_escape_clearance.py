@@ -149,7 +149,7 @@ def test_discs_that_move_go_straight_on_and_standing_ones_stay():
         env=Published(gym.make("OccludedCrossing-v0")),
     )
     anew(raw, plant, clearance, np.array([0, -0.7, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
-    forward, aside = clearance.slack([0, 1, 0]), clearance.slack([1, 0, 0])
+    forward, aside = (clearance.slack(np.array(u, float)) for u in ([0, 1, 0], [1, 0, 0]))
     assert forward < aside  # it does not stand still: away to the side is the way
     with pytest.raises(ConfigurationError, match="3-dimensional obstacles cannot meet a 2-dimensional point"):
         met(sw.constraints.Discs("balls", 0.3))  # a ball that stands somewhere in the air

@@ -39,14 +39,14 @@ def filtered(layout=None, velocity=(0.0, 0.0, 0.0), **options):
 def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
     env = filtered({"agent": [-0.3, 0.0, 0.0]}, uncertainty=0.25)
     (limit,), raw = env.filter.bound, env.unwrapped
-    every, push = limit.models, np.array([0.05, 0.0])
+    every, push = limit.spec.models, np.array([0.05, 0.0])
     assert len(every) == 1 + 4  # the body, and its corners
 
     def refused(x, models):
         qpos, qvel = raw.data.qpos.copy(), raw.data.qvel.copy()
         qpos[0], qvel[0] = x, 0.9
         raw.set_state(qpos, qvel)
-        limit.models = models
+        limit.spec.models = models
         env.filter.observe()
         return not limit.admits(push)
 
@@ -121,7 +121,7 @@ def start(env, hazards, qpos, qvel):
 def drive():
     env = filtered_boundary()
     env.reset(seed=0)
-    return env.filter.bound[0].drive
+    return env.filter.bound[0].spec.drive
 
 
 def driven(drive, pairs):
@@ -181,7 +181,7 @@ def test_from_the_boundary_on_there_is_always_an_admissible_control(margin, driv
 def test_a_state_with_clearance_left_stops_clear_of_every_disc_in_mujoco(pairs, direction, clearance):
     env = filtered_boundary(margin=0.004)
     env.reset(seed=0)
-    drive = env.filter.bound[0].drive
+    drive = env.filter.bound[0].spec.drive
     motion = driven(drive, pairs)
     start(env, [touching(drive, motion, direction, clearance)], motion[:3], motion[3:])
     env.filter.observe()

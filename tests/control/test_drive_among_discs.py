@@ -1,4 +1,4 @@
-"""A heading drive among discs: from inside of one the backup leads out, and many robots are judged as each alone."""
+"""A heading drive among discs: from inside of one the backup leads out, and random scenes have an answer."""
 
 import hashlib
 
@@ -42,28 +42,26 @@ def random_scenes(count):
         [sw.constraints.HeadingDriveClearance([sw.constraints.Disc([0.0, 0.0], 0.2)], uncertainty=0.1)],
     )
     env.reset(seed=0)
-    drive = env.filter.bound[0].drive
+    drive = env.filter.bound[0].spec.drive
     rng, models = np.random.default_rng(3), np.array([drive, *drive.corners()], dtype=np.float64)
     motions = rng.uniform(-1.0, 1.0, (count, 6)) * [0.1, 0.1, 3.0, 1.0, 1.0, 2.0]
     discs = np.dstack([rng.uniform(-0.9, 0.9, (count, 6, 2)), np.full((count, 6), 0.1)])
     controls = rng.uniform(-1.0, 1.0, (count, 2))
-    least, admitted, digest = np.empty(count), np.empty(count, dtype=bool), hashlib.sha256()
-    scenes = np.stack([models] * count), motions, discs.reshape(-1, 3), 6 * np.arange(count + 1), RESERVE_M
-    among.admit_each(*scenes, controls, least, admitted)
+    admitted, digest = np.empty(count, dtype=bool), hashlib.sha256()
     for i in range(count):
         scene = models, motions[i], discs[i], RESERVE_M
-        assert admitted[i] == among.is_admitted(scene, *controls[i])
+        admitted[i] = among.is_admitted(scene, *controls[i])
         joints = motions[i, :3], motions[i, 3:], np.zeros(4)
-        assert least[i] == among.least_clearance(*joints, (models, np.empty(6), discs[i], RESERVE_M))[0]
+        least = among.least_clearance(*joints, (models, np.empty(6), discs[i], RESERVE_M))[0]
         found = (
             *among.secants(scene),
             among.way_around(scene, *controls[i], 0.0),
             among.manoeuvre_drive(scene),
         )
-        for part in (least[i], admitted[i], *found):
+        for part in (least, admitted[i], *found):
             digest.update(np.asarray(part, dtype=np.float64).tobytes())
     return digest.hexdigest(), int(admitted.sum())
 
 
-def test_many_are_judged_as_each_alone():
+def test_some_controls_of_random_scenes_are_admitted_and_some_are_not():
     assert 40 < random_scenes(400)[1] < 360

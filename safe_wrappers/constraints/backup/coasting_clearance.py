@@ -96,7 +96,6 @@ class CoastingClearance(DetourClearance):
     def setup(self, plant: Plant) -> None:
         hint = "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
         super().setup(require_mujoco(plant, hint))
-        self.model = self
         name = self.robot_model_attr
         alone = None if name is None else plant.attribute(name)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
@@ -196,13 +195,14 @@ class CoastingClearance(DetourClearance):
         return [high, low, *(np.where(one, end, 0.0) for one in np.eye(low.size) for end in (low, high))]
 
     def h_along(self, path: Trajectory) -> Array:
-        """The least clearance on the way (from inside an obstacle at its end) where a control is admitted, m."""
+        """The least clearance on the way, from inside an obstacle that at its end, m; infinite where none is near."""
         if path.control is None:
             return self.clearance()[None]
-        if self.leaves_clear(path.control):
-            return np.array([[math.inf]])
-        after = self._after(path.control)
-        return np.array([[min(after.end if self._least < 0.0 else after.least, self.margin - _SAME_M)]])
+        admitted, least = self.leaves_clear(path.control), math.inf
+        if self._origin.near or self._whole.near:
+            after = self._after(path.control)
+            least = after.end if self._least < 0.0 else after.least
+        return np.array([[max(least, self.margin) if admitted else min(least, self.margin - _SAME_M)]])
 
     def proposals(self, control: Array | None) -> list[Array]:
         """What to try for a refused control: ways around, less of the same, none. The backup is no control at all."""

@@ -67,10 +67,14 @@ class HeadingDriveClearance(DetourClearance):
         self._discs = np.zeros((0, 3))
         self.turns_first = self.frame.turn_index == 0
         super().setup(machine)
-        self.model = self
         # The drive, and the bodies at the corners of its uncertainty: each must keep what is needed.
         self.drive = heading_drive(self.plant, self.body, self.uncertainty)
         self.models = np.array([self.drive, *self.drive.corners()], dtype=np.float64)
+        scene = self.models, np.zeros(6), np.ones((1, 3)), self.reserve
+        among.is_admitted(scene, 0.0, 0.0)  # compiled here, and not in a step
+        among.secants(scene)
+        among.way_around(scene, 0.0, 0.0, 0.0)
+        among.manoeuvre_drive(scene)
 
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""

@@ -72,7 +72,6 @@ class WallClearance(BackupClearance):
     def setup(self, plant: Plant) -> None:
         hint = "on an AnalyticPlant use Clearance([Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
         super().setup(require_mujoco(plant, f"WallClearance needs a MujocoPlant; {hint}"))
-        self.model = self
         clip = self.velocity_clip
         self._point = point = planar_point(self.plant, math.inf if clip is None else clip)
         around, reach = walls(self.plant.model, point.body)
@@ -169,7 +168,6 @@ class EscapeClearance(Constraint, Model):
             if isinstance(obstacle, TrackedDiscs):
                 obstacle.tracks(machine)
         super().setup(machine)
-        self.model = self
         self._point = point = planar_point(self.plant, np.inf, self.body)
         # What one hold makes of a state; x and y.
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T

@@ -10,7 +10,6 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import (
@@ -393,32 +392,3 @@ def is_admitted(scene: Scene, drive: float, turn: float) -> bool:
 def manoeuvre_drive(scene: Scene) -> float:
     """The drive control of the backup manoeuvre."""
     return backup_drive(look(scene))
-
-
-@compiled
-def admit_each(
-    models: Array,
-    motions: Array,
-    discs: Array,
-    first: NDArray[np.int64],
-    reserve: float,
-    proposals: Array,
-    values: Array,
-    admitted: NDArray[np.bool_],
-) -> None:
-    """Judges n robots.
-
-    Args:
-        models: As for one, of each, shape (n, 1 + c, 14).
-        motions: Likewise, shape (n, 6).
-        discs: All robots' discs, one after the other, shape (d, 3).
-        first: Where each robot's discs begin, and the end, shape (n + 1,).
-        reserve: The margin, m.
-        proposals: (drive, turn), shape (n, 2).
-        values: Written: as of `least_clearance`, m, shape (n,).
-        admitted: Written: whether its proposal is admitted, shape (n,).
-    """
-    for i in range(len(motions)):
-        at = look((models[i], motions[i], discs[first[i] : first[i + 1]], reserve))
-        values[i] = at.value
-        admitted[i] = admits(at, proposals[i, 0], proposals[i, 1])

@@ -182,7 +182,6 @@ class MujocoPlant(Plant):
         self._affine: tuple[Array, Array] | None = None
         self._forecasts: dict[tuple[bytes, bool], MujocoTrajectory] = {}
         self._contact_forecasts: dict[bytes, ContactForecast] = {}
-        self._present: _Present | None = None
 
     def observe(self) -> None:
         """Take the env's present state; everything else is computed on demand."""
@@ -347,7 +346,7 @@ class MujocoPlant(Plant):
         the best one. A trajectory is kept until the next observation, so that constraints share it.
         """
         if control is None:
-            return self._now()
+            return _Present(self)  # not kept: it refers to the plant
         key = control.tobytes()
         known = self._forecasts.get((key, euler))
         if known is None or known.holds < horizon:
@@ -360,12 +359,6 @@ class MujocoPlant(Plant):
             known = self._recorder.record(control, horizon, first, euler)
             self._forecasts[key, euler] = known
         return known.first(horizon)
-
-    def _now(self) -> "_Present":
-        """The present state alone."""
-        if self._present is None:
-            self._present = _Present(self)
-        return self._present
 
     def sketch(self, control: Array, horizon: int = 1) -> MujocoTrajectory:
         """A trajectory by Euler steps alone, of little price where the model's are Runge-Kutta's; not kept."""
