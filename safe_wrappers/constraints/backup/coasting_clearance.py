@@ -204,6 +204,11 @@ class CoastingClearance(DetourClearance):
             least = after.end if self._least < 0.0 else after.least
         return np.array([[max(least, self.margin) if admitted else min(least, self.margin - _SAME_M)]])
 
+    def points(self, path: Trajectory) -> Array:
+        """The way of the origin until rest without control, m, shape (instants, 1, 2)."""
+        course = self.coasting.run(self._still, self.horizon, self._radius)
+        return np.concatenate([self._here[None], course.places])[:, None]
+
     def proposals(self, control: Array | None) -> list[Array]:
         """What to try for a refused control: ways around, less of the same, none. The backup is no control at all."""
         if control is None:

@@ -10,12 +10,13 @@ from safe_wrappers.checks import Array, check_fields, non_negative
 from safe_wrappers.constraints.backup.base import DetourClearance
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup import drive_among_discs as among
+from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
 from safe_wrappers.control.numerics.shapes import nearest_discs
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
 from safe_wrappers.plants.mujoco.plant import require_mujoco
-from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.plant import Plant, Trajectory
 
 
 @dataclass
@@ -118,6 +119,10 @@ class HeadingDriveClearance(DetourClearance):
 
     def _half_spaces(self, normals: Array, offsets: Array) -> HalfSpaces:
         return HalfSpaces(normals[:, ::-1].copy() if self.turns_first else normals, offsets)
+
+    def points(self, path: Trajectory) -> Array:
+        """Corners of the area that braking sweeps from here, m, shape (corners, 1, 2); the third is at rest."""
+        return path_corners(stopping_path(self.drive, Motion(*self._scene[1].tolist())))[:, None]
 
     def proposals(self, control: Array | None) -> list[Array]:
         """Controls that lead around the disc in the way; of None, the first of the backup manoeuvre."""

@@ -19,6 +19,7 @@ from safe_wrappers.constraints.obstacles import (
     obstacles_from,
 )
 from safe_wrappers.control.backup import point_decision
+from safe_wrappers.control.backup.damped_axis import braking
 from safe_wrappers.control.backup.evasive_maneuvers import (
     Around,
     EvasiveManeuvers,
@@ -100,6 +101,13 @@ class WallClearance(BackupClearance):
             return [self._backup()]
         pairs = point_decision.candidates(self._scene, self._motion, self._left, control)
         return [self._point.control(control, pair) for pair in pairs]
+
+    def points(self, path: Trajectory) -> Array:
+        """The way until rest under full braking, at the ends of the control steps, m, shape (instants, 1, 2)."""
+        x, y, vx, vy = self._motion.tolist()
+        ways = braking(self._point.axes[0], x, vx), braking(self._point.axes[1], y, vy)
+        longest = max(map(len, ways))
+        return np.stack([np.pad(way, (0, longest - len(way)), mode="edge") for way in ways], axis=1)[:, None]
 
     def rows(self) -> HalfSpaces:
         """Bounds on the control along x and y: a convex part of what is admitted, braking included."""
