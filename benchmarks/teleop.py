@@ -87,7 +87,7 @@ def run(job: Job) -> dict[str, Any]:
     raw: Any = env.unwrapped
     operator = TeleopOperator(job.seed, stops=job.operator == "careful")
     observation, _ = env.reset(seed=job.seed)
-    effort = np.array(env.port.effort)  # type: ignore[union-attr]
+    effort = np.array(raw.port_effort_observed)
     net = lowest = peak = 0.0
     least, breached, revoked = math.inf, 0, 0
     for _ in range(job.steps):
