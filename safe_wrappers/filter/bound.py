@@ -154,7 +154,7 @@ class Bound:
             return np.concatenate([left.min(axis=0) - least, left[-1] - end])
         holds = path.holds
         if len(left) > holds:
-            left = left.reshape(holds, -1, left.shape[1]).min(axis=1)
+            left = left.reshape(holds, len(left) // holds, left.shape[1]).min(axis=1)
         held = left[0] if holds == 1 else left.ravel()
         return np.asarray(held - self._wanted()[0] if self.spec.decay < 1.0 else held)
 
@@ -170,8 +170,10 @@ class Bound:
             backup = self.backup()
             if backup is not None:
                 left = spec.h_along(self.model.rollout(backup, spec.horizon)) - spec.margin
-                floor = -np.inf if self._is_outside else 0.0
-                least, end = np.minimum(least, np.maximum(left.min(axis=0), floor)), np.minimum(end, left[-1])
+                # Where the limit is kept now, not even the backup may lose it; inside, nor the margin.
+                lost = np.where(self._value >= 0.0, -spec.margin, -np.inf) if self._is_outside else 0.0
+                least = np.minimum(least, np.maximum(left.min(axis=0), lost))
+                end = np.minimum(end, np.maximum(left[-1], lost))
             self._asked = least, end
         return self._asked
 

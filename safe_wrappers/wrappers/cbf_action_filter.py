@@ -150,6 +150,7 @@ class CBFActionFilter(LayerWrapper):
         self.filter = self._filter(margin)
         self.added_margin = margin
         self.filter.take_over(before)
+        self._observed = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning.

@@ -337,3 +337,13 @@ def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
             wrong += mujoco.mj_geomDistance(m, data, 1, 0, 9.0, None) == 0.0
     assert apart > 1500
     assert wrong == 0 if mujoco.mj_version() >= 3_012_000 else wrong > 10
+
+
+@pytest.mark.parametrize("margin", [0.0, 5.0])
+def test_a_limit_that_cannot_be_kept_any_more_is_flagged_from_inside_the_margin_too(margin):
+    env = sw.CBFActionFilter(slide(gap=0.02, force=20.0), [limit(margin=margin)])
+    env.reset(seed=0)
+    env.unwrapped.data.qvel[0] = 1.5
+    for _ in range(2):  # too fast to be stopped before the wall
+        info = env.step(np.ones(1))[4]
+        assert info["cbf/infeasible"] and info["cbf/fallback"]
