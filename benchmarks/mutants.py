@@ -62,12 +62,11 @@ _MATTER = {
     "filter/linearize.py": "Tangents._corrected not",
     "control/projection.py": "_judge comparison; project_unchecked not",
     "filter/bound.py": "Bound._of min/max; Bound._wanted min/max; Bound.slack min/max; Bound.admits not",
-    "constraints/backup/base.py": "BoundDetourClearance.executed arithmetic; BoundDetourClearance._kept_side not",
+    "constraints/backup/base.py": "DetourClearance.observe arithmetic; DetourClearance._kept_side not",
     "control/backup/drive_among_discs.py": "admits not; _to_disc not",
-    "constraints/backup/coasting_clearance.py": "BoundCoastingClearance.admits not;"
-    " BoundCoastingClearance._after min/max; BoundCoastingClearance.slack not",
-    "constraints/backup/point_clearance.py": "BoundEscapeClearance.clearance not;"
-    " BoundEscapeClearance.backup min/max",
+    "constraints/backup/coasting_clearance.py": "CoastingClearance.leaves_clear not;"
+    " CoastingClearance._after min/max; CoastingClearance.h_along not",
+    "constraints/backup/point_clearance.py": "EscapeClearance.clearance not; EscapeClearance._backup not",
     "control/backup/point_decision.py": "backup not; _stopped_at not",
     "constraints/predictive_shield.py": "PredictiveShield.plan comparison; PredictiveShield._after not",
     "wrappers/presets.py": "ActionShield.step not; ActionShield.action_masks not",
@@ -75,7 +74,7 @@ _MATTER = {
     "wrappers/lease_expiry.py": (
         "LeaseExpiry.step not; LeaseExpiry._accepted not; LeaseExpiry._grant min/max; Admission.admits not"
     ),
-    "wrappers/chunk_handover.py": "ChunkHandover.step not; ChunkHandover._submit not; ChunkQueue.submit min/max;"
+    "wrappers/chunk_handover.py": "ChunkHandover._submit not; ChunkQueue.submit min/max;"
     " ChunkQueue.next comparison; ChunkQueue._sendable not",
 }
 MATTER = [Mutant(file, *one.rsplit(" ", 1)) for file, of in _MATTER.items() for one in of.split("; ")]

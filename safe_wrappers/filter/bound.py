@@ -10,6 +10,7 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.shapes import NUMBERS, squashed
 from safe_wrappers.control.projection import keeps_rows
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import Tangents, differences
 from safe_wrappers.plants.plant import Plant
@@ -24,11 +25,10 @@ class Bound:
     In every control step `observe` comes first, after the plant's; then the other methods, in any order; last
     `executed`, whose memory `observe` takes in the next step.
 
-    From inside, an admitted control keeps `h >= margin` along its trajectory, and, with a `decay`, at least the share
-    of h that is not to be used up, as far as the constraint's backup keeps it. From outside it goes no farther out,
-    and comes back at the rate of `recovery_s`, as far as the backup does. So the backup is always admitted, and where
-    it ends at rest, what is left of an admitted trajectory is the backup of the next step: that is the proof of
-    constraints that promise "proved".
+    From inside, an admitted control keeps `h >= margin` along its trajectory. From outside it goes no farther out,
+    and comes back at the rate of `recovery_s`, as far as the constraint's backup does; a limit that is kept is not
+    lost. Where every trajectory goes on with the backup until rest, what is left of an admitted one is the backup of
+    the next step, which is therefore admitted: that is the proof of constraints that promise "proved".
 
     Args:
         constraint: The specification, which is copied.
@@ -45,23 +45,32 @@ class Bound:
     memory: Memory
 
     def __init__(self, constraint: Constraint, plant: Plant) -> None:
-        self.spec, self.plant = copy.copy(constraint), plant
-        self.spec.report, self.spec.memory = {}, {}
-        self.spec.setup(plant)
-        self.model = self.spec.model
+        self._given, self.plant = constraint, plant
+        self._set_up()
         has_h = type(self.spec).h_along is not Constraint.h_along
         self.predicts = has_h and self.spec.predicts
         self.rows_decide = self.spec.rows_decide or not has_h
         self.measures_state = has_h and self.spec.measures_state
         self.max_decrease = self.spec.max_decrease
-        self._blank = dict(self.spec.report)
+
+    def _set_up(self) -> None:
+        """Let a copy of the constraint read what it needs of the plant's model."""
+        self.spec = copy.copy(self._given)
+        self.spec.report, self.spec.memory = {}, {}
+        self.spec.setup(self.plant)
+        self.model, self._blank = self.spec.model, dict(self.spec.report)
+        self._model_version = (
+            self.plant.model_version
+        )  # last: what does not fit is refused at every observation
 
     def forget_report(self) -> None:
         """Put the info keys of the constraint back to those of a state about which nothing is known."""
         self.spec.report = dict(self._blank)
 
     def observe(self, memory: Memory) -> None:
-        """Take the plant's present state."""
+        """Take the plant's present state; after a change of its model the constraint is set up anew."""
+        if self._model_version != self.plant.model_version:
+            self._set_up()
         spec = self.spec
         self.memory = spec.memory = dict(memory)
         self._rows: HalfSpaces | None = None
@@ -99,7 +108,7 @@ class Bound:
         memory, spec = self.memory, self.spec
         memory["control"] = control
         if self.predicts:
-            if self.max_decrease is not None:
+            if self.max_decrease is not None and np.isfinite(self.least):
                 memory["recent"] = (*memory.get("recent", ()), self.least)[-spec.horizon :]
             if spec.info_keys:
                 spec.h_along(self.model.rollout(control, spec.horizon))
@@ -110,7 +119,7 @@ class Bound:
         return memory
 
     def value(self) -> Array:
-        """h at the present state, margin not taken off, shape (k,); empty where nothing is measured or near."""  # noqa: D403
+        """What is left now, margin not taken off, shape (k,); empty where nothing is measured or near."""
         found: Array = self._value
         return found
 
@@ -152,26 +161,22 @@ class Bound:
         if self._is_outside:
             least, end = self._wanted()
             return np.concatenate([left.min(axis=0) - least, left[-1] - end])
-        holds = path.holds
-        if len(left) > holds:
-            left = left.reshape(holds, len(left) // holds, left.shape[1]).min(axis=1)
-        held = left[0] if holds == 1 else left.ravel()
-        return np.asarray(held - self._wanted()[0] if self.spec.decay < 1.0 else held)
+        holds, width = path.holds, left.shape[1]
+        if not len(left):
+            name = type(self.spec).__name__
+            raise ConfigurationError(f"{name}.h_along must have at least one instant, got shape {left.shape}")
+        return np.asarray(left.reshape(holds, len(left) // holds, width).min(axis=1).ravel())
 
     def _wanted(self) -> tuple[Array, Array]:
-        """What a trajectory is to leave at least on the way, and at its end, margin taken off."""
+        """From outside: what a trajectory is to leave at least on the way, and at its end, margin taken off."""
         if self._asked is None:
-            spec, now = self.spec, self._value - self.spec.margin
-            if self._is_outside:
-                least = np.minimum(now, 0.0)
-                end = least * np.exp(-spec.horizon * self.plant.control_dt / spec.recovery_s)
-            else:
-                least = end = (1.0 - spec.decay) * np.maximum(now, 0.0)
+            spec, least = self.spec, np.minimum(self._value - self.spec.margin, 0.0)
+            end = least * np.exp(-spec.horizon * self.plant.control_dt / spec.recovery_s)
             backup = self.backup()
             if backup is not None:
                 left = spec.h_along(self.model.rollout(backup, spec.horizon)) - spec.margin
-                # Where the limit is kept now, not even the backup may lose it; inside, nor the margin.
-                lost = np.where(self._value >= 0.0, -spec.margin, -np.inf) if self._is_outside else 0.0
+                # Where the limit is kept now, not even the backup may lose it.
+                lost = np.where(self._value >= 0.0, -spec.margin, -np.inf)
                 least = np.minimum(least, np.maximum(left.min(axis=0), lost))
                 end = np.minimum(end, np.maximum(left[-1], lost))
             self._asked = least, end
@@ -182,7 +187,10 @@ class Bound:
         if self._tangents is None:
             memory = self.memory
             keeps = self.plant.observation_id < memory.get("kept_until", 0) and not self._is_outside
-            self._tangents = Tangents(self.slacks, self._slopes, memory["slopes"] if keeps else None)
+            slopes = memory["slopes"] if keeps else None
+            if slopes is not None and len(slopes) > self.slacks(control).size:
+                slopes = None  # there are fewer obstacles than there were
+            self._tangents = Tangents(self.slacks, self._slopes, slopes)
         return self._tangents.about(control)
 
     def _slopes(self, control: Array) -> Array:
@@ -190,9 +198,11 @@ class Bound:
 
         Left out are those of the control intervals after the last one in which a bound is violated most.
         """
-        plant, needed = self.plant, self.spec.horizon
-        if not self._is_outside and needed > 1:
-            left = self.slacks(control).reshape(needed, -1)
+        plant, needed, left = self.plant, self.spec.horizon, self.slacks(control)
+        if (
+            not self._is_outside and left.size % needed == 0
+        ):  # a model of one's own may not count the intervals
+            left = left.reshape(needed, -1)
             needed = int(np.where(left.min(axis=0) < 0.0, left.argmin(axis=0), 0).max()) + 1
         box = plant.lower, plant.upper
         return differences(lambda u: self._of(self.model.sketch(u, needed)), control, *box)
@@ -225,7 +235,8 @@ class Bound:
         Asked where no control is admitted. Such a control is executed without being reported as infeasible.
         """
         spec = self.spec
-        if not (self.predicts and spec.recovery_s and 0.0 <= self.least < spec.margin):
+        inside_margin = 0.0 <= self.least < spec.margin
+        if not (self.predicts and spec.recovery_s and inside_margin) or self.rows_decide:
             return False
         left = spec.h_along(self.model.rollout(control, spec.horizon)).min(axis=0)
         return bool((left >= np.maximum(np.minimum(self._value, spec.margin) - spec.at_rest, 0.0)).all())

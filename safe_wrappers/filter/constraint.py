@@ -75,8 +75,6 @@ class Constraint:
     """Whether the rows are the requirement, or a part of it; else they are a guess that h verifies."""
     recovery_s: ClassVar[float] = 0.1
     """Time constant with which a violation must shrink, s; 0: the next step starts afresh; inf: it must not grow."""
-    decay: ClassVar[float] = 1.0
-    """The share of h that one control step may use up, where `proposals(None)` leaves so much."""
     smooth: ClassVar[bool] = True
     """Whether h changes smoothly with the control, so that tangents are worth their trajectories."""
     rounding: float = 1e-9

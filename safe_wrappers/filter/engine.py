@@ -56,17 +56,10 @@ class SafetyFilter:
         search: type[SafeActionSearch] = SafeActionSearch,
     ) -> None:
         self.plant, self.constraints = plant, constraints
-        self._making = fallback, low, high, dtype, search
         self._low, self._high = low, high
         self._loaded = False
         load_solvers()
-        self._bind()
-
-    def _bind(self) -> None:
-        """Let the constraints read what they need of the plant's model."""
-        fallback, low, high, dtype, search = self._making
-        plant = self.plant
-        self.bound = [Bound(constraint, plant) for constraint in self.constraints]
+        self.bound = [Bound(constraint, plant) for constraint in constraints]
         self.reporting = [c for c in self.bound if c.spec.info_keys]
         kinds = [type(c.spec).__name__ for c in self.reporting]
         for kind in kinds:
@@ -74,12 +67,6 @@ class SafetyFilter:
                 twice = f"{kind} is in the list {kinds.count(kind)} times"
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
         self._search = search(plant, self.bound, Fallback(fallback, self.bound), low, high, dtype)
-        self._model_version = plant.model_version  # last: what does not fit is refused at every observation
-
-    @property
-    def outdated(self) -> bool:
-        """Whether the plant's model has changed since the constraints were bound to it."""
-        return self.plant.model_version != self._model_version
 
     def start(self) -> None:
         """Forget the episode, and take the state of the next one."""
@@ -99,6 +86,9 @@ class SafetyFilter:
 
         It is to be observed next. Before an episode there is nothing to go on with.
         """
+        for new, old in zip(self.bound, before.bound, strict=True):
+            if old.max_decrease is None:  # it was broken
+                new.max_decrease = None
         if hasattr(before, "memories"):
             self.memories, self.last, self.margin = before.memories, before.last, before.margin
 
@@ -106,8 +96,6 @@ class SafetyFilter:
         """Take the env's present state, and `margin` from it."""
         plant = self.plant
         plant.observe()
-        if self.outdated:  # what the constraints remember of the episode stays
-            self._bind()
         self.margin = math.nan
         for c in self.reporting:
             c.forget_report()
@@ -132,7 +120,7 @@ class SafetyFilter:
 
     def admits(self, control: Array) -> bool:
         """Whether a finite control inside the box, shape (m,), would be executed as it is in the observed state."""
-        return all(c.admits(control) for c in self.bound)
+        return self.margin == self.margin and all(c.admits(control) for c in self.bound)
 
     def executed(self, control: Array) -> None:
         """Remember what was sent, shape (m,), for the plant's delay, the constraints and a fallback that holds it."""

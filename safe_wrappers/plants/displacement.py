@@ -114,11 +114,16 @@ class DisplacementPlant(MujocoPlant):
         super()._load_to_step()
         self.data.xpos[self._body], self.data.xquat[self._body] = self._pose[:3], self._pose[3:]
 
+    def executed(self, control: Array | None) -> None:
+        super().executed(self._acting(control))
+
     def rollout(self, control: Array | None, horizon: int = 1, euler: bool = False) -> MujocoTrajectory:
         """A displacement, shape (4,), for one control interval, then none."""
-        if self.blocked and control is not None:  # the last entry has no effect: share the trajectory
-            control = np.append(control[:3], 0.0)
-        return super().rollout(control, horizon, euler)
+        return super().rollout(self._acting(control), horizon, euler)
+
+    def _acting(self, control: Array | None) -> Array | None:
+        """What of a control has an effect: of a blocked gripper the last entry has none."""
+        return np.append(control[:3], 0.0) if self.blocked and control is not None else control
 
     def _linearise(self) -> None:
         mujoco.mj_forward(self.model, self.data)

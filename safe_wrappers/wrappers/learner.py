@@ -265,6 +265,7 @@ class FilterObservation(LayerWrapper):
         """Reset the env; no correction yet."""
         observation, info = self.env.reset(seed=seed, options=options)
         if not self._acts:
+            self._observer.plant.received(observation, info)
             self._observer.filter.start()
         return self._with_features(observation, np.zeros(self._low.size)), info
 
@@ -277,7 +278,8 @@ class FilterObservation(LayerWrapper):
             correction = np.zeros(self._low.size)
             given = np.nan_to_num(np.asarray(action, dtype=np.float64))
             self._observer.filter.executed(np.clip(given, self._low, self._high))
-        self._observer.filter.observe()
+            self._observer.plant.received(observation, info)
+        self._observer.look()
         return self._with_features(observation, correction), reward, terminated, truncated, info
 
     def _with_features(self, observation: Any, correction: Array) -> Any:

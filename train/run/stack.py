@@ -201,16 +201,12 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         if isinstance(self._plant, MujocoPlant):
             self._plant = default_plant(task)
             self._plant.bind(task)
-            self._bind()
+            self._constraints = [Bound(constraint, self._plant) for constraint in its_filter.constraints]
         elif self._plant.delay_s:
             raise ConfigurationError(
                 f"env.judge: the filter's plant looks {self._plant.delay_s} s ahead and does not see the present "
                 "state; use env.cost: module:function"
             )
-
-    def _bind(self) -> None:
-        self._model_version = self._plant.model_version
-        self._constraints = [Bound(constraint.spec, self._plant) for constraint in self._constraints]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -232,8 +228,6 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         refuse_own_cost(self.unwrapped, info)
         self._plant.received(observation, info)
         self._plant.observe()
-        if isinstance(self._plant, MujocoPlant) and self._plant.model_version != self._model_version:
-            self._bind()
         cost, still = 0.0, np.zeros(self._plant.lower.size)
         for i, constraint in enumerate(self._constraints):
             constraint.observe(self._memories[i])

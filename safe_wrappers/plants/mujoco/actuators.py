@@ -9,7 +9,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.mujoco.model import control_range
+from safe_wrappers.plants.mujoco.model import AT_A_JOINT, SCALAR_JOINTS, control_range
 
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 _HANDLED = (
@@ -64,6 +64,11 @@ class AffineActuators:
         self._gain[model.actuator_gaintype != int(mujoco.mjtGain.mjGAIN_AFFINE), 1:] = 0.0
         self._bias[model.actuator_biastype != int(mujoco.mjtBias.mjBIAS_AFFINE)] = 0.0
         self._units, self._mobility = np.eye(model.nv), np.empty((model.nv, model.nv))
+        self._clamps, self._varies = bool(model.actuator_forcelimited.any()), bool(self._gain[:, 1:].any())
+        on_joints = np.isin(model.actuator_trntype, AT_A_JOINT)
+        kinds = model.jnt_type[model.actuator_trnid[on_joints, 0]] if model.njnt else np.zeros(0)
+        self._turns = not (on_joints.all() and np.isin(kinds, SCALAR_JOINTS).all())
+        self._moment: Array | None = None
 
     def gain_and_bias(self, length: Array, velocity: Array) -> tuple[Array, Array]:
         """Force per control and force at zero control, shapes (nu,) and (nu,)."""
@@ -72,7 +77,9 @@ class AffineActuators:
 
     def moment(self, data: mujoco.MjData) -> Array:
         """Generalised force per unit actuator force, shape (nu, nv)."""
-        moment = np.zeros((self._model.nu, self._model.nv))
+        if self._moment is not None and not self._turns:
+            return self._moment
+        self._moment = moment = np.zeros((self._model.nu, self._model.nv))
         sparse = data.actuator_moment.reshape(-1), data.moment_rownnz, data.moment_rowadr
         mujoco.mju_sparse2dense(moment, *sparse, data.moment_colind.reshape(-1))
         return moment
@@ -91,7 +98,7 @@ class AffineActuators:
         s; `actuator_acc0`, acceleration per force in the reference pose, bounds how fast.
         """
         m, (low, high) = self._model, self._range
-        if not m.actuator_forcelimited.any():
+        if not self._clamps:
             return low, high
         gain, bias = self.gain_and_bias(length, velocity)
         clamped = m.actuator_forcelimited.astype(bool) & (gain != 0.0)
@@ -109,7 +116,7 @@ class AffineActuators:
         """
         m, mobility = self._model, self._mobility
         mujoco.mj_solveM(m, data, mobility, self._units)
-        active = np.flatnonzero(data.efc_state == _QUADRATIC)
+        active = np.flatnonzero(data.efc_state == _QUADRATIC) if data.nefc else ()
         if len(active):  # inv(M + J' D J)
             jacobian = np.zeros((data.nefc, m.nv))
             if mujoco.mj_isSparse(m):
@@ -123,8 +130,10 @@ class AffineActuators:
             give = moved @ jacobian[active].T
             give.flat[:: len(active) + 1] += 1.0 / data.efc_D[active]
             mobility -= moved.T @ np.linalg.solve(give, moved)
-        length, velocity = data.actuator_length, data.actuator_velocity
-        least, most = self.acting_range(length, velocity)
-        gain = np.where(most > least, self.gain_and_bias(length, velocity)[0], 0.0)
+        (least, most), gain = self._range, self._gain[:, 0]
+        if self._clamps or self._varies:
+            length, velocity = data.actuator_length, data.actuator_velocity
+            least, most = self.acting_range(length, velocity)
+            gain = np.where(most > least, self.gain_and_bias(length, velocity)[0], 0.0)
         effect = mobility @ (self.moment(data).T * gain)
-        return data.qacc - effect @ np.clip(data.ctrl, least, most), effect
+        return data.qacc - effect @ np.minimum(np.maximum(data.ctrl, least), most), effect
