@@ -17,9 +17,8 @@ import daqp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 
 _TOLERANCE: Final = 1e-9
 """Largest residual that the nominal may have, as a share of `_scale`; answers may have ten times as much."""
