@@ -60,6 +60,7 @@ def test_parked_objects_leave_no_trace(make_env):
     env = make_env("Point", 2)
     env.reset(seed=0, options={"layout": {**LAYOUT, "hazards": [], "vases": []}})
     assert env.hazard_positions.shape == env.vase_positions.shape == (0, 2)
+    assert env.data.mocap_pos[1:, :2].min() > 100.0  # not drawn in the field either
     for _ in range(30):
         observation, _, _, _, info = env.step(np.array([1.0, 0.3]))
         assert not observation[28:].any() and info["cost"] == info["cost_substep"] == 0.0
