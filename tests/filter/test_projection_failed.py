@@ -31,21 +31,19 @@ def daqp_limited(asked):
 def test_a_program_whose_solver_reaches_its_limit_is_failed_and_not_infeasible(monkeypatch):
     rows = np.array([[1.0, 0.2], [-0.3, 1.0]])
     program = conic_program.Program(
-        *(np.eye(2), -np.array([0.9, 0.8]), rows, np.array([0.3, 0.2]), np.full(2, -1.0), np.full(2, 1.0)),
-        *(np.zeros((0, 3, 2)), np.zeros((0, 3))),
+        *(np.ones(2), -np.array([0.9, 0.8]), np.zeros((0, 2)), np.zeros(0), rows, np.array([0.3, 0.2])),
+        np.zeros((0, 3, 2)),
     )
-    assert np.allclose(conic_program.by_daqp(program), conic_program.by_clarabel(program))
-    asked, settings = [], conic_program.clarabel.DefaultSettings
+    assert not isinstance(conic_program.by_clarabel(program), str)
+    settings = conic_program.clarabel.DefaultSettings
 
     def limited():
         made = settings()
         made.max_iter = 1
         return made
 
-    monkeypatch.setattr(*daqp_limited(asked))
     monkeypatch.setattr(conic_program.clarabel, "DefaultSettings", limited)
-    assert conic_program.by_daqp(program) == conic_program.by_clarabel(program) == "failed"
-    assert len(asked) == 1
+    assert conic_program.by_clarabel(program) == "failed"
 
 
 def test_where_every_solver_reaches_its_limit_the_filter_says_so(monkeypatch):

@@ -42,7 +42,6 @@ class ContactPoints(NamedTuple):
 
     points: Array  #: shape (k, 3), m
     normals: Array  #: unit normals, pointing at the pushed body, shape (k, 3)
-    first_tangents: Array  #: the first axis of MuJoCo's friction pyramid, shape (k, 3)
     friction: Array  #: coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1)
     pushed_by: NDArray[np.intp]  #: ids of the other bodies, shape (k,)
     jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
@@ -108,7 +107,7 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
                 jacobians[row] += side * jac
                 drift[row] += side * (dot @ data.qvel)
     friction = np.where(found.dim[touching] > 1, found.friction[touching, 0], 0.0)
-    geometry = np.array(found.pos[touching]), signs * frames[:, 0], np.array(frames[:, 1]), friction
+    geometry = np.array(found.pos[touching]), signs * frames[:, 0], friction
     return ContactPoints(*geometry, bodies[:, 0], jacobians, drift, forces)
 
 
