@@ -9,14 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control import whole_body
 from safe_wrappers.control.contact import cone_excess
 from safe_wrappers.control.legged import support_distances
 from safe_wrappers.control.projection import Status
 from safe_wrappers.control.whole_body import WholeBodyProblem, WholeBodySolution, predicted_position_rows
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    UnsupportedEnvError,
+    check_fields,
+    non_negative,
+    positive,
+)
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world

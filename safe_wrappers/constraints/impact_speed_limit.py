@@ -7,10 +7,9 @@ from typing import ClassVar, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, name_list, positive
 from safe_wrappers.constraints.rollout import RolloutConstraint
 from safe_wrappers.control.contact import peak_force
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import Array, ConfigurationError, UnknownNameError, name_list, positive
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant

@@ -7,11 +7,10 @@ from typing import ClassVar, Final
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, name_list, positive
 from safe_wrappers.constraints.joints import chain, driven_joints, refuse_uncovered, scalar_joints
 from safe_wrappers.constraints.rollout import RolloutConstraint
 from safe_wrappers.control import barriers as of_arm
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, check_fields, name_list, positive
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS, SLIDE

@@ -23,8 +23,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 
 EPSILON = float(np.finfo(np.float64).eps)
 

@@ -21,7 +21,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, whole_number
+from safe_wrappers.errors import Array, whole_number
 
 Numbers = Array | float
 

@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 _KEPT: Final = 256
 """Number of cached discretisations."""

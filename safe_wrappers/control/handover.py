@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import Array, positive
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, positive
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled, hypot
+from safe_wrappers.errors import Array
 
 COPLANAR_M = 0.01
 """m; the largest distance of coplanar contacts from their plane."""

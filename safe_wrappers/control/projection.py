@@ -16,9 +16,8 @@ import daqp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 
 _TOLERANCE: Final = 1e-9
 """Largest residual of the nominal, as a share of the numbers that the row adds up."""

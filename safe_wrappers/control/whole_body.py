@@ -21,10 +21,9 @@ import clarabel
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_array
 from safe_wrappers.control.contact import cone_excess, friction_pyramid, tangents
 from safe_wrappers.control.projection import Status
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, finite_array
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import OF_NUMBERS, Array, numbers_of, positive, settings_from, shown, whole_number
 from safe_wrappers.control.handover import (
     BLENDS,
     LOOK_BACK,
@@ -22,15 +21,24 @@ from safe_wrappers.control.handover import (
     shortest_blend,
     smoothstep,
 )
-from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
+from safe_wrappers.errors import (
+    OF_NUMBERS,
+    ActionError,
+    Array,
+    ConfigurationError,
+    UnknownNameError,
+    numbers_of,
+    positive,
+    settings_from,
+    shown,
+    whole_number,
+)
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.mujoco.dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import plain_data, plain_numbers
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import (
     SAME_STEP,
     CommandReceiver,
@@ -41,6 +49,8 @@ from safe_wrappers.wrappers.layer import (
     receiver_inside,
     whole_steps,
 )
+from safe_wrappers.wrappers.serialize import plain_data, plain_numbers
+from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.stopping import FallbackController, bound_plant
 
 

@@ -23,8 +23,8 @@ from safe_wrappers.plants.mujoco.contacts import (
 )
 from safe_wrappers.plants.mujoco.dynamics import MomentumReader
 from safe_wrappers.plants.mujoco.model import fixed_bodies
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, mujoco_env
+from safe_wrappers.wrappers.stack import Layer
 
 
 class StepMonitor(LayerWrapper, ABC):

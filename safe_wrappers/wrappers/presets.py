@@ -7,11 +7,18 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, numbers_of, shown
 from safe_wrappers.constraints.contact_feasibility import ContactFeasibility, Stance, SupportMargin
 from safe_wrappers.constraints.joints import JointPositionLimit, refuse_uncovered_stops, stops
 from safe_wrappers.constraints.traction import Traction
-from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import (
+    ActionError,
+    ConfigurationError,
+    UnknownNameError,
+    UnsupportedEnvError,
+    non_negative,
+    numbers_of,
+    shown,
+)
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import DiscreteSearch

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, name_list
+from safe_wrappers.errors import Array, name_list
 from safe_wrappers.plants.mujoco.forecast import RESETS
 from safe_wrappers.plants.mujoco.model import fixed_bodies, named
 

@@ -16,10 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.bandwidth import modes
 from safe_wrappers.control.legged import CentroidalMomentum, centroidal_momentum
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import Array, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.model import (

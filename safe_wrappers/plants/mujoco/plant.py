@@ -8,9 +8,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.control.bandwidth import ControlLoop
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError, non_negative
 from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
