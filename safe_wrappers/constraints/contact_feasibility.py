@@ -25,7 +25,7 @@ from safe_wrappers.errors import (
 )
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
-from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
+from safe_wrappers.plants.mujoco.contacts import Contacts, can_touch_the_world
 from safe_wrappers.plants.mujoco.dynamics import equations_of_motion
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -73,7 +73,7 @@ class ContactFeasibility(Constraint):
         self._chosen = np.flatnonzero(touching_bodies(self.plant, "there is no cone to stay in"))
         self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
 
-    def h_along(self, path: ContactForecast | None) -> Array:
+    def h_along(self, path: Contacts | None) -> Array:
         """By how much each body's contact forces stay inside the cone, tolerance added, shares of the weight.
 
         At most as much as is asked for: differences between a touch and none would say nothing of the touch. NaN
@@ -97,7 +97,7 @@ class ContactModel(Model):
     def __init__(self, plant: MujocoPlant) -> None:
         self._plant = plant
 
-    def rollout(self, control: Array | None, horizon: int = 1) -> ContactForecast | None:
+    def rollout(self, control: Array | None, horizon: int = 1) -> Contacts | None:
         return None if control is None else self._plant.contact_forecast(control)
 
 
@@ -158,7 +158,7 @@ class SupportMargin(Constraint):
         self.model = ContactModel(self.plant)
         self.report = {keys.WHOLE_BODY_ZMP_MARGIN: 0.0}
 
-    def h_along(self, path: ContactForecast | None) -> Array:
+    def h_along(self, path: Contacts | None) -> Array:
         """Distance to the edge minus the inset where it is least, m; the margin where there is no polygon."""
         if path is None:
             return np.zeros((1, 0))
@@ -235,13 +235,14 @@ class Stance(Constraint, Model):
         found = motion.contacts
         # Beyond this MuJoCo resets the state in its step.
         within = bool((np.abs(self.plant.state) < mujoco.mjMAXVAL).all())
-        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
+        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.force).all()):
             return None  # nothing can be said
-        ground = fixed_bodies(self.plant.model)[found.pushed_by]
+        jacobians, drift = motion.jacobians, motion.drift
+        ground = fixed_bodies(self.plant.model)[found.bodies[:, 0]]
         # What the robot's bodies do to each other, and other things to it, stays as it is.
-        bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
-        jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
-        pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
+        bias = motion.bias - np.einsum("kiv,ki->v", jacobians[~ground], found.force[~ground])
+        jacobians, drift, normals = jacobians[ground], drift[ground], found.normal[ground]
+        pressing = np.einsum("ki,ki->k", found.force[ground], normals) > 0.0
         acceleration = -(jacobians @ self.plant.qvel) / _SETTLE_S
         limits: dict[str, Any] = {}
         if self.joint_tolerance is not None:
@@ -251,7 +252,7 @@ class Stance(Constraint, Model):
                 *joints, self.plant.control_dt, self.plant.model.nv
             )
         limits |= {"contact_acceleration": acceleration, "breaking": ~pressing}
-        limits["first_tangents"] = found.first_tangents[ground]
+        limits["first_tangents"] = found.tangent[ground]
         contacts = jacobians, drift, normals, self.friction_share * found.friction[ground]
         controls = self.plant.lower, self.plant.upper, control
         problem = WholeBodyProblem(motion.inertia, bias, motion.actuation, *contacts, *controls, **limits)
