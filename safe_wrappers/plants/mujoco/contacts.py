@@ -161,7 +161,6 @@ class Contacts(NamedTuple):
     gap: Array  # signed distance, shape (n,), m; negative where they penetrate
     point: Array  # shape (n, 3), m
     normal: Array  # pointing at the pushed body, shape (n, 3)
-    tangent: Array  # the first axis of MuJoCo's friction pyramid, shape (n, 3)
     friction: Array  # of sliding, shape (n,): the smaller of two directions'; 0 without friction (condim 1)
     force: Array  # on the pushed body, shape (n, 3), N
     finite: bool  # False where MuJoCo resets the state: contacts are meaningless
@@ -228,7 +227,7 @@ class ContactReader:
         frame = frame.reshape(-1, 3, 3)
         force = side * np.einsum("ki,kij->kj", wrench[:, :3], frame)
         sliding = friction[:, :2].min(axis=1) * (dim > 1)
-        parts = step, bodies, gap, point, side * frame[:, 0], frame[:, 1], sliding, force
+        parts = step, bodies, gap, point, side * frame[:, 0], sliding, force
         return Contacts(self._steps, *(part[chosen] for part in parts), finite)
 
     def follow(self, data: mujoco.MjData, substeps: int) -> Contacts:
