@@ -25,7 +25,7 @@ from safe_wrappers.errors import (
 )
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
-from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
+from safe_wrappers.plants.mujoco.contacts import Contacts, can_touch_the_world
 from safe_wrappers.plants.mujoco.dynamics import equations_of_motion
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -47,7 +47,7 @@ class _ContactConstraint(Constraint, Model):
         super().setup(require_mujoco(plant, f"{type(self).__name__} {hint}"))
         self.report = dict.fromkeys(self.info_keys, 0.0)
 
-    def rollout(self, control: Array | None, horizon: int = 1) -> ContactForecast | None:
+    def rollout(self, control: Array | None, horizon: int = 1) -> Contacts | None:
         """The forecast; None of the present state, of which nothing is known."""
         return None if control is None else self.plant.contact_forecast(control)  # type: ignore[no-any-return]
 
@@ -85,7 +85,7 @@ class ContactFeasibility(_ContactConstraint):
         super().setup(plant)
         self._chosen = np.flatnonzero(touching_bodies(self.plant, "there is no cone to stay in"))
 
-    def h_along(self, path: ContactForecast | None) -> Array:
+    def h_along(self, path: Contacts | None) -> Array:
         """By how much each body's contact forces stay inside the cone, tolerance added, shares of the weight.
 
         At most as much as is asked for: differences between a touch and none would say nothing of the touch. NaN
@@ -148,7 +148,7 @@ class SupportMargin(_ContactConstraint):
 
     info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_ZMP_MARGIN,)
 
-    def h_along(self, path: ContactForecast | None) -> Array:
+    def h_along(self, path: Contacts | None) -> Array:
         """Distance to the edge minus the inset where it is least, m; the margin where there is no polygon."""
         if path is None:
             return np.zeros((1, 0))
@@ -225,13 +225,13 @@ class Stance(Constraint, Model):
         found = motion.contacts
         # Beyond this MuJoCo resets the state in its step.
         within = bool((np.abs(plant.state) < mujoco.mjMAXVAL).all())
-        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
+        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.force).all()):
             return None  # nothing can be said
-        ground = fixed_bodies(plant.model)[found.pushed_by]
+        ground = fixed_bodies(plant.model)[found.bodies[:, 0]]
         # What the robot's bodies do to each other, and other things to it, stays as it is.
-        bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
-        jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
-        pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
+        bias = motion.bias - np.einsum("kiv,ki->v", motion.jacobians[~ground], found.force[~ground])
+        jacobians, drift, normals = motion.jacobians[ground], motion.drift[ground], found.normal[ground]
+        pressing = np.einsum("ki,ki->k", found.force[ground], normals) > 0.0
         limits = None
         if self.joint_tolerance is not None:
             joints = self._dofs, plant.qpos[self._qpos], plant.qvel[self._dofs], self._low, self._high
