@@ -3,10 +3,11 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from safe_wrappers.control.backup.stopping import Nearest
 from safe_wrappers.control.estimation import Tracks
 from safe_wrappers.control.numerics.shapes import (
     BLOCK,
@@ -27,15 +28,6 @@ from safe_wrappers.errors import (
 from safe_wrappers.plants.plant import Plant
 
 _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)  # of the horizon, at which growth is looked at; the first: its rate now
-
-
-class Nearest(NamedTuple):
-    """For one point and k surfaces in d dimensions."""
-
-    distance: Array  # signed, m, negative inside, shape (k,)
-    normal: Array  # unit vectors from the surface towards the point, shape (k, d)
-    velocity: Array  # of the surface, m/s, shape (k, d)
-    curvature: Array  # of the surface of equal distance through the point, along each coordinate, 1/m, (k, d)
 
 
 class Obstacle(Protocol):
