@@ -1,7 +1,5 @@
 """Callbacks: what the filter did in the log, a price on cost, a margin that changes."""
 
-from typing import Any
-
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -65,8 +63,8 @@ class LagrangianMultiplier(BaseCallback):
 
     Raises:
         ConfigurationError: Numbers outside these ranges; in training: an env that reports no cost or one that is
-            not finite, hindsight replay, `ExecutedActionReplayBuffer(mode="both")`, or an off-policy learner behind a
-            VecNormalize: they replay the env's own rewards.
+            not finite, hindsight replay, or an off-policy learner behind a VecNormalize: they replay the env's own
+            rewards.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -92,11 +90,9 @@ class LagrangianMultiplier(BaseCallback):
                 "LagrangianMultiplier: an off-policy learner behind a VecNormalize stores the env's own rewards,"
                 " without a price on cost; leave VecNormalize out, or use an on-policy learner"
             )
-        buffer: Any = getattr(self.model, "replay_buffer", None)
-        if isinstance(buffer, HerReplayBuffer) or getattr(buffer, "mode", "") == "both":
+        if isinstance(getattr(self.model, "replay_buffer", None), HerReplayBuffer):
             raise ConfigurationError(
-                "LagrangianMultiplier: hindsight replay and mode 'both' have rewards without a price on cost; use"
-                " another replay buffer"
+                "LagrangianMultiplier: hindsight replay has rewards without a price on cost; use another buffer"
             )
         self._episode_cost = np.zeros(self.training_env.num_envs)
 

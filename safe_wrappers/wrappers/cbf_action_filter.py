@@ -20,7 +20,7 @@ from safe_wrappers.filter.search import SafeActionSearch, Stage
 from safe_wrappers.plants import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import constraint_from, plain_data
+from safe_wrappers.serialize import constraint_from
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, action_array
 
@@ -86,7 +86,6 @@ class CBFActionFilter(LayerWrapper):
         fallback: str | FallbackFunction = "brake",
         margin: float = 0.0,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)
         self._take_action_space(env)
         plant = own_plant(plant)
@@ -94,7 +93,6 @@ class CBFActionFilter(LayerWrapper):
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
         own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
         self.added_margin = margin = non_negative("margin", margin, "the constraints' own units")
-        self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
         self._own = own
         self.constraint_names = _unique([type(c).__name__ for c in own])
         self.plant: Plant = plant if plant is not None else default_plant(env, own)
@@ -158,45 +156,35 @@ class CBFActionFilter(LayerWrapper):
         Another thread's step is waited for, as another reset.
         """
         with self._deciding:
-            self.started = False
+            self.warned.discard("unsafe")
+            self.started = self._observed = False
             observation, info = self.env.reset(seed=seed, options=options)
             self.plant.received(observation, info)
-            return observation, info | self.start_report()
-
-    def start_report(self) -> dict[str, Any]:
-        """Take the state that a reset has left: the info keys of a new episode."""
-        self.warned.discard("unsafe")
-        self.started = self._observed = False
-        self.filter.start()
-        margin, unsafe = self._margin()
-        report = self._quiet_report()
-        report[keys.CBF_MARGIN] = margin
-        report[keys.CBF_UNSAFE] = unsafe
-        # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
-        report[keys.PROPOSED_ACTION] = np.zeros(self._shape)
-        report[keys.EXECUTED_ACTION] = np.zeros(self._shape)
-        report |= self.filter.info()
-        self.started = True
-        return report
-
-    def _quiet_report(self) -> dict[str, Any]:
-        """The info keys of a step that changes nothing, but for margin and actions."""
-        report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
-        report[keys.CBF_REFUSED] = np.zeros(len(self._own), dtype=bool)
-        report[keys.CBF_STAGE] = int(Stage.PROPOSAL)
-        return report
+            self.filter.start()
+            info |= dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
+            info[keys.CBF_MARGIN], info[keys.CBF_UNSAFE] = self._margin()
+            info[keys.CBF_REFUSED] = np.zeros(len(self._own), dtype=bool)
+            info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
+            # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
+            info[keys.PROPOSED_ACTION], info[keys.EXECUTED_ACTION] = np.zeros((2, *self._shape))
+            info |= self.filter.info()
+            self.started = True
+            return observation, info
 
     def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed; another thread waits meanwhile."""
         with self._deciding:  # the env makes the step that was judged, from the state in which it was
             started = time.perf_counter()
-            sent, report = self.judge(action)
+            sent, report = self._judge(action)
             self.filter_seconds += time.perf_counter() - started
             self.filter_calls += 1
             observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
             self.plant.received(observation, info)
             info |= report
-            info[keys.CBF_MISMATCH] = self.deviates()
+            if deviation := self.plant.deviation():
+                message = f"{deviation}; what the filter guarantees does not hold (cbf/mismatch)"
+                self._warn_once("mismatch", message)
+                info[keys.CBF_MISMATCH] = True
             info |= self.filter.info()
         return observation, reward, terminated, truncated, info
 
@@ -218,11 +206,8 @@ class CBFActionFilter(LayerWrapper):
         self.plant.observation_id = count
         return self.filter.bound if self.filter.margin == self.filter.margin else ()
 
-    def judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
-        """What to send for a proposed action in the env's present state, and the step's info keys.
-
-        The env must be stepped with it next. The constraints' own keys are not among these.
-        """
+    def _judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
+        """What to send for a proposed action in the env's present state, and the step's info keys."""
         self._refuse_without_reset()
         proposed: Array = action_array(action, self._shape, np.float64)
         if not self._observed:
@@ -273,13 +258,6 @@ class CBFActionFilter(LayerWrapper):
             keys.EXECUTED_ACTION: executed.copy(),
             keys.CBF_STAGE: int(decision.stage),
         }
-
-    def deviates(self) -> bool:
-        """`cbf/mismatch` of the step that the env has just made: whether it was not the one that was judged."""
-        found = self.plant.deviation()
-        if found:
-            self._warn_once("mismatch", f"{found}; what the filter guarantees does not hold (cbf/mismatch)")
-        return bool(found)
 
     def _margin(self) -> tuple[float, bool]:
         """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""

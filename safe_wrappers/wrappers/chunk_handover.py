@@ -29,7 +29,6 @@ from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.mujoco.dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import (
     SAME_STEP,
@@ -86,7 +85,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         rate_limit: Bound on |u[k+1] - u[k]| / control interval, for all components or one each, action units per s.
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
-        control_dt: Control interval, s; None reads the env's `dt`.
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
         limits: Of the machine, which every "quintic" keeps between its ends, too: it is stretched until it does, or
             its chunk is refused.
@@ -120,11 +118,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         rate_limit: float | Sequence[float] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        control_dt: float | None = None,
         steps_per_entry: int = 1,
         limits: SeamLimits | Mapping[str, Any] | None = None,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)  # first: with a handover inside the actions are no vector either
         space = check_actions(env)
         plant = own_plant(plant)
@@ -132,18 +128,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         if blend not in BLENDS:
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join(BLENDS)}")
         limits = None if limits is None else settings_from(SeamLimits, limits, "limits")
-        plain: dict[str, Any] = {"blend_time": blend_time, "rate_limit": rate_limit, "control_dt": control_dt}
-        plain = {name: plain_numbers(value) for name, value in plain.items()}
-        delays = delay[0] if delay[0] == delay[1] else list(delay)
-        plain |= {
-            "chunk_size": H,
-            "execution_horizon": s,
-            "inference_delay": delays,
-            "steps_per_entry": apart,
-        }
-        self._record(arguments, plant=plant, limits=plain_data(limits), **plain)
         self.chunk_size, self.execution_horizon, self.blend = H, s, blend
-        self.control_dt = check_timing(env, plain["control_dt"])
+        self.control_dt = check_timing(env)
         self._delay, self._apart, self._controls = delay, apart, space.shape[0]
         low, high = (np.repeat(end[None], H, axis=0) for end in (space.low, space.high))
         self.action_space = gym.spaces.Box(low, high, dtype=space.dtype)
@@ -151,7 +137,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         if limits is not None and blend != "quintic":
             raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
         rates = _rate_limits(rate_limit, space, self.control_dt)
-        fewest = self._fewest(plain["blend_time"], rate_limit is not None or limits is not None)
+        fewest = self._fewest(blend_time, rate_limit is not None or limits is not None)
         self._check = None if limits is None else self._bound_check(limits)
         self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rates, self._check)
         self._inside = receiver_inside(env)

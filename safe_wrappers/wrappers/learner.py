@@ -12,7 +12,6 @@ from safe_wrappers.checks import Array, non_negative, positive, whole_number
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng, action_array
@@ -43,7 +42,6 @@ class ActionRepeat(LayerWrapper):
     def __init__(self, env: Env, repeat: int) -> None:
         LayerWrapper.__init__(self, env)
         self.repeat = whole_number("repeat", repeat, least=1)
-        self._record({"repeat": self.repeat})
 
     def step(self, action: Any) -> Step:
         """Step the env with the same action until `repeat` control steps are made or the episode ends."""
@@ -90,7 +88,6 @@ class AdaptionPenalty(LayerWrapper):
             raise ConfigurationError(
                 "AdaptionPenalty: give penalty (per step), per_correction (per unit of cbf/correction), or both"
             )
-        self._record({"penalty": self.penalty, "per_correction": self.per_correction})
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         info[keys.ADAPTION_PENALTY] = 0.0
@@ -149,7 +146,6 @@ class StuckEscape(LayerWrapper):
         progress: float = 0.0,
         escape_s: float = 1.0,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)
         self._inside = needed_filter(env, "StuckEscape(sw.protect(env))")
         if not (isinstance(progress, int | float | np.number) and np.isfinite(progress)):
@@ -157,7 +153,6 @@ class StuckEscape(LayerWrapper):
         control_dt = self._inside.plant.control_dt
         self._window = max(1, round(positive("after_s", after_s, "s") / control_dt))
         self._escape = round(non_negative("escape_s", escape_s, "s") / control_dt)
-        self._record(arguments)
         self.progress = float(progress)
         self._rng = WrapperRng("StuckEscape")
 
@@ -236,7 +231,6 @@ class FilterObservation(LayerWrapper):
         plant: Plant | None = None,
         neighbours: int = 4,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)
         inside = filter_inside(env)
         if inside is None and constraints is None:
@@ -251,8 +245,6 @@ class FilterObservation(LayerWrapper):
         self.neighbours = whole_number("neighbours", neighbours, least=0)
         if constraints is not None:
             observer = CBFActionFilter(env, constraints, plant)
-            arguments["constraints"] = [plain_data(c) for c in observer.constraints]
-        self._record(arguments, plant=plant)
         self._acts = inside is not None
         self._observer = inside if inside is not None else observer
         low, high = np.ravel(self._observer.action_space.low), np.ravel(self._observer.action_space.high)  # type: ignore[attr-defined]

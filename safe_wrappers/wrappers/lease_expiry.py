@@ -19,7 +19,6 @@ from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.mujoco.binding import actions_are_controls
 from safe_wrappers.plants.mujoco.model import control_range
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, Step, action_array, whole_steps
 from safe_wrappers.wrappers.stopping import (
@@ -58,7 +57,6 @@ class LeaseExpiry(CommandGate):
             "max_speed": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
         fallback: "brake", "hold", "zero", or a function of the plant.
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
-        control_dt: Control interval, s; None reads the env's `dt`.
 
     Info, at every step: ``lease/remaining_s`` (float), ``lease/refused``, ``lease/braking`` (bool); without a filter
     inside ``executed_action`` and ``action/clipped`` (float).
@@ -98,14 +96,10 @@ class LeaseExpiry(CommandGate):
         motion_limits: Mapping[str, Any] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        control_dt: float | None = None,
     ) -> None:
-        arguments = dict(locals())
-        CommandGate.__init__(self, env, control_dt)
+        CommandGate.__init__(self, env)
         refuse_changed_actions(env)
         plant, budget = own_plant(plant), settings_from(StoppingBudget, budget, "budget")
-        limits = dict(motion_limits) if isinstance(motion_limits, Mapping) else motion_limits
-        self._record(arguments, budget=plain_data(budget), motion_limits=limits, plant=plant)
         self._max_lease_s = positive("max_lease_s", max_lease_s, "s")
         if self._max_lease_s < self.control_dt - self._same_s:
             step = f"one control step, {self.control_dt} s"

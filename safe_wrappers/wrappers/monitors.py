@@ -122,7 +122,6 @@ class ContactMonitor(StepMonitor):
         self._contacts = Contacts(self._raw.model, bodies, against)
         self.bodies = None if bodies is None else list(bodies)
         self.against = None if against is None else list(against)
-        self._record({"bodies": self.bodies, "against": self.against})
         self._forget()
 
     @property
@@ -212,7 +211,6 @@ class BalanceMonitor(StepMonitor):
         StepMonitor.__init__(self, env)
         self._take(bodies)
         self.bodies = None if bodies is None else list(bodies)
-        self._record({"bodies": self.bodies})
 
     def _take(self, bodies: Sequence[str] | None) -> None:
         """Find the robot in the env's model."""

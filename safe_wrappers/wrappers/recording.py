@@ -69,7 +69,7 @@ class CostFunction(LayerWrapper):
                 ) from None
         if not callable(function):
             raise ConfigurationError(f"fn is a function of the env or its name 'module:function'; got {fn!r}")
-        self._record({"fn": _reference(function)})
+        self._saved_kwargs["fn"] = _reference(function)
         self.fn: Judge = function
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
@@ -144,7 +144,6 @@ class RecordInterventions(LayerWrapper):
         text = None if path is None else os.fspath(path)
         if text is not None:
             _continue_file(Path(text))
-        self._record({"path": text})
         self.path = text
 
     @property

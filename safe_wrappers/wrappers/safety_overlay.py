@@ -83,7 +83,6 @@ class SafetyOverlay(LayerWrapper):
                 f"SafetyOverlay draws into the windows of MuJoCo envs alone, which {name_of(env)} is not: take "
                 "render_mode='rgb_array', whose frames get a strip"
             )
-        self._record({})
         self._inside = filter_inside(env)
         self._infos: deque[dict[str, Any]] = deque(maxlen=STEPS)
         self._bounds: tuple[Array, Array] | None = None

@@ -259,10 +259,10 @@ class CommandGate(LayerWrapper, CommandReceiver):
     _not_sent: ClassVar[str]
     """What happens instead with one that is not finite."""
 
-    def __init__(self, env: Env, control_dt: float | None) -> None:
+    def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
         space = check_actions(env)
-        self.control_dt = check_timing(env, control_dt)
+        self.control_dt = check_timing(env)
         self._same_s = SAME_STEP * self.control_dt
         self._shape, self._dtype = space.shape, space.dtype
         self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))

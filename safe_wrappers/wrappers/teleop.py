@@ -17,7 +17,6 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.faults import OnOffProcess, probability
 from safe_wrappers.wrappers.layer import SAME_STEP, Env, Step, WrapperRng, action_array
@@ -225,7 +224,6 @@ class TeleopChannel(CommandGate):
         ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
         fallback: The local brake: "brake", "hold", "zero", or a function of the plant.
         plant: For the ceiling's constraint and the fallback; None reads the env's MuJoCo model.
-        control_dt: Control interval, s; None reads the env's `dt`.
 
     Info, at every step: ``teleop/round_trip_s``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
     ``teleop/lost`` (int); without a filter inside ``executed_action`` and ``action/clipped`` (float).
@@ -257,17 +255,13 @@ class TeleopChannel(CommandGate):
         ceiling: RoundTripCeiling | dict[str, Any] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        control_dt: float | None = None,
     ) -> None:
-        arguments = dict(locals())
-        CommandGate.__init__(self, env, control_dt)
+        CommandGate.__init__(self, env)
         plant = own_plant(plant)
         self.uplink, self.downlink = _link("uplink", uplink), _link("downlink", downlink)
         limit = None if ceiling is None else settings_from(RoundTripCeiling, ceiling, "ceiling", ", or None")
         if coding not in get_args(Coding):
             raise ConfigurationError(f"coding is one of {', '.join(get_args(Coding))}; got {coding!r}")
-        plain = {"uplink": self.uplink, "downlink": self.downlink, "ceiling": limit}
-        self._record(arguments, plant=plant, **{name: plain_data(value) for name, value in plain.items()})
         self._port = Port(env) if env.has_wrapper_attr("port_flow") else None
         self._waves: WaveCoding | None = None
         if coding == "plain" and impedance is not None:

@@ -132,9 +132,8 @@ class WaveCoding:
 
     def settle(self, effort: Array, flow: Array, obeyed: bool) -> Array:
         """The wave in the packet down, of the effort and the flow with which the channel acted on the machine."""
-        if (
-            not obeyed
-        ):  # a still port absorbs the wave; reflected ones would pile up in the channel without bound
+        if not obeyed:
+            # A still port absorbs the wave; reflected ones would pile up in the channel without bound.
             return self._still
         _, outgoing = to_waves(effort, flow, self._impedance)
         # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.

@@ -473,7 +473,6 @@ def handover(env, **changed):
         ),
         ({"rate_limit": None, "execution_horizon": 5, "inference_delay": [0, 3]}, "no left-over"),
         ({"rate_limit": None, "chunk_size": 1, "execution_horizon": 1}, "no left-over"),
-        ({"control_dt": 0.2}, "dt = 0.1"),
         ({"fallback": "sleep"}, "no fallback 'sleep'; choose brake, hold, zero"),
         ({"fallback": "brake"}, "(?i)mujoco"),
         ({"plant": 3}, "plant is a MujocoPlant"),

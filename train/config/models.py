@@ -75,12 +75,11 @@ class LearnerConfig(Section):
     """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
 
     text_is: ClassVar[str] = "kind"
-    _PENALISED: ClassVar = ("adaption_penalty", "both")
 
-    kind: Literal["naive", "adaption_penalty", "safe_action", "both"] = "naive"
-    """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ."""
+    kind: Literal["naive", "adaption_penalty", "safe_action"] = "naive"
+    """`safe_action` is for SAC, TD3, DDPG, TQC and CrossQ."""
     penalty: Annotated[Number, Field(ge=0)] = 0.0
-    """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
+    """For `adaption_penalty`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
     """For the same: taken off per unit of correction."""
     margin_curriculum: MarginCurriculumConfig | None = None
@@ -102,13 +101,13 @@ class LearnerConfig(Section):
                 f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction."
             )
         if given and not self.penalised:
-            raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
+            raise ConfigurationError(f"{self.kind} takes no penalty; adaption_penalty does.")
         return self
 
     @property
     def penalised(self) -> bool:
         """Whether the reward is reduced where the action was changed."""
-        return self.kind in self._PENALISED
+        return self.kind == "adaption_penalty"
 
     @property
     def of_filter(self) -> bool:
@@ -118,7 +117,7 @@ class LearnerConfig(Section):
     @property
     def stores_executed(self) -> bool:
         """Whether the replay buffer holds executed actions."""
-        return self.kind in ("safe_action", "both")
+        return self.kind == "safe_action"
 
 
 NAIVE: Final = LearnerConfig()

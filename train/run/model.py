@@ -76,7 +76,7 @@ def _constructor_arguments(arm: ArmConfig, envs: VecEnv) -> dict[str, Any]:
         settings["buffer_size"] = buffer_size(arm)
     if arm.learner.stores_executed:
         kind_of = ExecutedActionDictReplayBuffer if has_dict else ExecutedActionReplayBuffer
-        settings |= {"replay_buffer_class": kind_of, "replay_buffer_kwargs": {"mode": arm.learner.kind}}
+        settings["replay_buffer_class"] = kind_of
     return settings
 
 
