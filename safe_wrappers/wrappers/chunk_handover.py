@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import OF_NUMBERS, Array, numbers_of, positive, settings_from, shown, whole_number
+from safe_wrappers.checks import Array, numbers_of, positive, settings_from, whole_number
 from safe_wrappers.control.handover import (
     BLENDS,
     LOOK_BACK,
@@ -22,7 +22,7 @@ from safe_wrappers.control.handover import (
     shortest_blend,
     smoothstep,
 )
-from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
@@ -37,6 +37,7 @@ from safe_wrappers.wrappers.layer import (
     LayerWrapper,
     Step,
     WrapperRng,
+    action_array,
     receiver_inside,
     whole_steps,
 )
@@ -136,7 +137,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback = FallbackController(env, fallback, bound_plant(env, plant, fallback))
         if limits is not None and blend != "quintic":
             raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
-        rates = _rate_limits(rate_limit, space, self.control_dt)
+        rates = _rate_limits(rate_limit, self._controls)
         fewest = self._fewest(blend_time, rate_limit is not None or limits is not None)
         self._check = None if limits is None else self._bound_check(limits)
         self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rates, self._check)
@@ -184,22 +185,18 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         return self._queue.now * self.control_dt
 
     def _fewest(self, blend_time: float | None, limited: bool) -> int:
-        """The fewest control steps of a blend."""
-        size = (self.chunk_size - 1) * self._apart + 1
-        available = size - self._delay[1]
+        """The fewest control steps of a blend: without a time or a limit, as many as are left over at a seam."""
+        if blend_time is None and limited:
+            return 0
+        rest = (self.chunk_size - 1) * self._apart + 1 - self._delay[1]
+        fewest = rest - self.execution_horizon
         if blend_time is not None:
             fewest = max(whole_steps(positive("blend_time", blend_time, "s"), self.control_dt) - 1, 1)
-            if fewest >= available and size > 1:
-                left = f"{available} control steps of {self.control_dt} s"
-                longer = f"blend_time = {blend_time} s is longer than a chunk's rest, {left}"
-                raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
-            return fewest
-        if limited:
-            return 0
-        fewest = available - self.execution_horizon  # the least left-over
-        if fewest == 0:
-            has = f"chunk_size {size}, execution_horizon {self.execution_horizon}, inference_delay {self._delay[1]}"
-            raise ConfigurationError(f"{has}: no left-over to blend with: pass rate_limit or blend_time")
+        if fewest < 1 or (fewest >= rest and self.chunk_size > 1):
+            raise ConfigurationError(
+                f"a blend of {fewest} control steps does not fit into what is left of a chunk when it takes over, "
+                f"{rest} control steps: choose a longer chunk_size, a shorter blend_time, or pass rate_limit"
+            )
         return fewest
 
     def _bound_check(self, limits: SeamLimits) -> SeamCheck:
@@ -213,16 +210,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         return SeamCheck(limits, self._controls, self.control_dt, dynamics.torques, dynamics.inertia)
 
     def _checked(self, action: Any) -> Array:
-        expected = f"expected a chunk of shape {self.action_space.shape}"
-        given = numbers_of(action)
-        if given is None:
-            raise ActionError(f"{expected}, {OF_NUMBERS}, got {shown(action)}")
-        chunk = given.astype(np.float64)
-        if self.chunk_size == 1 and chunk.shape == (self._controls,):
-            return chunk[None]  # an ordinary policy's action
-        if chunk.shape != self.action_space.shape:
-            raise ActionError(f"{expected} (chunk_size, controls), got {chunk.shape}")
-        return chunk
+        given, shape = numbers_of(action), (self.chunk_size, self._controls)
+        one = given is not None and self.chunk_size == 1 and given.ndim == 1  # an ordinary policy's action
+        return action_array(action, shape[1:] if one else shape, np.float64).reshape(shape)
 
     def _admits(self, commands: Array) -> bool:
         return self._inside is None or self._inside.admits(commands[-1], len(commands))
@@ -439,24 +429,15 @@ def _sizes(
     return entries, horizon, delay, apart
 
 
-def _rate_limits(rate_limit: Any, space: gym.spaces.Box, control_dt: float) -> Array:
+def _rate_limits(rate_limit: Any, controls: int) -> Array:
     """The rate limit of every component, shape (m,), infinite for none."""
-    controls = space.shape[0]
     if rate_limit is None:
         return np.full(controls, np.inf)
-    each = rate_limit if isinstance(rate_limit, list | tuple | np.ndarray) else [rate_limit] * controls
-    if len(each) != controls:
+    each = [positive("rate_limit", one, "action units per second") for one in np.ravel(rate_limit)]
+    if len(each) not in (1, controls):
         wanted = f"one number, or one for each of the {controls} action components"
         raise ConfigurationError(f"rate_limit is {wanted}; got {rate_limit!r}")
-    rates = np.array([positive("rate_limit", one, "action units per second") for one in each])
-    # Rounding to the actions' dtype may add so much to the difference of two commands in the box.
-    ends = np.abs(np.concatenate([space.low, space.high]).astype(np.float64))
-    dtype: Any = space.dtype
-    resolution = 2.0 * float(np.finfo(dtype).eps) * float(ends[np.isfinite(ends)].max(initial=1.0))
-    if (rates * control_dt <= resolution).any():
-        least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
-        raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
-    return rates
+    return np.array(np.broadcast_to(each, controls))
 
 
 @lru_cache(maxsize=16)

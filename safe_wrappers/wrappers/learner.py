@@ -14,7 +14,7 @@ from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
-from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng, action_array
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, action_array
 
 
 class ActionRepeat(LayerWrapper):
@@ -233,33 +233,25 @@ class FilterObservation(LayerWrapper):
     ) -> None:
         LayerWrapper.__init__(self, env)
         inside = filter_inside(env)
-        if inside is None and constraints is None:
-            wanted = (
-                "FilterObservation(sw.protect(env)), or constraints=[...] to observe them without a filter"
-            )
-            raise ConfigurationError(f"FilterObservation needs a filter inside or constraints: {wanted}")
-        if inside is not None and (constraints is not None or plant is not None):
+        if (inside is None) == (constraints is None) or (inside is not None and plant is not None):
             raise ConfigurationError(
-                "FilterObservation shows what the filter inside decides by; leave constraints and plant out"
+                "FilterObservation shows what a filter inside decides by, FilterObservation(sw.protect(env)), or without "
+                "one what constraints=[...] observe"
             )
         self.neighbours = whole_number("neighbours", neighbours, least=0)
-        if constraints is not None:
-            observer = CBFActionFilter(env, constraints, plant)
         self._acts = inside is not None
-        self._observer = inside if inside is not None else observer
-        low, high = np.ravel(self._observer.action_space.low), np.ravel(self._observer.action_space.high)  # type: ignore[attr-defined]
-        self._low, self._high = low.astype(np.float64), high.astype(np.float64)
+        self._observer = CBFActionFilter(env, constraints or (), plant) if inside is None else inside
+        space: Any = self._observer.action_space
+        self._low, self._high = (np.ravel(end).astype(np.float64) for end in (space.low, space.high))
         self._counts = [c.feature_count(self.neighbours) for c in self._observer.filter.bound]
-        count = sum(self._counts) + low.size
+        count = sum(self._counts) + self._low.size
         self._widen_observation(KEY, spaces.Box(-1.0, 1.0, (count,), np.float32))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; no correction yet."""
-        observation, info = self.env.reset(seed=seed, options=options)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         if not self._acts:
             self._observer.plant.received(observation, info)
             self._observer.filter.start()
-        return self._with_features(observation, np.zeros(self._low.size)), info
+        return self._with_features(observation, np.zeros(self._low.size))
 
     def step(self, action: Any) -> Step:
         """Step the env, and look at the state that it has reached as the filter will."""

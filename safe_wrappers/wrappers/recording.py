@@ -64,9 +64,7 @@ class CostFunction(LayerWrapper):
                 # Without a colon a name could also be a module's, which is no function.
                 function = pkgutil.resolve_name(fn) if ":" in fn else None
             except (ImportError, AttributeError, ValueError) as error:
-                raise ConfigurationError(
-                    f"fn: {fn!r} ('module:function') cannot be imported: {error}"
-                ) from None
+                raise ConfigurationError(f"fn: {fn!r} cannot be imported: {error}") from None
         if not callable(function):
             raise ConfigurationError(f"fn is a function of the env or its name 'module:function'; got {fn!r}")
         self._saved_kwargs["fn"] = _reference(function)
@@ -84,11 +82,9 @@ class CostFunction(LayerWrapper):
 
     def _judge(self, info: dict[str, Any]) -> None:
         refuse_own_cost(self.unwrapped, info)
-        given = self.fn(self.unwrapped)
-        cost = np.asarray(given)
+        cost = np.asarray(given := self.fn(self.unwrapped))
         if cost.shape != () or cost.dtype.kind not in "biuf" or not np.isfinite(cost):
-            name = getattr(self.fn, "__name__", repr(self.fn))
-            raise ConfigurationError(f"the cost function {name} must return one finite number, got {given!r}")
+            raise ConfigurationError(f"{self.fn} must return one finite number as cost, got {given!r}")
         info[keys.COST] = float(cost)
 
 
