@@ -118,8 +118,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         ),
     },
     "CostFunction": {
-        "a function": ("Reacher-v5", lambda: {"fn": _joint_speed}),
-        "its name": ("Reacher-v5", lambda: {"fn": f"{__name__}:_joint_speed"}),
+        "a function by its name": ("Reacher-v5", lambda: {"fn": f"{__name__}:_joint_speed"}),
     },
     "FilterObservation": {
         "constraints without a filter": (

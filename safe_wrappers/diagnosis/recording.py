@@ -70,7 +70,6 @@ class Recording:
     env: Env
     infos: list[dict[str, Any]]  # with those of a contact and a balance monitor, where the env allows them
     struck: list[tuple[str, str] | None]  # bodies with the largest force
-    touching: list[Array]  # pairs of geoms, ids, after each step, shape (n, 2)
     first: np.ndarray  # steps of episodes, shape (k,)
     terminated: np.ndarray
     executed: Array  # actions that the unwrapped env was given, shape (k, m)
@@ -161,19 +160,11 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
             over = bool(terminated or truncated)
             struck = None if contacts is None else contacts.peak_bodies
             diverged = _divergences(data) > before
-            rows.append((info, struck, *_physics(data), first, terminated, spy.given, diverged))
-    infos, bodies, touching, qpos, qvel, first, terminated, executed, diverged = zip(*rows, strict=True)
-    arrays = (np.array(column) for column in (first, terminated, executed, qpos, qvel, diverged))
-    return Recording(env, list(infos), list(bodies), list(touching), *arrays)
+            state = (np.empty(0), np.empty(0)) if data is None else (data.qpos.copy(), data.qvel.copy())
+            rows.append((info, struck, first, terminated, spy.given, *state, diverged))
+    infos, bodies, *arrays = zip(*rows, strict=True)
+    return Recording(env, list(infos), list(bodies), *map(np.array, arrays))
 
 
 def _divergences(data: mujoco.MjData | None) -> int:
     return 0 if data is None else int(sum(data.warning[kind].number for kind in _DIVERGED))
-
-
-def _physics(data: mujoco.MjData | None) -> tuple[Array, Array, Array]:
-    """Geoms that touch, shape (n, 2), positions and velocities."""
-    if data is None:
-        return np.empty((0, 2), dtype=int), np.empty(0), np.empty(0)
-    contact = data.contact
-    return contact.geom[: data.ncon][contact.dist[: data.ncon] <= 0.0], data.qpos.copy(), data.qvel.copy()

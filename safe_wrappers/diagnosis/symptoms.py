@@ -5,7 +5,6 @@ from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.constraints import ImpactSpeedLimit, JointPositionLimit, PredictiveShield
@@ -23,9 +22,7 @@ from safe_wrappers.wrappers.recipes import recipe_of
 
 PRESSED = 0.02
 """Share of a joint's range by which it is beyond its stop."""
-_PLANE, _FIELD, _SPHERE, _CYLINDER = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("PLANE", "HFIELD", "SPHERE", "CYLINDER")
-)
+_SPHERE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 
 
 class Treatment(NamedTuple):
@@ -67,18 +64,17 @@ def _filtered(constraint: Callable[..., Any], advice: str = "", **arguments: Any
     )
 
 
-def _is_protected_by_recipe(env: Env) -> bool:
-    """Whether `protect` has a recipe for the env, and accepts what is around it."""
+def _recommended(env: Env) -> list[str]:
+    """Kinds of the constraints that `protect` has for the env; none where it refuses what is around it."""
     if env.spec is None or recipe_of(env.spec.id) is None:
-        return False
+        return []
     try:
-        protect(env)
+        return [type(constraint).__name__ for constraint in protect(env).constraints]
     except ConfigurationError:
-        return False
-    return True
+        return []
 
 
-# limits: declared costs, joints that press their stops, contacts with what is fixed
+# limits: declared costs, joints that press their stops
 
 
 def _beyond(recording: Recording) -> tuple[list[str], Array]:
@@ -92,41 +88,26 @@ def _beyond(recording: Recording) -> tuple[list[str], Array]:
     return [model.joint(j).name for j in joints], np.maximum(low - position, position - high) / (high - low)
 
 
-def _touches_fixed(recording: Recording) -> NDArray[np.bool_]:
-    """Whether the machine touches something fixed that is no ground, shape (k,)."""
-    model = recording.model
-    if model is None:
-        return np.zeros(len(recording.first), dtype=bool)
-    solid = fixed_bodies(model)[model.geom_bodyid] & ~np.isin(model.geom_type, (_PLANE, _FIELD))
-    roots = model.body_rootid[model.jnt_bodyid[driven_joints(model)]]
-    machine = np.isin(model.body_rootid[model.geom_bodyid], roots) & ~solid
-    hit = np.outer(solid, machine) | np.outer(machine, solid)
-    return np.array([hit[tuple(pairs.T)].any() for pairs in recording.touching])
-
-
 def _measure_limits(recording: Recording) -> float:
-    """The share of steps with a cost, a driven joint beyond its stop, or a contact with what is fixed."""
+    """The share of steps with a cost, or with a driven joint beyond its stop."""
     cost = recording.of_info("cost")
     if np.isnan(cost).all() and recording.model is None:
         raise NotMeasuredError(
             "the env reports no cost in info, and has no MuJoCo model whose limits could be read"
         )
     pressed = (_beyond(recording)[1] > PRESSED).any(axis=1)
-    return float(((cost > 0.0) | pressed | _touches_fixed(recording)).mean())
+    return float(((cost > 0.0) | pressed).mean())
 
 
 def _treat_limits(recording: Recording) -> Treatment:
-    if _is_protected_by_recipe(recording.env):
+    if _recommended(recording.env):
         return _wrapped(protect)
     names, beyond = _beyond(recording)
     if (beyond > PRESSED).any():
         pressed = [name for name, shares in zip(names, beyond.T, strict=True) if shares.max() > 0.0]
         return _filtered(JointPositionLimit, joints=pressed, margin=0.0, horizon=recording.braking_horizon)
-    if (recording.of_info("cost") > 0.0).any():
-        advice = "Choose a backup that stops your machine, and a horizon that is as long as it takes."
-        return _filtered(PredictiveShield, advice, h="cost", horizon=20, backup="zero")
-    advice = "Say where the fixed things are: Workspace(keep_out=[...]), Clearance or PredictiveShield."
-    return Treatment("", None, advice)
+    advice = "Choose a backup that stops your machine, and a horizon that is as long as it takes."
+    return _filtered(PredictiveShield, advice, h="cost", horizon=20, backup="zero")
 
 
 # command_steps: commands that spike
@@ -171,11 +152,11 @@ def _measure_forces(recording: Recording) -> float:
 
 
 def _treat_forces(recording: Recording) -> Treatment:
-    """`protect`, where it keeps the machine off what is fixed; else a limit of the pair that hit hardest."""
+    """`protect`, where it keeps the machine clear; else a limit of the pair that hit hardest."""
     if recording.diverged.any():
         advice = "The simulation diverged: a shorter timestep, softer contacts, or weaker actuators."
         return Treatment("", None, advice)
-    if _touches_fixed(recording).any() and _is_protected_by_recipe(recording.env):
+    if any(kind.endswith("Clearance") for kind in _recommended(recording.env)):
         return _wrapped(protect)
     forces = np.nan_to_num(recording.of_info("contact/peak_force"), nan=0.0)
     k = int(np.argmax(forces))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -149,8 +149,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback.reset()
         self._queue.reset()
         self._executed: list[Array] = []
+        self._commands: list[Command] = []
         self._observed_s, self._clipped, self._refused = 0.0, 0.0, False
-        self._starved = self._limited = 0
         info.update(self._measured())
         return observation
 
@@ -167,9 +167,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     def _control_step(self) -> Step:
         command = self._queue.next(self._admits, self._fallback.command)
-        self._refused |= command.refused
-        self._starved += command.starved
-        self._limited += command.limited
+        self._commands.append(command)
         if self._inside is not None:
             observed_s = None if command.observed < 0 else command.observed * self.control_dt
             self._inside.set_observation_time(observed_s)
@@ -245,17 +243,21 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         """The info of the control steps since the last call."""
         executed = np.array(self._executed).reshape(-1, self._controls)
         peak = float(np.abs(np.diff(executed, axis=0)).max(initial=0.0)) / self.control_dt
-        if self._limited:
+        starved, limited, refused = (
+            sum(getattr(command, what) for command in self._commands)
+            for what in ("starved", "limited", "refused")
+        )
+        if limited:
             message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
             self._warn_once("limited", message)
         report = {
             keys.HANDOVER_PEAK_JERK: peak,
-            keys.HANDOVER_STARVED: self._starved,
-            keys.HANDOVER_LIMITED: self._limited,
-            keys.HANDOVER_REFUSED: self._refused,
+            keys.HANDOVER_STARVED: starved,
+            keys.HANDOVER_LIMITED: limited,
+            keys.HANDOVER_REFUSED: self._refused or refused > 0,
             keys.ACTION_CLIPPED: self._clipped,
         }
-        self._executed, self._starved, self._limited = self._executed[-1:], 0, 0
+        self._executed, self._commands = self._executed[-1:], []
         return report
 
 
@@ -440,12 +442,6 @@ def _rate_limits(rate_limit: Any, controls: int) -> Array:
     return np.array(np.broadcast_to(each, controls))
 
 
-@lru_cache(maxsize=16)
-def _spline_weights(entries: int, steps: int) -> Array:
-    """The spline is linear in the entries: one matrix for all chunks."""
-    return np.asarray(hermite_spline(np.eye(entries), float(steps))(np.arange((entries - 1) * steps + 1.0)))
-
-
 def upsampled(chunk: Array, steps: int) -> Array:
     """Commands on a cubic Hermite spline through entries (H, m) that lie so many control steps apart.
 
@@ -453,6 +449,6 @@ def upsampled(chunk: Array, steps: int) -> Array:
     """
     if steps == 1:
         return chunk
-    commands = _spline_weights(len(chunk), steps) @ chunk
+    commands = hermite_spline(chunk, float(steps))(np.arange((len(chunk) - 1) * steps + 1.0))
     commands[::steps] = chunk
-    return commands
+    return np.asarray(commands)

@@ -235,8 +235,8 @@ class FilterObservation(LayerWrapper):
         inside = filter_inside(env)
         if (inside is None) == (constraints is None) or (inside is not None and plant is not None):
             raise ConfigurationError(
-                "FilterObservation shows what a filter inside decides by, FilterObservation(sw.protect(env)), or without "
-                "one what constraints=[...] observe"
+                "FilterObservation(sw.protect(env)) shows what the filter inside decides by; without one give it "
+                "constraints=[...], which then observe alone"
             )
         self.neighbours = whole_number("neighbours", neighbours, least=0)
         self._acts = inside is not None

@@ -52,7 +52,7 @@ class StepMonitor(LayerWrapper, ABC):
         answer = self._pass_on(action)
         raw = self._raw
         self._forget()
-        whole = self._replay.after(self._visit)
+        whole = self._replay.after(lambda data, _: self._visit(data))
         if not whole:
             message = (
                 f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
@@ -60,7 +60,7 @@ class StepMonitor(LayerWrapper, ABC):
             )
             self._warn_once("partial", message)
             self._forget()
-            self._visit(raw.data, float(raw.model.opt.timestep))
+            self._visit(raw.data)
         answer[4].update(self._figures(raw.data) | {self.partial: not whole})
         return answer
 
@@ -69,8 +69,8 @@ class StepMonitor(LayerWrapper, ABC):
         """Forget what was visited; the env may have made itself another model."""
 
     @abstractmethod
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
-        """Look at one evaluation of the physics, which acts for some time, s."""
+    def _visit(self, data: mujoco.MjData) -> None:
+        """Look at one evaluation of the physics."""
 
     @abstractmethod
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
@@ -141,7 +141,7 @@ class ContactMonitor(StepMonitor):
         self._peak = 0.0
         self._peak_bodies: tuple[int, int] | None = None
 
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+    def _visit(self, data: mujoco.MjData) -> None:
         pairs: dict[tuple[int, int], float] = {}
         for bodies, gap, force in self._contacts.read(data):
             self._gaps.append(gap)
@@ -232,7 +232,7 @@ class BalanceMonitor(StepMonitor):
             self._take(self.bodies)
         self._contacts.clear()
 
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+    def _visit(self, data: mujoco.MjData) -> None:
         self._contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:

@@ -92,8 +92,8 @@ _RAIL = Clearance(
 _CLAMP = Plane([0.0, CLAMP_Y], [0.0, -1.0])
 
 
-def _safe_rover(env: Env, max_slip: float = 0.15, friction: float | None = None) -> Recommended:
-    return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
+def _safe_rover(env: Env) -> Recommended:
+    return [Traction(env.unwrapped.wheels)]  # type: ignore[attr-defined]
 
 
 def _of_what_is_known(env: Env, option: str, chosen: str, radius: float, true: str, sigmas: float) -> Any:
