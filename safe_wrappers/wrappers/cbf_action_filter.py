@@ -57,7 +57,6 @@ class CBFActionFilter(LayerWrapper):
 
     Attributes:
         filter: The `SafetyFilter` that decides; `filter.bound` are the constraints on the plant.
-        added_margin: Added to every constraint's own; `set_margin` changes it.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         warned: What has been warned of: "nonfinite", "clipped", "mismatch", and "unsafe" until the next reset.
         started: Whether there is an episode: the last reset has not failed.
@@ -92,13 +91,13 @@ class CBFActionFilter(LayerWrapper):
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
         own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
-        self.added_margin = margin = non_negative("margin", margin, "the constraints' own units")
-        self._own = own
+        if margin := non_negative("margin", margin, "the constraints' own units"):
+            own = [c.widened(margin) for c in own]
         self.constraint_names = _unique([type(c).__name__ for c in own])
         self.plant: Plant = plant if plant is not None else default_plant(env, own)
         self.plant.bind(env)
-        self._fallback = fallback
-        self.filter = self._filter(margin)
+        of_actions = self._low, self._high, self._dtype, self._search
+        self.filter = SafetyFilter(self.plant, own, fallback, *of_actions)
         self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
         self._deciding = threading.RLock()
@@ -125,31 +124,6 @@ class CBFActionFilter(LayerWrapper):
             vars(given).update({k: v for k, v in vars(bound.spec).items() if k in ("promise", "validated")})
         return list(self.filter.constraints)
 
-    def _filter(self, margin: float) -> SafetyFilter:
-        of_actions = self._low, self._high, self._dtype, self._search
-        widened = [c.widened(margin) for c in self._own] if margin else self._own
-        return SafetyFilter(self.plant, widened, self._fallback, *of_actions)
-
-    def set_margin(self, margin: float) -> None:
-        """Add this to every constraint's own margin from the next decision on, in place of `margin`.
-
-        What constraints remember of the episode stays. From a state that a wider margin finds too near, constraints
-        lead back, as from every such state. Not for the filters inside a `VectorCBFActionFilter`, which decides for
-        them.
-
-        Args:
-            margin: At least 0, in each constraint's own unit.
-
-        Raises:
-            ConfigurationError: It is negative, or leaves nothing of some limit; the margin stays as it was.
-        """
-        margin = non_negative("margin", margin, "the constraints' own units")
-        before = self.filter
-        self.filter = self._filter(margin)
-        self.added_margin = margin
-        self.filter.take_over(before)
-        self._observed = False
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning.
 
@@ -163,7 +137,7 @@ class CBFActionFilter(LayerWrapper):
             self.filter.start()
             info |= dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
             info[keys.CBF_MARGIN], info[keys.CBF_UNSAFE] = self._margin()
-            info[keys.CBF_REFUSED] = np.zeros(len(self._own), dtype=bool)
+            info[keys.CBF_REFUSED] = np.zeros(len(self.filter.bound), dtype=bool)
             info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
             # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
             info[keys.PROPOSED_ACTION], info[keys.EXECUTED_ACTION] = np.zeros((2, *self._shape))
@@ -243,7 +217,7 @@ class CBFActionFilter(LayerWrapper):
                 # What fails least may be the proposal itself, and a change may be lost in rounding.
                 intervened &= bool((executed != np.clip(proposed, self._low, self._high)).any())
         self.filter.executed(executed)
-        none = np.zeros(len(self._own), dtype=bool)
+        none = np.zeros(len(self.filter.bound), dtype=bool)
         return sent, {
             keys.CBF_INTERVENED: intervened,
             keys.CBF_INFEASIBLE: decision.infeasible,

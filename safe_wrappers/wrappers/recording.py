@@ -83,7 +83,9 @@ class CostFunction(LayerWrapper):
         refuse_own_cost(self.unwrapped, info)
         cost = np.asarray(given := self.fn(self.unwrapped))
         if cost.shape != () or cost.dtype.kind not in "biuf" or not np.isfinite(cost):
-            raise ConfigurationError(f"the cost function {self.fn} must return one finite number, got {given!r}")
+            raise ConfigurationError(
+                f"the cost function {self.fn} must return one finite number, got {given!r}"
+            )
         info[keys.COST] = float(cost)
 
 

@@ -58,19 +58,6 @@ def _check_algorithm(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class MarginCurriculumConfig(Section):
-    """How the margin of an arm's filter changes in training, in hundredths of the way."""
-
-    start: Annotated[Number, Field(ge=0)]
-    """Added margin at the first step, in the constraints' own unit; never below 0, so that constraints keep at least
-    their own."""
-    end: Annotated[Number, Field(ge=0)] = 0.0
-    """Added margin from `until` on; linear between."""
-    until: Annotated[Number, Field(gt=0, le=1)] = 1.0
-    """Share of `total_steps`."""
-
-
-@dataclass(frozen=True)
 class LearnerConfig(Section):
     """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
 
@@ -82,11 +69,8 @@ class LearnerConfig(Section):
     """For `adaption_penalty`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
     """For the same: taken off per unit of correction."""
-    margin_curriculum: MarginCurriculumConfig | None = None
-    """A margin that the arm's filter adds in training and that changes; see [its
-    keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
     cost_limit: Annotated[Number, Field(ge=0)] | None = None
-    """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-margin-that-changes-and-a-price-on-cost)
+    """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-price-on-cost)
     puts a price on cost, in training; with PPO this is PPO-Lagrangian. For any algorithm and arm, also without a
     filter."""
     multiplier_rate: Annotated[Number, Field(gt=0)] = 1e-3
