@@ -2,7 +2,6 @@
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from safe_wrappers import info as keys
@@ -85,14 +84,12 @@ class LagrangianMultiplier(BaseCallback):
         return float(getattr(self.model, "lagrangian_multiplier", 0.0))
 
     def _on_training_start(self) -> None:
-        if isinstance(self.model, OffPolicyAlgorithm) and self.model.get_vec_normalize_env() is not None:
+        replays = getattr(self.model, "replay_buffer", None)
+        scaled = replays is not None and self.model.get_vec_normalize_env() is not None
+        if scaled or isinstance(replays, HerReplayBuffer):
             raise ConfigurationError(
-                "LagrangianMultiplier: an off-policy learner behind a VecNormalize stores the env's own rewards,"
-                " without a price on cost; leave VecNormalize out, or use an on-policy learner"
-            )
-        if isinstance(getattr(self.model, "replay_buffer", None), HerReplayBuffer):
-            raise ConfigurationError(
-                "LagrangianMultiplier: hindsight replay has rewards without a price on cost; use another buffer"
+                "LagrangianMultiplier: off-policy learners with hindsight replay or a VecNormalize learn from"
+                " the env's own rewards, without a price on cost; leave that out, or use an on-policy learner"
             )
         self._episode_cost = np.zeros(self.training_env.num_envs)
 

@@ -344,24 +344,21 @@ class OcclusionPenalty(LayerWrapper):
         range_m = math.inf if s.range_m is None else s.range_m
         self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m)
         self.ego_motion = EgoMotion(s.imu, self._sight) if isinstance(s.imu, Imu) else None
+        found = [(name, body, track) for track in self.tracks for name, body in self._followed(track, model)]
+        self._bodies = np.array([body for _, body, _ in found], dtype=np.intp)
+        self._owners = [track for *_, track in found]
+        return [name for name, *_ in found]
+
+    def _followed(self, track: Track, model: mujoco.MjModel) -> list[tuple[str, int]]:
+        """Names and ids of a track's bodies, or of its points, whose ids are -1."""
+        if track.bodies is None:
+            return [(f"{track.published}[{i}]", -1) for i in range(len(self._published(track)))]
         there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
-        names: list[str] = []
-        self._owners: list[Track] = []
-        bodies: list[int] = []  # -1 for a published point
-        for track in self.tracks:
-            if track.bodies is None:
-                found = {f"{track.published}[{i}]": -1 for i in range(len(self._published(track)))}
-            else:
-                found = {name: b for name, b in there.items() if fnmatchcase(name, track.bodies)}
-            if not found:
-                known = ", ".join(there) or "none"
-                raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {known}")
-            names += found
-            bodies += found.values()
-            self._owners += [track] * len(found)
-        self._bodies = np.array(bodies, dtype=np.intp)
-        self._in_model = self._bodies >= 0
-        return names
+        found = [(name, b) for name, b in there.items() if fnmatchcase(name, track.bodies)]
+        if not found:
+            known = ", ".join(there) or "none"
+            raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {known}")
+        return found
 
     def _published(self, track: Track) -> Array:
         points = np.asarray(read_attribute(self.env, track.published or ""), dtype=np.float64)
@@ -373,14 +370,10 @@ class OcclusionPenalty(LayerWrapper):
     def _truth(self) -> tuple[Array, Array | None]:
         """True positions, shape (n, 3), m, and velocities, (n, d), m/s, if the sensor measures them."""
         sight = self._sight
-        positions = np.empty((len(self.track_names), 3))
-        if self._in_model.any():
-            positions[self._in_model] = sight.data.xpos[self._bodies[self._in_model]]
+        positions = np.array(sight.data.xpos[self._bodies])
         velocities = None
-        if self.sensor.velocity_std is not None:
-            velocities = np.empty((len(positions), self._d))
-            for i in np.flatnonzero(self._in_model):
-                velocities[i] = sight.velocity(int(self._bodies[i]))[0][: self._d]
+        if self.sensor.velocity_std is not None:  # then all of them are bodies
+            velocities = np.stack([sight.velocity(int(body))[0][: self._d] for body in self._bodies])
         for track in self.tracks:
             if track.published is not None:
                 points = self._published(track)

@@ -264,17 +264,17 @@ class TeleopChannel(CommandGate):
             raise ConfigurationError(f"coding is one of {', '.join(get_args(Coding))}; got {coding!r}")
         self._port = Port(env) if env.has_wrapper_attr("port_flow") else None
         self._waves: WaveCoding | None = None
-        if coding == "plain" and impedance is not None:
-            raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
-        if coding == "wave":
+        if (coding == "wave") != (impedance is not None):
+            raise ConfigurationError(
+                f'coding="wave" takes an impedance in N s/m, plain coding none; got {impedance!r}'
+            )
+        if impedance is not None:
             if self._port is None:
                 published = "port_flow, port_effort_observed, port_feedthrough and port_effort_acted"
                 raise ConfigurationError(
                     f'coding="wave" needs a port: {env.unwrapped!r} publishes no {published}'
                 )
             refuse_changed_actions(env)
-            if impedance is None:
-                raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
             self._waves = WaveCoding(self._port, self.control_dt, positive("impedance", impedance, "N s/m"))
         self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
         self._down = Line(self.downlink, "TeleopChannel down 0", self._same_s)
