@@ -9,8 +9,8 @@ from matplotlib.patches import Circle
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, panels
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.stopping import held_stop
+from safe_wrappers.errors import Array
 
 BRAKE, HOLD, DELAY = 2.0, 0.25, 0.2
 CENTER, RADIUS = (2.0, 0.12), 0.5

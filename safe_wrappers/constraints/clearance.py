@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.obstacles import (
     Nearest,
     Plain,
@@ -19,7 +18,15 @@ from safe_wrappers.control.backup.stopping import (
     approach_rows_of,
     approaches,
 )
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    UnknownNameError,
+    check_fields,
+    name_list,
+    non_negative,
+    positive,
+)
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant

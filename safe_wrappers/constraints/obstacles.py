@@ -7,7 +7,6 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from safe_wrappers.checks import Array, finite_array, non_negative, positive, settings_from
 from safe_wrappers.control.estimation import Tracks
 from safe_wrappers.control.numerics.shapes import (
     BLOCK,
@@ -17,7 +16,14 @@ from safe_wrappers.control.numerics.shapes import (
     nearest_points,
     surface_distances,
 )
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    finite_array,
+    non_negative,
+    positive,
+    settings_from,
+)
 from safe_wrappers.plants.plant import Plant
 
 _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)  # of the horizon, at which growth is looked at; the first: its rate now

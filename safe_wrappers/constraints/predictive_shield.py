@@ -11,8 +11,15 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, non_negative, one_number, whole_number
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    UnknownNameError,
+    UnsupportedEnvError,
+    non_negative,
+    one_number,
+    whole_number,
+)
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.plant import Model, Plant
 from safe_wrappers.plants.simulator import NotFiniteError, View

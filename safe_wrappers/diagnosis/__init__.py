@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import gymnasium as gym
 
-from safe_wrappers.checks import whole_number
 from safe_wrappers.diagnosis.recording import (
     Driver,
     Env,
@@ -20,7 +19,7 @@ from safe_wrappers.diagnosis.recording import (
     record,
 )
 from safe_wrappers.diagnosis.symptoms import SYMPTOMS
-from safe_wrappers.errors import SafeWrappersError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import SafeWrappersError, UnknownNameError, UnsupportedEnvError, whole_number
 from safe_wrappers.plants.env_checks import name_of
 
 __all__ = ["SYMPTOMS", "Diagnosis", "Finding", "diagnose"]

@@ -12,8 +12,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, finite_action
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError, finite_action
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 

@@ -6,12 +6,11 @@ from typing import Any, Final, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.constraints import ImpactSpeedLimit, JointPositionLimit, PredictiveShield
 from safe_wrappers.constraints.joints import driven_joints
 from safe_wrappers.control.vehicle import slip_ratio
 from safe_wrappers.diagnosis.recording import Env, NotMeasuredError, Recording, box
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.plants.env_checks import check_timing, name_of
 from safe_wrappers.plants.mujoco.model import HINGE, fixed_bodies, weight_n
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.projection import load_solvers
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction

@@ -6,8 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import positive
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, positive
 
 _REPEATS = ("StickyAction", "MaxAndSkipObservation", "RepeatAction")
 

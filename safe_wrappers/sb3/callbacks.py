@@ -5,8 +5,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, non_negative, positive
 
 
 class InterventionCallback(BaseCallback):

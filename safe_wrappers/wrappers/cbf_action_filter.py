@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative
-from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
+from safe_wrappers.errors import Array, ConfigurationError, UnsafeStateWarning, non_negative
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
@@ -20,9 +19,9 @@ from safe_wrappers.filter.search import SafeActionSearch, Stage
 from safe_wrappers.plants import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import constraint_from
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, action_array
+from safe_wrappers.wrappers.serialize import constraint_from
+from safe_wrappers.wrappers.stack import Layer
 
 SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, numbers_of, positive, settings_from, whole_number
 from safe_wrappers.control.handover import (
     BLENDS,
     LOOK_BACK,
@@ -22,14 +21,21 @@ from safe_wrappers.control.handover import (
     shortest_blend,
     smoothstep,
 )
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    UnknownNameError,
+    numbers_of,
+    positive,
+    settings_from,
+    whole_number,
+)
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.mujoco.dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import (
     SAME_STEP,
     CommandReceiver,
@@ -41,6 +47,7 @@ from safe_wrappers.wrappers.layer import (
     receiver_inside,
     whole_steps,
 )
+from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.stopping import FallbackController, bound_plant
 
 

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, numbers_of, positive
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, non_negative, numbers_of, positive
 from safe_wrappers.plants.env_checks import check_timing, wrappers_of
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import (
     CommandReceiver,
     Env,
@@ -22,6 +20,7 @@ from safe_wrappers.wrappers.layer import (
     action_array,
     receiver_inside,
 )
+from safe_wrappers.wrappers.stack import Layer
 
 __all__ = [
     "FAULTS",

@@ -15,12 +15,18 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import OF_NUMBERS, numbers_of, shown
-from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import (
+    OF_NUMBERS,
+    ActionError,
+    ConfigurationError,
+    UnsupportedEnvError,
+    numbers_of,
+    shown,
+)
 from safe_wrappers.plants import Plant, PlantTemplate
 from safe_wrappers.plants.env_checks import wrappers_of
-from safe_wrappers.serialize import plain_data
-from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.wrappers.serialize import plain_data
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 
 Env = gym.Env[Any, Any]
 Reset = tuple[Any, dict[str, Any]]

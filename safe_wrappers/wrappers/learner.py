@@ -8,13 +8,12 @@ import numpy as np
 from gymnasium import spaces
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, positive, whole_number
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, non_negative, positive, whole_number
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, action_array
+from safe_wrappers.wrappers.stack import Layer
 
 
 class ActionRepeat(LayerWrapper):

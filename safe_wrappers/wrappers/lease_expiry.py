@@ -10,18 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, non_negative, positive, settings_from
 from safe_wrappers.control.handover import smoothstep
 from safe_wrappers.control.watchdog import admits, checked_limits, jerk_limited_time
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    UnsupportedEnvError,
+    non_negative,
+    positive,
+    settings_from,
+)
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.mujoco.binding import actions_are_controls
 from safe_wrappers.plants.mujoco.model import control_range
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, Step, action_array, whole_steps
+from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.stopping import (
     BoundBudget,
     CommandGate,

@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, finite_array, non_negative, positive, settings_from
 from safe_wrappers.control.dead_reckoning import (
     DeadReckoning,
     from_sensor,
@@ -20,13 +19,23 @@ from safe_wrappers.control.dead_reckoning import (
     to_sensor,
 )
 from safe_wrappers.control.estimation import Motion, Tracks, largest_deviation, unobservable_directions
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    SafeWrappersError,
+    UnknownNameError,
+    check_fields,
+    finite_array,
+    non_negative,
+    positive,
+    settings_from,
+)
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import physics_steps
 from safe_wrappers.plants.mujoco.line_of_sight import LineOfSight
 from safe_wrappers.plants.mujoco.model import named
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, mujoco_env
+from safe_wrappers.wrappers.stack import Layer
 
 __all__ = ["Imu", "Sensor", "Track"]
 

@@ -7,11 +7,17 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, numbers_of, shown
 from safe_wrappers.constraints.contact_feasibility import ContactFeasibility, SupportMargin
 from safe_wrappers.constraints.joints import JointPositionLimit, refuse_uncovered_stops, stops
 from safe_wrappers.constraints.traction import Traction
-from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import (
+    ActionError,
+    ConfigurationError,
+    UnsupportedEnvError,
+    non_negative,
+    numbers_of,
+    shown,
+)
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.search import DiscreteSearch

@@ -11,10 +11,10 @@ from safe_wrappers.constraints import JointSpeedLimit, PredictiveShield
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.simulator import SimulatorPlant
-from safe_wrappers.stack import refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.presets import ActionShield
 from safe_wrappers.wrappers.recipes import EVERY, PLANTS, family_of, recipe_of
+from safe_wrappers.wrappers.stack import refuse_order
 from safe_wrappers.wrappers.vector_cbf_action_filter import EACH, VectorCBFActionFilter, single_envs
 
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]

@@ -14,8 +14,8 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step
+from safe_wrappers.wrappers.stack import Layer
 
 COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
 """The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""

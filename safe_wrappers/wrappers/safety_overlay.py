@@ -11,18 +11,17 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array
 from safe_wrappers.constraints.obstacles import Plain, Plane, TrackedDiscs
 from safe_wrappers.constraints.points import Workspace
 from safe_wrappers.control.numerics.shapes import BLOCK, PLANE
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step
+from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.strip import ACTIONS, STEPS, with_strip, words_of
 
 Mark = dict[str, Any]

@@ -9,19 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative, positive
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.plants import default_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import constraint_from
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.layer import SAME_STEP, CommandReceiver, Env, LayerWrapper, Step
+from safe_wrappers.wrappers.serialize import constraint_from
 
 ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
 """Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 Pixels = NDArray[np.uint8]
 Colour = tuple[int, int, int]

@@ -10,16 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, non_negative, positive, settings_from, true_or_false
 from safe_wrappers.control.teleop import ChannelLedger
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    check_fields,
+    non_negative,
+    positive,
+    settings_from,
+    true_or_false,
+)
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.faults import OnOffProcess, probability
 from safe_wrappers.wrappers.layer import SAME_STEP, Env, Step, WrapperRng, action_array
+from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.stopping import (
     BoundBudget,
     CommandGate,

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.teleop import WaveLine, effort_and_outgoing, port_energy, to_waves
+from safe_wrappers.errors import Array
 from safe_wrappers.wrappers.layer import Env
 
 

@@ -12,7 +12,7 @@ import safe_wrappers as sw
 from safe_wrappers import constraints as of
 from safe_wrappers.constraints.obstacles import obstacle_from
 from safe_wrappers.errors import UnknownNameError
-from safe_wrappers.serialize import constraint_from, plain_data
+from safe_wrappers.wrappers.serialize import constraint_from, plain_data
 
 OBSTACLES = [
     of.Box([1.0, 0.0, 0.0], [0.1, 0.2, 0.3]),

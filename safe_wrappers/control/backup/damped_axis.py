@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled
+from safe_wrappers.errors import Array
 
 _MOST_HOLDS: Final = 4096
 """Length of the table, in holds of full braking; the distance beyond it is infinite."""

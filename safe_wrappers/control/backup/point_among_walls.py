@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup import damped_axis as along
 from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.compiled import compiled
 from safe_wrappers.control.numerics.shapes import Rectangle, apart, closer, nearest, one_of
+from safe_wrappers.errors import Array
 
 Pair = tuple[float, float]
 """Numbers along x and along y."""

@@ -9,7 +9,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup import damped_axis as along
 from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.backup.point_among_walls import (
@@ -27,6 +26,7 @@ from safe_wrappers.control.backup.point_among_walls import (
 )
 from safe_wrappers.control.compiled import compiled, hypot
 from safe_wrappers.control.numerics.shapes import Rectangle, closer, gaps, nearest, one_of
+from safe_wrappers.errors import Array
 
 HAIR_M: Final = 1e-7
 """Extra distance of corrections, for rounding to float32."""

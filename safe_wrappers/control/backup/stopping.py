@@ -11,9 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled
 from safe_wrappers.control.numerics.shapes import nearest_points
+from safe_wrappers.errors import Array
 
 _RETREAT_RATE: Final = 1.0
 """1/s: rate at which a violation is to shrink."""

@@ -14,9 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled, hypot
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 
 Rectangle = tuple[float, float, float, float]
 """x from, x to, y from, y to, m."""

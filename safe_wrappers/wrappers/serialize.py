@@ -4,9 +4,8 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from safe_wrappers import constraints
-from safe_wrappers.checks import settings_from
 from safe_wrappers.constraints.obstacles import KINDS as OBSTACLES
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, settings_from
 from safe_wrappers.filter.constraint import Constraint
 
 _EXPORTED = [getattr(constraints, name) for name in constraints.__all__ if name != "Constraint"]
