@@ -19,7 +19,7 @@ from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step
 from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.strip import ACTIONS, STEPS, with_strip, words_of
 
@@ -71,29 +71,22 @@ class SafetyOverlay(LayerWrapper):
 
     def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
-        if env.render_mode not in ("rgb_array", "human"):
+        modes = ["rgb_array"] if find_renderer(env) is None else ["rgb_array", "human"]
+        if env.render_mode not in modes:
             raise ConfigurationError(
                 f"SafetyOverlay draws into the frames of {name_of(env)}, whose render_mode is {env.render_mode!r}: "
-                "make the env with gym.make(..., render_mode='rgb_array'), or 'human' for a window"
+                f"make the env with gym.make(..., render_mode={' or '.join(map(repr, modes))})"
             )
-        if env.render_mode == "human" and find_renderer(env) is None:
-            raise ConfigurationError(
-                f"SafetyOverlay draws into the windows of MuJoCo envs alone, which {name_of(env)} is not: take "
-                "render_mode='rgb_array', whose frames get a strip"
-            )
-        self._record({})
         self._inside = filter_inside(env)
         self._infos: deque[dict[str, Any]] = deque(maxlen=STEPS)
         self._bounds: tuple[Array, Array] | None = None
         if isinstance(env.action_space, spaces.Box) and env.action_space.is_bounded():
             self._bounds = np.ravel(env.action_space.low), np.ravel(env.action_space.high)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; the strip begins anew."""
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._infos.clear()
-        observation, info = self.env.reset(seed=seed, options=options)
         self._infos.append(dict(info))
-        return observation, info
+        return observation
 
     def step(self, action: Any) -> Step:
         """Step the env; a window is drawn meanwhile."""
