@@ -11,9 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from safe_wrappers.constraints.obstacles import Plain, Plane, TrackedDiscs
+from safe_wrappers.constraints.obstacles import Box, Plane, Round, TrackedDiscs
 from safe_wrappers.constraints.points import Workspace
-from safe_wrappers.control.numerics.shapes import BLOCK, PLANE
 from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.env_checks import name_of
@@ -169,19 +168,19 @@ def _around(obstacle: Any, plant: Plant, inset: float, here: Array) -> list[Mark
         centers, halves = (part[0] for part in obstacle.boxes(plant, np.zeros(1)))
         sizes = halves + obstacle.radius + inset
         return [mark("BOX", ESTIMATE, *box) for box in zip(_spatial(centers), _spatial(sizes), strict=True)]
-    found = []
-    for kind, d, *numbers in obstacle.surfaces(plant) if isinstance(obstacle, Plain) else ():
-        first, second = _spatial(numbers[: int(d)]), np.array(numbers[3:])
-        if kind == PLANE:
-            foot = here - ((here - first) @ second - inset) * second
-            found.append(mark("BOX", KEEP_OUT, foot, [0.4, 0.4, 0.004], second))
-        elif kind == BLOCK:
-            found.append(mark("BOX", KEEP_OUT, first, _spatial(second[: int(d)] + inset)))
-        elif d == 3:
-            found.append(mark("SPHERE", KEEP_OUT, first, [second[0] + inset, 0.0, 0.0]))
-        else:
-            found += _lines(LIMIT, first + (second[0] + inset) * _CIRCLE)
-    return found
+    if isinstance(obstacle, Plane):
+        normal = np.pad(obstacle.normal, (0, 3 - len(obstacle.normal)))
+        foot = here - ((here - _spatial(obstacle.point)) @ normal - inset) * normal
+        return [mark("BOX", KEEP_OUT, foot, [0.4, 0.4, 0.004], normal)]
+    if isinstance(obstacle, Box):
+        sides = _spatial(np.array(obstacle.half_size) + inset)
+        return [mark("BOX", KEEP_OUT, _spatial(obstacle.center), sides)]
+    if not isinstance(obstacle, Round):
+        return []
+    centers, radius = obstacle.centers(plant), obstacle.radius + inset
+    if centers.shape[1] == 3:
+        return [mark("SPHERE", KEEP_OUT, center, [radius, 0.0, 0.0]) for center in centers]
+    return [line for center in _spatial(centers) for line in _lines(LIMIT, center + radius * _CIRCLE)]
 
 
 def _arrows(plant: Plant, specs: Sequence[Any], info: dict[str, Any]) -> list[Mark]:
