@@ -60,7 +60,7 @@ _MATTER = {
     "filter/search.py": "SafeActionSearch.decide not; SafeActionSearch._decide not;"
     " SafeActionSearch._nearby not; SafeActionSearch._search not; SafeActionSearch.relinearize not",
     "filter/linearize.py": "Tangents._corrected not",
-    "control/projection.py": "_judge comparison; project_unchecked not",
+    "control/projection.py": "_missed comparison; project_unchecked comparison",
     "filter/bound.py": "Bound._of min/max; Bound._wanted min/max; Bound.slack min/max; Bound.admits not",
     "constraints/backup/base.py": "DetourClearance.observe arithmetic; DetourClearance._kept_side not",
     "control/backup/drive_among_discs.py": "admits not; _to_disc not",

@@ -11,8 +11,8 @@ from matplotlib.patches import Circle, Polygon
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import Motion, stopping_path
+from safe_wrappers.errors import Array
 
 HEADING, SPEED = 0.7, 1.3
 

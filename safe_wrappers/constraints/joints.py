@@ -7,9 +7,8 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, float_array, name_list, positive
 from safe_wrappers.constraints.rollout import RolloutConstraint
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, float_array, name_list, positive
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, SCALAR_JOINTS

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, name_list, non_negative, positive
 from safe_wrappers.control.vehicle import FrictionEstimate, slip_ratio, slip_window
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, name_list, non_negative, positive
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.driven_wheels import DrivenWheels
 from safe_wrappers.plants.mujoco.plant import require_mujoco

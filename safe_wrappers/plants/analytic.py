@@ -8,8 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, non_negative, positive
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, non_negative, positive
 from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant, Trajectory
 

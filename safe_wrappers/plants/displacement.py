@@ -6,8 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import Array, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import moves_by_displacement, welds
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Recorder
 from safe_wrappers.plants.mujoco.plant import MujocoPlant

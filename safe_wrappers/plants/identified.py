@@ -16,8 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, float_array, positive, whole_number
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    UnsupportedEnvError,
+    float_array,
+    positive,
+    whole_number,
+)
 from safe_wrappers.plants.env_checks import name_of, refuse_changed_actions
 from safe_wrappers.plants.simulator import Measure, Rollout, RolloutPlant, View
 

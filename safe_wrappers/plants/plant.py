@@ -5,8 +5,7 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import Array, UnsupportedEnvError
 
 
 class Trajectory:

@@ -13,8 +13,15 @@ import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 
-from safe_wrappers.checks import Array, numbers_of, positive, shown, whole_number
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    UnsupportedEnvError,
+    numbers_of,
+    positive,
+    shown,
+    whole_number,
+)
 from safe_wrappers.plants.copies import Simulation, differing, reward_number
 from safe_wrappers.plants.env_checks import check_timing, name_of, read_attribute, refuse_second_env
 from safe_wrappers.plants.mujoco.binding import physics_steps

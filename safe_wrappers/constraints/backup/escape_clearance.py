@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.obstacles import (
     Disc,
     Discs,
@@ -22,7 +21,7 @@ from safe_wrappers.control.backup.evasive_maneuvers import (
     Maneuver,
     least_left,
 )
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative, positive
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.planar_point import nearest_first, planar_point
 from safe_wrappers.plants.mujoco.plant import require_mujoco

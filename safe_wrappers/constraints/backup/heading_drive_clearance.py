@@ -6,13 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative
 from safe_wrappers.constraints.backup.base import DetourClearance
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup import drive_among_discs as among
 from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
 from safe_wrappers.control.numerics.shapes import nearest_discs
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
 from safe_wrappers.plants.mujoco.plant import require_mujoco

@@ -6,9 +6,9 @@ from itertools import product
 
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.control.backup.damped_axis import brake, clipped
 from safe_wrappers.control.backup.point_among_walls import distances, slides, way
+from safe_wrappers.errors import Array, check_fields, non_negative, positive
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.planar_point import nearest_first, planar_point, walls
 from safe_wrappers.plants.mujoco.plant import require_mujoco

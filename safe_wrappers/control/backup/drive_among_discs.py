@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import (
     HeadingDrive,
     Motion,
@@ -26,6 +25,7 @@ from safe_wrappers.control.backup.heading_drive import (
     stopping_path,
 )
 from safe_wrappers.control.compiled import compiled, hypot
+from safe_wrappers.errors import Array
 
 RECOVERY_RATE: Final = 1.0
 """1/s: an unsafe start must shrink its violation at least this fast, where the drive can."""

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled, hypot
+from safe_wrappers.errors import Array
 
 _WANDER = 0.012
 """Bound on the lateral deviation of the stopping path, per metre of sideways coasting: drag turns a sliding body.

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis, brake, clipped
 from safe_wrappers.control.compiled import compiled, hypot
+from safe_wrappers.errors import Array
 
 MOST_HOLDS: Final = 4096
 """Control steps to rest; a way that takes more has no end."""

@@ -12,8 +12,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, positive
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError, positive
 from safe_wrappers.plants.copies import EnvCopier
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.forecast import RESETS, Recorder

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle import Wheel
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant

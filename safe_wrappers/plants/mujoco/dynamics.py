@@ -16,12 +16,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.bandwidth import modes
 from safe_wrappers.control.legged import CentroidalMomentum, centroidal_momentum
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import Array, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
+from safe_wrappers.plants.mujoco.contacts import ContactReader, Contacts
 from safe_wrappers.plants.mujoco.model import (
     AT_A_JOINT,
     SCALAR_JOINTS,
@@ -37,21 +37,8 @@ LEFT_OVER: Final = 0.05
 """Share of a vibration's amplitude that may be left after a control interval for a rigid model to be good enough."""
 
 
-class ContactPoints(NamedTuple):
-    """The k contacts of MuJoCo's solver. The world is never the pushed body."""
-
-    points: Array  #: shape (k, 3), m
-    normals: Array  #: unit normals, pointing at the pushed body, shape (k, 3)
-    first_tangents: Array  #: the first axis of MuJoCo's friction pyramid, shape (k, 3)
-    friction: Array  #: coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1)
-    pushed_by: NDArray[np.intp]  #: ids of the other bodies, shape (k,)
-    jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
-    drift: Array  #: `dJ/dt qvel`, shape (k, 3), m/s^2
-    forces: Array  #: on the pushed body, as MuJoCo's solver found them last, shape (k, 3), N
-
-
 class FloatingBaseTerms(NamedTuple):
-    """The equations of motion at one state.
+    """The equations of motion at one state, with the k contacts of MuJoCo's solver.
 
     The bias has Coriolis, centrifugal and gravity forces, minus passive and applied forces, minus the actuators'
     forces at zero control, minus constraint forces other than contacts, as MuJoCo found them for the data's control.
@@ -60,7 +47,9 @@ class FloatingBaseTerms(NamedTuple):
     inertia: Array  #: M with armature, shape (nv, nv)
     bias: Array  #: h, shape (nv,)
     actuation: Array  #: B, shape (nv, nu): generalised force per control, inside the actuators' force ranges
-    contacts: ContactPoints
+    contacts: Contacts
+    jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
+    drift: Array  #: `dJ/dt qvel`, shape (k, 3), m/s^2
 
 
 def equations_of_motion(
@@ -69,7 +58,8 @@ def equations_of_motion(
     """The terms at the state of the data, which are only read and must be up to date (`mj_forward`).
 
     Raises:
-        UnsupportedEnvError: An actuator that is not affine in its control; not checked where `actuators` are given.
+        UnsupportedEnvError: Something flexible is in contact, which has no body; or an actuator that is not affine in
+            its control, which is not checked where `actuators` are given.
     """
     acts = AffineActuators(model) if actuators is None else actuators
     gain, _ = acts.gain_and_bias(data.actuator_length, data.actuator_velocity)
@@ -78,38 +68,21 @@ def equations_of_motion(
     if data.nefc:
         mujoco.mj_mulJacTVec(model, data, others, np.where(data.efc_type < _CONTACT, data.efc_force, 0.0))
     bias = actuation @ np.clip(data.ctrl, *control_range(model)) - data.qfrc_smooth - others
-    return FloatingBaseTerms(inertia(model, data), bias, actuation, contact_points(model, data))
-
-
-def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
-    """The contacts of data that are up to date (`mj_forward`).
-
-    Raises:
-        UnsupportedEnvError: Something flexible is in contact, which has no body.
-    """
-    found, fixed = data.contact, fixed_bodies(model)
-    touching = np.flatnonzero(found.efc_address >= 0)
-    if (found.geom[touching] < 0).any():
+    reader = ContactReader(model)
+    reader.read(data)
+    contacts = reader.found()
+    if (contacts.bodies == model.nbody).any():
         raise UnsupportedEnvError("something flexible is in contact, which has no body")
-    bodies, frames = model.geom_bodyid[found.geom[touching]], found.frame[touching].reshape(-1, 3, 3)
-    # MuJoCo's normal points from the first geom to the second, and its force pushes the second.
-    turned = fixed[bodies[:, 1]][:, None]
-    signs, bodies = np.where(turned, -1.0, 1.0), np.where(turned, bodies[:, ::-1], bodies)
-    jacobians = np.zeros((len(touching), 3, model.nv))
-    forces, drift = np.zeros((len(touching), 3)), np.zeros((len(touching), 3))
-    jac, dot, wrench = np.zeros((3, model.nv)), np.zeros((3, model.nv)), np.zeros(6)
-    for row, i in enumerate(touching.tolist()):
-        mujoco.mj_contactForce(model, data, i, wrench)
-        forces[row] = signs[row] * (wrench[:3] @ frames[row])
-        for body, side in zip(bodies[row].tolist(), (-1.0, 1.0), strict=True):
+    fixed, (jac, dot) = fixed_bodies(model), np.zeros((2, 3, model.nv))
+    jacobians, drift = np.zeros((len(contacts.point), 3, model.nv)), np.zeros((len(contacts.point), 3))
+    for row, (point, bodies) in enumerate(zip(contacts.point, contacts.bodies.tolist(), strict=True)):
+        for body, side in zip(bodies, (-1.0, 1.0), strict=True):
             if not fixed[body]:
-                mujoco.mj_jac(model, data, jac, None, found.pos[i], body)
-                mujoco.mj_jacDot(model, data, dot, None, found.pos[i], body)
+                mujoco.mj_jac(model, data, jac, None, point, body)
+                mujoco.mj_jacDot(model, data, dot, None, point, body)
                 jacobians[row] += side * jac
                 drift[row] += side * (dot @ data.qvel)
-    friction = np.where(found.dim[touching] > 1, found.friction[touching, 0], 0.0)
-    geometry = np.array(found.pos[touching]), signs * frames[:, 0], np.array(frames[:, 1]), friction
-    return ContactPoints(*geometry, bodies[:, 0], jacobians, drift, forces)
+    return FloatingBaseTerms(inertia(model, data), bias, actuation, contacts, jacobians, drift)
 
 
 class MomentumReader:

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 from safe_wrappers.plants.mujoco.model import Remade, control_range
 from safe_wrappers.plants.plant import Trajectory
 

@@ -8,14 +8,13 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.control.bandwidth import ControlLoop
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError, non_negative
 from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
-from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
+from safe_wrappers.plants.mujoco.contacts import ContactReader, Contacts, on_the_world
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Poses, Recorder
 from safe_wrappers.plants.mujoco.model import (
     DYNAMICS,
@@ -144,7 +143,7 @@ class MujocoPlant(Plant):
         self._delay_steps = int(np.ceil(self.delay_s / model.opt.timestep - 1e-9))
         self._pending = deque(self._pending, maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._recorder = self._new_recorder()
-        self._contact_reader = ContactReader(model)
+        self._contact_reader = ContactReader(model, on_the_world(model))
         # Last: a model that was refused is refused again at the next observation.
         self._env_model, self._outdated = source.model, False
         self.model_version += 1
@@ -181,7 +180,7 @@ class MujocoPlant(Plant):
         self._loaded = self._forwarded = False
         self._affine: tuple[Array, Array] | None = None
         self._forecasts: dict[tuple[bytes, bool], MujocoTrajectory] = {}
-        self._contact_forecasts: dict[bytes, ContactForecast] = {}
+        self._contact_forecasts: dict[bytes, Contacts] = {}
 
     def observe(self) -> None:
         """Take the env's present state; everything else is computed on demand."""
@@ -368,7 +367,7 @@ class MujocoPlant(Plant):
         self._load_to_step()
         return self._recorder.sketch(control, horizon)
 
-    def contact_forecast(self, control: Array) -> ContactForecast:
+    def contact_forecast(self, control: Array) -> Contacts:
         """Contacts with the fixed world while a control, shape (nu,), is held for one interval; kept as forecasts."""
         key = control.tobytes()
         if key not in self._contact_forecasts:
