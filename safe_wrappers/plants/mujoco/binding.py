@@ -15,8 +15,7 @@ import numpy as np
 from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError, positive
 from safe_wrappers.plants.copies import EnvCopier
 from safe_wrappers.plants.env_checks import name_of
-from safe_wrappers.plants.mujoco.forecast import RESETS, Recorder
-from safe_wrappers.plants.mujoco.model import control_range
+from safe_wrappers.plants.mujoco.model import RESETS
 
 ModelOf = Callable[[Any], mujoco.MjModel]
 """Takes the unwrapped env; returns its model."""
@@ -220,26 +219,6 @@ def refuse_mapped(action_map: ActionMap | None, asker: str) -> None:
             "offset + scale * action. Constraints that forecast take that into account (SpeedLimit, JointSpeedLimit, "
             "JointPositionLimit, Workspace), as do Clearance, Barrier and ImpactSpeedLimit"
         )
-
-
-class MappedRecorder(Recorder):
-    """A `Recorder` of actions that the env maps to controls."""
-
-    def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int, action_map: ActionMap
-    ) -> None:
-        super().__init__(model, data, substeps)
-        self._map = action_map
-        # Brakes are as strong as actions can make them.
-        self._low, self._high = (np.clip(end, *control_range(model)) for end in action_map.reach())
-
-    def act(self, data: mujoco.MjData, control: Array) -> None:
-        """Give the machine an action, shape (nu,), as its env does at the start of a control interval."""
-        data.ctrl[:] = self._map.control(control)
-
-    def braking(self, data: mujoco.MjData) -> Array:
-        """The action that brakes, shape (nu,)."""
-        return self._map.action(super().braking(data))
 
 
 def action_map_of(env: gym.Env[Any, Any], source: Any, lower: Array, upper: Array) -> ActionMap | None:
