@@ -62,7 +62,7 @@ def names(model: mujoco.MjModel, kind: str, pattern: str = "*") -> list[str]:
 def frame(
     model: mujoco.MjModel, data: mujoco.MjData, kind: str, name: str, compute: Any = mujoco.mj_jac
 ) -> tuple[Array, Array]:
-    """Origin of a "body", "site" or "geom", shape (3,), m, and its Jacobian, by `mj_jacDot` the rate of it, (3, nv)."""
+    """Origin of a "body", "site" or "geom", shape (3,), m, and its Jacobian, or by `mj_jacDot` its rate, (3, nv)."""
     i = named(model, kind, name)
     body = i if kind == "body" else int(getattr(model, f"{kind}_bodyid")[i])
     origin, jacobian = (
