@@ -53,7 +53,7 @@ class StepMonitor(LayerWrapper, ABC):
         answer = self._pass_on(action)
         raw = self._raw
         self._forget()
-        whole = self._replay.after(self._visit)
+        whole = self._replay.after(lambda data, _: self._visit(data))
         if not whole:
             message = (
                 f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
@@ -61,7 +61,7 @@ class StepMonitor(LayerWrapper, ABC):
             )
             self._warn_once("partial", message)
             self._forget()
-            self._visit(raw.data, float(raw.model.opt.timestep))
+            self._visit(raw.data)
         answer[4].update(self._figures(raw.data) | {self.partial: not whole})
         return answer
 
@@ -70,8 +70,8 @@ class StepMonitor(LayerWrapper, ABC):
         """Forget what was visited; the env may have made itself another model."""
 
     @abstractmethod
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
-        """Look at one evaluation of the physics, which acts for some time, s."""
+    def _visit(self, data: mujoco.MjData) -> None:
+        """Look at one evaluation of the physics."""
 
     @abstractmethod
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
@@ -122,8 +122,6 @@ class ContactMonitor(StepMonitor):
         StepMonitor.__init__(self, env)
         self.bodies, self.against, self._model = bodies, against, None
         self._forget()
-        named = {"bodies": bodies, "against": against}
-        self._record({name: None if names is None else list(names) for name, names in named.items()})
 
     @property
     def peak_bodies(self) -> tuple[str, str] | None:
@@ -141,7 +139,7 @@ class ContactMonitor(StepMonitor):
         self._contacts.clear()
         self._peak_bodies: Any = None
 
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+    def _visit(self, data: mujoco.MjData) -> None:
         self._contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
@@ -213,7 +211,6 @@ class BalanceMonitor(StepMonitor):
         StepMonitor.__init__(self, env)
         self._take(bodies)
         self.bodies = None if bodies is None else list(bodies)
-        self._record({"bodies": self.bodies})
 
     def _take(self, bodies: Sequence[str] | None) -> None:
         """Find the robot in the env's model."""
@@ -236,7 +233,7 @@ class BalanceMonitor(StepMonitor):
             self._take(self.bodies)
         self._contacts.clear()
 
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+    def _visit(self, data: mujoco.MjData) -> None:
         self._contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
