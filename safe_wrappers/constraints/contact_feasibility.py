@@ -49,7 +49,7 @@ class _ContactConstraint(Constraint, Model):
 
     def rollout(self, control: Array | None, horizon: int = 1) -> Contacts | None:
         """The forecast; None of the present state, of which nothing is known."""
-        return None if control is None else self.plant.contact_forecast(control)  # type: ignore[no-any-return]
+        return None if control is None else self.plant.contact_forecast(control)
 
 
 @dataclass

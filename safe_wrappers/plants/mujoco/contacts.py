@@ -213,8 +213,10 @@ class ContactReader:
         frame = frame.reshape(-1, 3, 3)
         force = side * np.einsum("ki,kij->kj", wrench[:, :3], frame)
         sliding = friction[:, :2].min(axis=1) * (dim > 1)
-        parts = step, bodies, gap, point, side * frame[:, 0], sliding, force
-        return Contacts(self._steps, *(part[chosen] for part in parts), finite)
+        return Contacts(
+            *(self._steps, step[chosen], bodies[chosen], gap[chosen], point[chosen]),
+            *((side * frame[:, 0])[chosen], sliding[chosen], force[chosen], finite),
+        )
 
     def follow(self, data: mujoco.MjData, substeps: int) -> Contacts:
         """Step the data, with the control it has, and return the contacts of all these physics substeps."""

@@ -241,7 +241,7 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
     fed_back = -model.actuator_biasprm[: len(moment)] * affine[:, None]
     stiffness = np.diag(springs) + moment.T * fed_back[:, 1] @ moment
     damping = damping + moment.T * fed_back[:, 2] @ moment
-    driven = moment.any(axis=0)
+    driven = np.asarray(moment.any(axis=0))
     behind = np.zeros(model.nv, dtype=bool)  # whether a driven joint is before it on the way from the world
     for dof, before in enumerate(model.dof_parentid):  # which is smaller
         behind[dof] = before >= 0 and (driven[before] or behind[before])
@@ -249,5 +249,5 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
     found = modes(inertia(model, data), stiffness, damping)
     stored = springs @ found.shapes**2  # twice the energy in the springs, at an amplitude of 1
     chosen = (found.resonances > 0.0) & (stored > 0.5 * found.resonances**2)
-    kept = (part[chosen].tolist() for part in (found.resonances, found.damping_ratios))
-    return RigidModelCheck(*map(tuple, kept), plant.control_dt)
+    resonances, ratios = found.resonances[chosen].tolist(), found.damping_ratios[chosen].tolist()
+    return RigidModelCheck(tuple(resonances), tuple(ratios), plant.control_dt)

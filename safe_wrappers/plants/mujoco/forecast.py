@@ -91,9 +91,10 @@ class Recorder(Remade):
         rest, per_length = -bias[:, :2].T / np.where(acts, gain, 1.0)
         damping[bias[:, 2] != 0.0] = 0.0  # it has damping of its own
         self._servos = rest, per_length, damping
-        self._map, ends = action_map, control_range(model)
-        # Brakes are as strong as actions can make them.
-        self._low, self._high = ends if action_map is None else np.clip(action_map.reach(), *ends)
+        self._map = action_map
+        self._low, self._high = low, high = control_range(model)
+        if action_map is not None:  # brakes are as strong as actions can make them
+            self._low, self._high = (np.clip(end, low, high) for end in action_map.reach())
 
     def record(
         self, control: Array, horizon: int, first: MujocoTrajectory | None = None, euler: bool = False
