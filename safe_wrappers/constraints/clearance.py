@@ -114,8 +114,10 @@ class Clearance(Constraint):
             plant = self.plant
             limits = plant.lower, plant.upper, plant.delay_s, plant.control_dt
             machine = Machine(*limits, self.radius, self.braking, self.state_error + self.margin)
-            every = ((self._surfaces(p), *rest) for p, *rest in self._accelerations())
-            found = [approach_rows(*one, machine) for one in every]
+            found = [
+                approach_rows(self._surfaces(p), v, drift, effect, machine)
+                for p, v, drift, effect in self._accelerations()
+            ]
             rooms, normals, offsets = map(np.concatenate, zip(*found, strict=True))
             self._observed = rooms, HalfSpaces(normals, offsets)
         return self._observed

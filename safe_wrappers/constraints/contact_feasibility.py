@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control import whole_body
 from safe_wrappers.control.contact import cone_excess
 from safe_wrappers.control.legged import support_distances
 from safe_wrappers.control.projection import Status
-from safe_wrappers.control.whole_body import WholeBodyProblem, WholeBodySolution, predicted_position_rows
+from safe_wrappers.control.whole_body import WholeBodyProblem, WholeBodySolution
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,
@@ -49,7 +48,7 @@ class _ContactConstraint(Constraint, Model):
 
     def rollout(self, control: Array | None, horizon: int = 1) -> Contacts | None:
         """The forecast; None of the present state, of which nothing is known."""
-        return None if control is None else self.plant.contact_forecast(control)  # type: ignore[no-any-return]
+        return None if control is None else self.plant.contact_forecast(control)
 
 
 @dataclass
@@ -173,21 +172,17 @@ class Stance(Constraint, Model):
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1].
         cone: "pyramid" is conservative and quick, "exact" is the cone itself.
-        joint_tolerance: How far driven joints may press their stops, rad or m; None leaves them alone.
 
     Source: appendix "Hierarchical whole-body control quadratic program".
     """
 
     friction_share: float = 0.7
     cone: Literal["pyramid", "exact"] = "pyramid"
-    joint_tolerance: float | None = 0.1
 
     def __post_init__(self) -> None:
         self.friction_share = checked_friction_share(self.friction_share)
         if self.cone not in ("pyramid", "exact"):
             raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
-        if self.joint_tolerance is not None:
-            self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
 
     info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
     measures_state: ClassVar[bool] = False
@@ -200,12 +195,6 @@ class Stance(Constraint, Model):
             raise UnsupportedEnvError(hint)
         refuse_mapped(self.plant.action_map, "Stance")
         touching_bodies(self.plant, "there is nothing to stand on")
-        if self.joint_tolerance is not None:
-            refuse_uncovered_stops(self.plant.model)
-        joints, low, high = stops(self.plant.model)
-        wider = self.joint_tolerance or 0.0
-        self._low, self._high = low - wider, high + wider
-        self._qpos, self._dofs = self.plant.model.jnt_qposadr[joints], self.plant.model.jnt_dofadr[joints]
         self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
 
     def observe(self, memory: Memory) -> None:
@@ -232,16 +221,11 @@ class Stance(Constraint, Model):
         bias = motion.bias - np.einsum("kiv,ki->v", motion.jacobians[~ground], found.force[~ground])
         jacobians, drift, normals = motion.jacobians[ground], motion.drift[ground], found.normal[ground]
         pressing = np.einsum("ki,ki->k", found.force[ground], normals) > 0.0
-        limits = None
-        if self.joint_tolerance is not None:
-            joints = self._dofs, plant.qpos[self._qpos], plant.qvel[self._dofs], self._low, self._high
-            limits = predicted_position_rows(*joints, plant.control_dt, plant.model.nv)
         problem = WholeBodyProblem(
             *(motion.inertia, bias, motion.actuation, jacobians, drift, normals),
             *(self.friction_share * found.friction[ground], plant.lower, plant.upper, control),
             contact_acceleration=-(jacobians @ plant.qvel) / _SETTLE_S,
             breaking=~pressing,
-            accelerations=limits,
         )
         # Two points of one rigid foot cannot come to rest each as it likes.
         attainable = whole_body.attainable_contact_acceleration(problem)

@@ -171,9 +171,7 @@ class Tracks:
         if time_s not in self._known:
             if len(self._known) >= _KEPT:
                 self._known.clear()
-            different = {id(motion): motion for motion in self.motions}
-            each = {key: motion.over(time_s) for key, motion in different.items()}
-            parts = zip(*(each[id(motion)] for motion in self.motions), strict=True)
+            parts = zip(*(motion.over(time_s) for motion in self.motions), strict=True)
             self._known[time_s] = tuple(np.stack(part) for part in parts)
         return self._known[time_s]
 

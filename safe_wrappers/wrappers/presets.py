@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.contact_feasibility import ContactFeasibility, SupportMargin
-from safe_wrappers.constraints.joints import JointPositionLimit, refuse_uncovered_stops, stops
+from safe_wrappers.constraints.joints import JointPositionLimit, stops
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.errors import (
     ActionError,
@@ -117,7 +117,6 @@ class WholeBodyFilter(CBFActionFilter):
             constraints.append(SupportMargin(zmp_inset))
         if joint_tolerance is not None:
             wider = non_negative("joint_tolerance", joint_tolerance, "rad or m")
-            refuse_uncovered_stops(model)
             joints, low, high = stops(model)
             if not joints:
                 raise UnsupportedEnvError("no driven joint has a range: pass joint_tolerance=None")
