@@ -66,8 +66,9 @@ _MATTER = {
     "control/backup/drive_among_discs.py": "admits not; _to_disc not",
     "constraints/backup/coasting_clearance.py": "CoastingClearance.leaves_clear not;"
     " CoastingClearance._after min/max; CoastingClearance.h_along not",
-    "constraints/backup/point_clearance.py": "EscapeClearance.clearance not; EscapeClearance._backup not",
-    "control/backup/point_decision.py": "backup not; _stopped_at not",
+    "constraints/backup/escape_clearance.py": "EscapeClearance.clearance not; EscapeClearance._backup not",
+    "constraints/backup/wall_clearance.py": "WallClearance.proposals not; WallClearance.h_along arithmetic",
+    "control/backup/point_among_walls.py": "way min/max; distances min/max; slides comparison",
     "constraints/predictive_shield.py": "PredictiveShield.plan comparison; PredictiveShield._after not",
     "wrappers/presets.py": "ActionShield.step not; ActionShield.action_masks not",
     "wrappers/stopping.py": "BoundBudget.longest_time not; BoundBudget.can_stop_after not",

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import Array, name_list
-from safe_wrappers.plants.mujoco.forecast import RESETS
-from safe_wrappers.plants.mujoco.model import fixed_bodies, named
+from safe_wrappers.plants.mujoco.model import RESETS, fixed_bodies, named
 
 Visit = Callable[[mujoco.MjData, float], None]
 """Takes data with the contacts and forces of one evaluation, and the time for which it counts, s."""
@@ -37,7 +36,7 @@ class Replay:
     them between substeps, or writes to the state, ends elsewhere than the replay; then `after` returns False.
 
     Runge-Kutta steps are made here stage by stage, since MuJoCo keeps only the forces of the last stage; on Ant-v5
-    these alone are wrong by half of the impulse in the median step.
+    these alone are wrong by half of the impulse in the median step. Activations of actuators are not followed there.
     """
 
     def __init__(self, raw: Any) -> None:
@@ -87,11 +86,16 @@ def evaluations(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> Non
 def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> None:
     """`mj_step` by the classical four stages, in the order of MuJoCo's own sums."""
     step_s, time = float(model.opt.timestep), data.time
-    qpos, qvel, act, qacc, act_dot = data.qpos, data.qvel, data.act, data.qacc, data.act_dot
-    qpos0, qvel0, act0 = qpos.copy(), qvel.copy(), act.copy()
-    velocity, acceleration, activation = np.zeros(model.nv), np.zeros(model.nv), np.zeros(model.na)
+    qpos, qvel, qacc = data.qpos, data.qvel, data.qacc
+    qpos0, qvel0, velocity, acceleration = qpos.copy(), qvel.copy(), np.zeros(model.nv), np.zeros(model.nv)
     rate = np.zeros(model.nv)
     turns = _turns(model) if RATES_OF_ROTATION_VECTORS else np.zeros(0, dtype=np.intp)
+
+    def move(at_rate: Array, at_acceleration: Array) -> None:
+        qpos[:] = qpos0
+        mujoco.mj_integratePos(model, qpos, at_rate, step_s)
+        qvel[:] = qvel0 + step_s * at_acceleration
+
     for ahead, weight in _STAGES:
         mujoco.mj_forwardSkip(model, data, _FROM_POSITIONS, 1)
         visit(data, weight * step_s)
@@ -101,21 +105,11 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
             stage[turns] = rotation_vector_rate(step_s * rate[turns], qvel[turns])
         velocity += weight * stage
         acceleration += weight * qacc
-        if model.na:
-            activation += weight * act_dot
         if ahead:
             rate = ahead * stage
-            qpos[:] = qpos0
-            mujoco.mj_integratePos(model, qpos, rate, step_s)
-            qvel[:] = qvel0 + step_s * (ahead * qacc)
-            if model.na:
-                act[:] = act0 + step_s * (ahead * act_dot)
+            move(rate, ahead * qacc)
             data.time = time + ahead * step_s
-    qpos[:] = qpos0
-    mujoco.mj_integratePos(model, qpos, velocity, step_s)
-    qvel[:] = qvel0 + step_s * acceleration
-    if model.na:
-        act[:] = _within_ranges(model, act0 + step_s * activation)
+    move(velocity, acceleration)
     data.qacc_warmstart[:] = qacc
 
 
@@ -126,7 +120,7 @@ def _turns(model: mujoco.MjModel) -> NDArray[np.intp]:
     return np.asarray(first[:, None] + np.arange(3), dtype=np.intp)
 
 
-def rotation_vector_rate(turned: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_vector_rate(turned: Array, velocity: Array) -> Array:
     """Rates of rotation vectors, rad/s, from angular velocities in the turned body's frame, rad/s; shapes (n, 3).
 
     The inverse of the exponential's derivative: Iserles et al., "Lie-group methods", Acta Numerica 9 (2000).
@@ -138,14 +132,6 @@ def rotation_vector_rate(turned: NDArray[np.float64], velocity: NDArray[np.float
         second = np.where(small, 1.0 / 12.0, (1.0 - angle / np.tan(angle)) / (4.0 * angle**2))
         across = np.cross(turned, velocity)
         return np.asarray(velocity + 0.5 * across + second * np.cross(turned, across))
-
-
-def _within_ranges(model: mujoco.MjModel, act: np.ndarray) -> np.ndarray:
-    """Activations clipped where their actuators limit them."""
-    limited = model.actuator_actlimited.astype(bool) & (model.actuator_actadr >= 0)
-    last = model.actuator_actadr[limited] + model.actuator_actnum[limited] - 1
-    act[last] = np.clip(act[last], *model.actuator_actrange[limited].T)
-    return act
 
 
 # Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here.
@@ -227,8 +213,10 @@ class ContactReader:
         frame = frame.reshape(-1, 3, 3)
         force = side * np.einsum("ki,kij->kj", wrench[:, :3], frame)
         sliding = friction[:, :2].min(axis=1) * (dim > 1)
-        parts = step, bodies, gap, point, side * frame[:, 0], sliding, force
-        return Contacts(self._steps, *(part[chosen] for part in parts), finite)
+        return Contacts(
+            *(self._steps, step[chosen], bodies[chosen], gap[chosen], point[chosen]),
+            *((side * frame[:, 0])[chosen], sliding[chosen], force[chosen], finite),
+        )
 
     def follow(self, data: mujoco.MjData, substeps: int) -> Contacts:
         """Step the data, with the control it has, and return the contacts of all these physics substeps."""

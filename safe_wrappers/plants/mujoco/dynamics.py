@@ -8,7 +8,6 @@ a round foot that rolls, such a point moves into the foot.
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
@@ -170,29 +169,25 @@ class InverseDynamics:
             yield self._data
 
 
-@dataclass(frozen=True)
-class RigidModelCheck:
-    """What `rigid_model_check` found; printed, it is the verdict.
+class RigidModelCheck(NamedTuple):
+    """What `rigid_model_check` found of springs behind a motor; printed, it is the verdict."""
 
-    Attributes:
-        springs: Names of the joints that are springs behind a motor; empty if there are none.
-        resonances: Of the springs, at the pose of the check, the slowest first, rad/s.
-        damping_ratios: Of each of them, to first order in the damping.
-        boundary_layer_s: Time constant with which the slowest of the vibrations decays, 1 / (ratio resonance), s;
-            infinite without damping, 0 without springs.
-        control_dt: Control interval of the env, s.
-    """
+    resonances: tuple[float, ...]  #: of the springs, at the pose of the check, the slowest first, rad/s
+    damping_ratios: tuple[float, ...]  #: of each of them, to first order in the damping
+    control_dt: float  #: control interval of the env, s
 
-    springs: tuple[str, ...]
-    resonances: tuple[float, ...]
-    damping_ratios: tuple[float, ...]
-    boundary_layer_s: float
-    control_dt: float
+    @property
+    def boundary_layer_s(self) -> float:
+        """Time constant with which the slowest vibration decays, s; infinite without damping, 0 without springs."""
+        if not self.resonances:
+            return 0.0
+        slowest = min(w * z for w, z in zip(self.resonances, self.damping_ratios, strict=True))
+        return 1.0 / slowest if slowest > 0.0 else np.inf
 
     @property
     def left_over(self) -> float:
         """Share of a vibration's amplitude that is left after one control interval."""
-        return float(np.exp(-self.control_dt / self.boundary_layer_s)) if self.boundary_layer_s > 0.0 else 0.0
+        return float(np.exp(-self.control_dt / self.boundary_layer_s)) if self.resonances else 0.0
 
     @property
     def rigid_is_good_enough(self) -> bool:
@@ -201,7 +196,7 @@ class RigidModelCheck:
 
     def __str__(self) -> str:
         """The verdict and why, in one sentence."""
-        if not self.springs:
+        if not self.resonances:
             return "rigid model is good enough: no spring lies behind a motor"
         found = zip(self.resonances, self.damping_ratios, strict=True)
         rings = ", ".join(f"{w / (2.0 * np.pi):.3g} Hz (damping ratio {z:.2g})" for w, z in found)
@@ -238,35 +233,21 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
     plant.observe()
     data, model = plant.forward(), plant.model
     moment = plant.actuators.moment(data)
-    scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
-    springs = _springs(model, np.asarray(moment.any(axis=0)), scalar)
-    if not len(springs):
-        return RigidModelCheck((), (), (), 0.0, plant.control_dt)
-    stiffness, damping = np.zeros((model.nv, model.nv)), np.diag(model.dof_damping)
-    every = model.jnt_dofadr[scalar]
-    stiffness[every, every] = model.jnt_stiffness[scalar]
+    scalar = np.flatnonzero(np.isin(model.jnt_type, SCALAR_JOINTS))
+    dofs = model.jnt_dofadr[scalar]
+    springs, damping = np.zeros(model.nv), np.diag(model.dof_damping)
+    springs[dofs] = model.jnt_stiffness[scalar]
     affine = (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE))[: len(moment)]
     fed_back = -model.actuator_biasprm[: len(moment)] * affine[:, None]
-    stiffness += moment.T * fed_back[:, 1] @ moment
+    stiffness = np.diag(springs) + moment.T * fed_back[:, 1] @ moment
     damping = damping + moment.T * fed_back[:, 2] @ moment
+    driven = np.asarray(moment.any(axis=0))
+    behind = np.zeros(model.nv, dtype=bool)  # whether a driven joint is before it on the way from the world
+    for dof, before in enumerate(model.dof_parentid):  # which is smaller
+        behind[dof] = before >= 0 and (driven[before] or behind[before])
+    springs *= behind & ~driven
     found = modes(inertia(model, data), stiffness, damping)
-    at_springs = found.shapes[model.jnt_dofadr[springs]]
-    own = (at_springs**2 * model.jnt_stiffness[springs][:, None]).sum(axis=0)  # of the stored energy
-    chosen = (found.resonances > 0.0) & (own > 0.5 * found.resonances**2)
-    resonances, ratios = found.resonances[chosen], found.damping_ratios[chosen]
-    slowest = float((resonances * ratios).min(initial=np.inf))
-    names = tuple(model.joint(int(j)).name or f"#{j}" for j in springs)
-    decay = 1.0 / slowest if slowest > 0.0 else np.inf
-    return RigidModelCheck(names, tuple(resonances.tolist()), tuple(ratios.tolist()), decay, plant.control_dt)
-
-
-def _springs(model: mujoco.MjModel, driven: NDArray[np.bool_], scalar: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Joints with stiffness that no actuator drives and that have a driven joint before them, shape (n,)."""
-    found = []
-    for j in np.flatnonzero(scalar & (model.jnt_stiffness > 0.0)):
-        dof = before = int(model.jnt_dofadr[j])
-        while before >= 0 and not driven[before]:
-            before = int(model.dof_parentid[before])
-        if before >= 0 and before != dof:
-            found.append(j)
-    return np.array(found, dtype=np.intp)
+    stored = springs @ found.shapes**2  # twice the energy in the springs, at an amplitude of 1
+    chosen = (found.resonances > 0.0) & (stored > 0.5 * found.resonances**2)
+    resonances, ratios = found.resonances[chosen].tolist(), found.damping_ratios[chosen].tolist()
+    return RigidModelCheck(tuple(resonances), tuple(ratios), plant.control_dt)
