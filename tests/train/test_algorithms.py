@@ -36,9 +36,8 @@ PENALTY = 1000.0
 """An episode of the fake task returns less than 5, so that one penalty in a return would show."""
 KINDS = {
     "naive": "naive",
-    "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}}}",
+    "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}, per_correction: 1.0}}",
     "safe_action": "safe_action",
-    "both": f"{{kind: both, penalty: {PENALTY}, per_correction: 1.0}}",
 }
 
 
@@ -125,7 +124,7 @@ def one_arm(fake_experiment, algorithm, learner, *overrides):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, algorithm):
-    experiment = one_arm(fake_experiment, algorithm, KINDS["both" if algorithm in OFF_POLICY else "naive"])
+    experiment = one_arm(fake_experiment, algorithm, "safe_action" if algorithm in OFF_POLICY else "naive")
     (arm,), (job,) = experiment.arms, training_jobs(one_arm(fake_experiment, algorithm, "naive", "seeds=[0]"))
     folder = killed_after(experiment, 1, monkeypatch, arm=0)
     assert latest_checkpoint(folder / "checkpoints").timesteps == 64
@@ -133,9 +132,8 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
     assert type(model) is algorithm_class(algorithm)
     if algorithm in OFF_POLICY:
         buffer = model.replay_buffer
-        assert type(buffer) is ExecutedActionReplayBuffer and buffer.mode == "both" and buffer.size() == 64
-        assert buffer.changed[:64].any() and (np.abs(buffer.task_rewards[:64]) < 1).all()
-        assert (buffer.rewards[:64][buffer.changed[:64]] < 1 - PENALTY).all()
+        assert type(buffer) is ExecutedActionReplayBuffer and buffer.size() == 64
+        assert (np.abs(buffer.rewards[:64]) < 1).all()
     trained(experiment, 0)
     # As many steps as were announced, and are reported: whole rollouts.
     assert finish(folder)["timesteps"] == job.total == 128
@@ -169,7 +167,7 @@ class Watch(BaseCallback):
 
 @pytest.mark.parametrize(
     ("algorithm", "kind"),
-    [("SAC", "naive"), ("SAC", "safe_action"), ("SAC", "both"), ("PPO", "adaption_penalty")],
+    [("SAC", "naive"), ("SAC", "safe_action"), ("SAC", "adaption_penalty"), ("PPO", "adaption_penalty")],
 )
 def test_training_has_what_the_kind_says_and_what_is_reported_is_the_tasks(
     fake_experiment, monkeypatch, algorithm, kind
@@ -184,7 +182,7 @@ def test_training_has_what_the_kind_says_and_what_is_reported_is_the_tasks(
     if arm.learner.penalised:
         taken = np.array([[info[keys.ADAPTION_PENALTY] for info in row] for row in infos])
         corrections = np.array([[info[keys.CBF_CORRECTION] for info in row] for row in infos])
-        np.testing.assert_allclose(taken, changed * (PENALTY + corrections * (kind == "both")), rtol=1e-12)
+        np.testing.assert_allclose(taken, changed * (PENALTY + corrections), rtol=1e-12)
         assert np.abs(np.array(watch.paid) + taken).max() < 1.0
     else:
         assert keys.ADAPTION_PENALTY not in infos[0, 0] and np.abs(watch.paid).max() < 1.0
@@ -197,10 +195,8 @@ def test_training_has_what_the_kind_says_and_what_is_reported_is_the_tasks(
         buffer = model.replay_buffer
         assert type(buffer) is (ExecutedActionReplayBuffer if arm.learner.stores_executed else ReplayBuffer)
         executed = np.array([[info[keys.EXECUTED_ACTION] for info in row] for row in infos], np.float32)
-        stores = {"both": "executed_actions"}.get(kind, "actions")
-        difference = np.abs(getattr(buffer, stores)[: len(infos)] - executed).max(axis=-1)
+        difference = np.abs(buffer.actions[: len(infos)] - executed).max(axis=-1)
         assert (difference > 1e-6).any() == (not arm.learner.stores_executed)
-        assert not arm.learner.stores_executed or buffer.mode == kind
     if arm.learner.penalised:
         check_evaluation(experiment, model)
 
@@ -242,13 +238,18 @@ def test_actions_of_the_wrong_kind_are_refused_before_the_first_step(
 @pytest.mark.parametrize(
     ("algorithm", "learner", "overrides", "message"),
     [
-        ("SAC", "both", [], "both needs a penalty in units of the task's reward"),
-        ("SAC", "{kind: both, penalty: -1}", [], "learner.penalty: .* greater than or equal to 0, got -1"),
+        ("SAC", "adaption_penalty", [], "adaption_penalty needs a penalty in units of the task's reward"),
+        (
+            "SAC",
+            "{kind: adaption_penalty, penalty: -1}",
+            [],
+            "learner.penalty: .* greater than or equal to 0, got -1",
+        ),
         (
             "SAC",
             "{kind: safe_action, penalty: 1}",
             [],
-            "safe_action takes no penalty; adaption_penalty and both",
+            "safe_action takes no penalty; adaption_penalty does",
         ),
         ("DQN", "safe_action", [], "is for continuous actions, and DQN has"),
         ("SAC", "safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
@@ -258,8 +259,6 @@ def test_actions_of_the_wrong_kind_are_refused_before_the_first_step(
         ("TD3", "naive", ["hyperparameters={}"], r"TD3 is deterministic .*\{normal: 0.1\}"),
         ("SAC", "{cost_limit: 1}", ["normalize.reward=true"], "leave normalize out"),
         ("SAC", "{cost_limit: -1}", [], "cost_limit"),
-        ("SAC", "{margin_curriculum: {start: 1.0, until: 1.5}}", [], r"margin_curriculum\.until"),
-        ("SAC", "{margin_curriculum: {start: -0.005}}", [], "greater than or equal to 0"),
     ],
 )
 def test_what_does_not_go_together_is_refused_with_the_reason(

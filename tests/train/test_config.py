@@ -116,7 +116,7 @@ def test_arms_override_the_common_settings():
             "a.filter: expected none, protect, {protect: {...}}",
         ),
         ({"arms": {"a": {"filter": {"lease": {}}}}}, "beside it"),
-        ({"arms": {"a": {"learner": {"margin_curriculum": {"start": 0.1}}}}}, "there is no margin"),
+        ({"arms": {"a": {"learner": {"kind": "safe_action"}}}}, "without a filter no action is ever changed"),
         (
             {"hyperparameters": {"learning_rate": -1}},
             "learning_rate: input should be greater than 0, got -1.",
@@ -237,7 +237,7 @@ def test_the_command_prints_what_lies_beside_the_configs(capsys):
         ("n_envs=", True), ("arms.filtered=", True), ("arms.filtered.filter={protect: {margin: 0.1}}", True),
         ("total_steps=3e5", True), ("arms.filtered.learner={kind: adaption_penalty, penalty: 0.1}", True),
         ("env={id: SafePointGoal1-v0, observation: constraints}", True), ("trackers=[wandb]", True),
-        ("arms.filtered.learner.margin_curriculum={start: 0.1, until: 0.5}", True), ("device=", True),
+        ("device=", True),
     ],
 )  # fmt: skip
 def test_it_says_what_the_command_says(change, taken):
@@ -284,7 +284,7 @@ def test_the_page_s_required_keys_are_those_of_a_config():
     given = {"name": "x", "env": "Pendulum-v1", "algorithm": "PPO", "total_steps": 9, "arms": {"a": {}}}
     parse_experiment({**given, "seeds": [0]})
     required = {name for name, key in rows().items() if key.default == "required"}
-    inner = {"env.id", "learner.margin_curriculum.start", "sweep.parameters"}
+    inner = {"env.id", "sweep.parameters"}
     assert required == given.keys() | {"seeds"} | inner
 
 

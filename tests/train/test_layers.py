@@ -27,7 +27,6 @@ from safe_wrappers.train.config import (
 )
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
 from safe_wrappers.train.evaluation.summary import summarize, write_summary
-from safe_wrappers.train.experiment import train_experiment
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.report import comparison_table, verdict, write_report
 from safe_wrappers.train.run import train_run, training
@@ -47,7 +46,7 @@ def test_the_stack_has_every_layer_in_its_place():
     outages = {"mean_between_s": 0.2, "mean_length_s": 0.2}
     faults = {"Outages": outages, "RepeatedCommands": {"share": 0.1}}
     filtered = FilterConfig(protect={"margin": 0.1}, lease=LEASE, escape={"progress": 0.1})
-    learner = LearnerConfig("both", penalty=2.0, per_correction=0.5)
+    learner = LearnerConfig("adaption_penalty", penalty=2.0, per_correction=0.5)
     stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), filtered, learner)
     assert (stack.penalty, stack.per_correction) == (2.0, 0.5)
     kinds = [type(wrapper).__name__ for wrapper in wrappers_of(stack)]
@@ -85,7 +84,7 @@ def test_arguments_of_layers_that_are_missing_or_wrong_are_named(env, used, mess
 
 
 def test_a_penalty_needs_a_filter_of_ours():
-    learner = LearnerConfig("both", penalty=1.0)
+    learner = LearnerConfig("adaption_penalty", penalty=1.0)
     with pytest.raises(ConfigurationError, match="AdaptionPenalty needs a CBFActionFilter inside"):
         make_stack(EnvConfig("fake_task:FakeGoal-v0"), FilterConfig(factory="fake_task:shield"), learner)
 
@@ -182,80 +181,29 @@ def test_fetch_reach_is_trained_and_evaluated_by_its_plain_id(fake_experiment):
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-# Margins and prices that change in training -----------------------------------------------------------------------
+# A price on cost that changes in training -------------------------------------------------------------------------
 
-REACHER = (
-    "env=Reacher-v5",
-    "normalize.observation=false",
-    "arms={filtered: {filter: protect}}",
-    "n_envs=1",
-    "hyperparameters={n_steps: 64, batch_size: 64, n_epochs: 1}",
-    "evaluation={episodes: 1}",
-)
-CURRICULUM = "arms.filtered.learner.margin_curriculum={start: 1.0, end: 0.5, until: 0.5}"
 LIMIT = "arms.unfiltered.learner={cost_limit: 0, multiplier_rate: 0.01}"
 
 
-@pytest.fixture
-def seen(monkeypatch):
-    """By the run's steps: the filter's added margin, if it has one, and the price on cost."""
+def test_the_price_on_cost_rises_where_there_is_a_limit_and_goes_on_from_a_checkpoint(
+    fake_experiment, monkeypatch
+):
     found = {}
 
     class Watch(BaseCallback):
         def _on_step(self):
-            (margin, *_) = self.training_env.env_method("has_wrapper_attr", "added_margin")
-            margin = self.training_env.get_attr("added_margin")[0] if margin else None
-            found[self.num_timesteps] = margin, getattr(self.model, "lagrangian_multiplier", 0.0)
+            found[self.num_timesteps] = self.model.lagrangian_multiplier
             return True
 
     made = training.learner_callbacks
     monkeypatch.setattr(training, "learner_callbacks", lambda arm: [*made(arm), Watch()])
-    return found
-
-
-def test_the_margin_narrows_in_training_alone_and_goes_on_from_a_checkpoint(
-    fake_experiment, seen, monkeypatch
-):
-    experiment = fake_experiment(*REACHER, CURRICULUM, "total_steps=256")
-    trained(experiment, 0)
-    expected = {64: 1.0, 128: 0.75, 192: 0.5, 256: 0.5}
-    assert {step: seen[step][0] for step in expected} == expected and len(seen) == 256
-    judge, in_evaluation = sw.CBFActionFilter.judge, []
-
-    def watching(self, action):
-        in_evaluation.append((self.added_margin, self.constraints[0].margin))
-        return judge(self, action)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(sw.CBFActionFilter, "judge", watching)
-        evaluated(experiment, 0)
-    assert set(in_evaluation) == {(0.0, 0.01)} and len(in_evaluation) == 50
-    seen.clear()
-    trained(fake_experiment(*REACHER, CURRICULUM, "total_steps=512"), 0)
-    assert seen[257][0] == 0.5 and min(seen) == 257  # half of the longer run is done: `until`
-
-
-def test_the_price_on_cost_rises_where_there_is_a_limit_and_goes_on_from_a_checkpoint(fake_experiment, seen):
     trained(fake_experiment(LIMIT, "total_steps=384"), 0)
-    stood = seen[max(seen)][1]
+    stood = found[max(found)]
     assert stood > 0.0
-    seen.clear()
+    found.clear()
     trained(fake_experiment(LIMIT, "total_steps=512"), 0)
-    assert seen[min(seen)][1] == stood
-
-
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["arms.filtered.learner.margin_curriculum={start: 0.1}"], "has no set_margin"),
-        ([*REACHER, "arms.filtered.learner.margin_curriculum={start: 5.0}"], "leaves nothing of the limit"),
-    ],
-)
-def test_a_filter_that_cannot_have_the_margin_is_refused_before_training(fake_experiment, overrides, words):
-    experiment = fake_experiment(*overrides)
-    with pytest.raises(ConfigurationError, match=words):
-        train_experiment(experiment, Console(quiet=True))
-    assert not experiment.folder.exists()
+    assert found[min(found)] == stood
 
 
 # Who judges a task that reports no cost: nobody, a function, or the filter's own limits ----------------------------
