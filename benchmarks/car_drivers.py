@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.drivers import Action, Driver, Maker, held
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 _FULL = 0.02
 

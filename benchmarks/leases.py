@@ -29,8 +29,8 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.tables import keep, markdown, measured, options, total
-from safe_wrappers.checks import Array
 from safe_wrappers.control.watchdog import longest_lease
+from safe_wrappers.errors import Array
 from safe_wrappers.wrappers.faults import Outages
 
 PHYSICS_S, SUBSTEPS = 0.002, 10

@@ -60,14 +60,15 @@ _MATTER = {
     "filter/search.py": "SafeActionSearch.decide not; SafeActionSearch._decide not;"
     " SafeActionSearch._nearby not; SafeActionSearch._search not; SafeActionSearch.relinearize not",
     "filter/linearize.py": "Tangents._corrected not",
-    "control/projection.py": "_judge comparison; project_unchecked not",
+    "control/projection.py": "_missed comparison; project_unchecked comparison",
     "filter/bound.py": "Bound._of min/max; Bound._wanted min/max; Bound.slack min/max; Bound.admits not",
     "constraints/detour.py": "Detour.observe arithmetic; Detour._kept_side comparison",
     "control/backup/heading_drive.py": "clearances not; clearances comparison",
     "constraints/backup/coasting_clearance.py": "CoastingClearance.leaves_clear not;"
     " CoastingClearance._after min/max; CoastingClearance.h_along not",
-    "constraints/backup/point_clearance.py": "EscapeClearance.clearance not; EscapeClearance._backup not",
-    "control/backup/point_decision.py": "backup not; _stopped_at not",
+    "constraints/backup/escape_clearance.py": "EscapeClearance.clearance not; EscapeClearance._backup not",
+    "constraints/backup/wall_clearance.py": "WallClearance.proposals not; WallClearance.h_along arithmetic",
+    "control/backup/point_among_walls.py": "way min/max; distances min/max; slides comparison",
     "constraints/predictive_shield.py": "PredictiveShield.plan comparison; PredictiveShield._after not",
     "wrappers/presets.py": "ActionShield.step not; ActionShield.action_masks not",
     "wrappers/stopping.py": "BoundBudget.longest_time not; BoundBudget.can_stop_after not",

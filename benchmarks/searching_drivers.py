@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 from safe_wrappers.plants.copies import EnvCopier
 
 Score = Callable[[Array], float]

@@ -12,8 +12,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, finite_action
-from safe_wrappers.errors import SafeWrappersError
+from safe_wrappers.errors import Array, SafeWrappersError, finite_action
 from safe_wrappers.info import GOALS_REACHED
 
 from .layout import Given

@@ -10,8 +10,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP
 
 from .field import ASSETS, FieldEnv

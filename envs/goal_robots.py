@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 LIDAR_BINS: Final = 16
 """Directions per object kind; bin i spans [i, i + 1] * 2 pi / 16 counter-clockwise from straight ahead."""

@@ -9,8 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import Array, ConfigurationError, UnknownNameError
 
 Given = Mapping[str, Any]
 """The parts of a layout that are fixed, arrays by name; what is missing is sampled."""

@@ -8,9 +8,8 @@ import mujoco
 import numpy as np
 from gymnasium.utils import EzPickle
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation import Motion, Tracks
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
 from .field import FieldEnv

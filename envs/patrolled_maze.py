@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.estimation import Motion, Tracks
+from safe_wrappers.errors import Array
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
 from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic

@@ -9,8 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import Array, ConfigurationError, UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP, SPIN_OUT
 
 from .field import FieldEnv

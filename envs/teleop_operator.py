@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 REACTION_S: Final = (0.15, 0.25)
 """Range of human reaction times, s, from which one is drawn."""

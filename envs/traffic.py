@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 CAR_MEAN_SPEED: Final = 1.0
 """m/s, along the lane."""

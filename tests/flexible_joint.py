@@ -9,7 +9,7 @@ another.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 
 def manifold(torque: Array, rotor_inertia: Array, link_inertia: Array, taken: Array | float = 0.0) -> Array:

@@ -23,12 +23,10 @@ LAYERS = {
 }
 FLOORS = (
     {"errors", "info"},
-    {"checks"},
     {"control"},
     {"plants", "envs"},
-    {"filter", "stack"},
+    {"filter"},
     {"constraints"},
-    {"serialize"},
     {"wrappers", "sb3"},
     {"diagnosis"},
     {"", "train"},

@@ -15,7 +15,7 @@ FOLDERS = [str(Path(__file__).parent / name) for name in ("control", "constraint
 CALLS = {
     "test_stopping": ("random_looks", [200]),
     "test_heading_drive": ("random_scenes", [200]),
-    "test_point_decision": ("random_scenes", [200]),
+    "test_point_among_walls": ("random_scenes", [40]),
 }
 """Module -> its function that returns a digest, and the arguments."""
 

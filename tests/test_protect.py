@@ -337,13 +337,13 @@ def test_box2d_is_protected_by_forks(env_id):
 
 
 def test_an_asynchronous_vector_env_is_told_how_to_protect_each_env():
-    vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="async", max_episode_steps=7)
-    message = refusal(vector)
+    vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="async")
+    assert "gym.make_vec(..., wrappers=[sw.protect])" in refusal(vector)
     vector.close()
-    protected = eval(message.partition("protect each env of it: ")[2], {"gym": gym, "sw": sw})
+    protected = gym.make_vec("Reacher-v5", 2, vectorization_mode="async", wrappers=[sw.protect])
     _, info = protected.reset(seed=0)
     assert protected.num_envs == 2 and info["cbf/margin"].shape == (2,)
-    assert protected.spec.kwargs["max_episode_steps"] == 7 and type(protected) is type(vector)
+    assert type(protected) is type(vector)
     protected.close()
 
 

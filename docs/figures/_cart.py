@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 _FINE = 20
 """Points per control step at which the motion is kept."""

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 
 def bang_bang(size: float, often: float, seed: int = 0) -> Callable[[Any], Any]:

@@ -11,7 +11,7 @@ from matplotlib.patches import Circle
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, OFF, ON, SAFE, bare, panels
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 HAZARD = [0.92, 0.03]
 LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.9, 0.15], "hazards": [HAZARD], "vases": []}

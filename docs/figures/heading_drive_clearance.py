@@ -9,8 +9,8 @@ from matplotlib.patches import Circle
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import way_to_rest
+from safe_wrappers.errors import Array
 
 HEADING, SPEED = 0.7, 1.3
 

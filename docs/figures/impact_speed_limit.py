@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, OFF, ON, OTHER, panels
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 LIMIT, STIFFNESS, MASS, PUSH = 140.0, 25e3, 6.0, 150.0
 GAP, START, STEPS = 0.08, 0.3, 28

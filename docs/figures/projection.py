@@ -7,7 +7,7 @@ from matplotlib.patches import Polygon, Rectangle
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, SAFE, panels
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 LOW, HIGH = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
 _POLICY = {"marker": "o", "color": OFF, "ms": 7}

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 import safe_wrappers as sw
 from _drivers import bang_bang
 from _style import FORBIDDEN, INK, OFF, ON, bare, panels
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 with contextlib.redirect_stderr(io.StringIO()):  # it greets on stderr
     import gymnasium_robotics

@@ -7,9 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import Array, non_negative, one_number, positive
 from safe_wrappers.control import barriers as cbf
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, non_negative, one_number, positive
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant, Trajectory
 

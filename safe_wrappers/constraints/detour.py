@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 from safe_wrappers.filter.constraint import Constraint, Memory
 
 

@@ -6,8 +6,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from safe_wrappers.checks import (
+from safe_wrappers.constraints.obstacles import distances, obstacles_from
+from safe_wrappers.constraints.rollout import RolloutConstraint
+from safe_wrappers.errors import (
     Array,
+    ConfigurationError,
+    UnknownNameError,
     check_fields,
     finite_array,
     name_list,
@@ -15,9 +19,6 @@ from safe_wrappers.checks import (
     positive,
     true_or_false,
 )
-from safe_wrappers.constraints.obstacles import distances, obstacles_from
-from safe_wrappers.constraints.rollout import RolloutConstraint
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.plant import Plant

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from safe_wrappers.checks import check_fields, non_negative, positive, whole_number
+from safe_wrappers.errors import check_fields, non_negative, positive, whole_number
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant

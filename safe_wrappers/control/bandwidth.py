@@ -18,8 +18,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
-from safe_wrappers.errors import ConfigurationError, PhaseMarginWarning
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    PhaseMarginWarning,
+    check_fields,
+    non_negative,
+    positive,
+)
 
 
 def phase_lag(crossover: float, control_dt: float, late_s: float = 0.0) -> float:

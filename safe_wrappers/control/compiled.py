@@ -58,7 +58,7 @@ def _drop_stale(function: Callable[..., Any]) -> None:
 
 
 _COMPILE = _compiler()
-_NEWEST_SOURCE_S = max(source.stat().st_mtime for source in Path(__file__).parents[1].rglob("*.py"))
+_NEWEST_SOURCE_S = max(source.stat().st_mtime for source in Path(__file__).parent.rglob("*.py"))
 IS_COMPILED = _COMPILE is not None
 """Whether `compiled` gives machine code in this process."""
 

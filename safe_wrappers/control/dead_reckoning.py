@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation

@@ -15,8 +15,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, finite_arrays, float_array, positive
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, finite_arrays, float_array, positive
 
 
 def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> tuple[Array, Array]:

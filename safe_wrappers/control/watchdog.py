@@ -25,8 +25,7 @@ import numpy as np
 import ruckig
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 
 _ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
 """Relative bound on the accumulated rounding of the formulas below."""

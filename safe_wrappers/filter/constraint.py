@@ -6,8 +6,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.plants.plant import Model, Plant
 
 Promise = Literal["proved", "best effort"]

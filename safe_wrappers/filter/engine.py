@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.projection import load_solvers
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
@@ -80,17 +79,6 @@ class SafetyFilter:
                 if c.predicts:
                     c.slack(self.last)
             self._loaded = True
-
-    def take_over(self, before: "SafetyFilter") -> None:
-        """Go on in the episode of another filter of the same plant and the same kinds of constraints.
-
-        It is to be observed next. Before an episode there is nothing to go on with.
-        """
-        for new, old in zip(self.bound, before.bound, strict=True):
-            if old.max_decrease is None:  # it was broken
-                new.max_decrease = None
-        if hasattr(before, "memories"):
-            self.memories, self.last, self.margin = before.memories, before.last, before.margin
 
     def observe(self) -> None:
         """Take the env's present state, and `margin` from it."""

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import Array, float_array
 from safe_wrappers.control.projection import box_least_squares
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import Array, ConfigurationError, UnknownNameError, float_array
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.plants.mujoco.model import inertia
 from safe_wrappers.plants.plant import Plant

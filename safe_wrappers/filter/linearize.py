@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 from safe_wrappers.filter.constraint import HalfSpaces
 
 Slacks = Callable[[Array], Array]

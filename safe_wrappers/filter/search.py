@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.projection import (
     Projection,
     Status,
@@ -19,6 +18,7 @@ from safe_wrappers.control.projection import (
     keeps_rows,
     project_unchecked,
 )
+from safe_wrappers.errors import Array
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.filter.fallback import Fallback

@@ -11,11 +11,11 @@ from safe_wrappers.constraints import JointSpeedLimit, PredictiveShield
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.simulator import SimulatorPlant
-from safe_wrappers.stack import refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.presets import ActionShield
 from safe_wrappers.wrappers.recipes import EVERY, PLANTS, family_of, recipe_of
-from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, by_env, single_envs
+from safe_wrappers.wrappers.stack import refuse_order
+from safe_wrappers.wrappers.vector_cbf_action_filter import EACH, VectorCBFActionFilter, single_envs
 
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 _LIMIT: Final = (
@@ -59,14 +59,15 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
         if len(ids) > 1:
             raise UnsupportedEnvError(f"expected a vector env of one id, got {ids}; protect each env of it")
         if isinstance(env.single_action_space, gym.spaces.Discrete):
-            raise UnsupportedEnvError(
-                f"discrete actions are shielded env by env, got {env!r}; protect each env of it: {by_env(env)}"
-            )
+            raise UnsupportedEnvError(f"discrete actions are shielded env by env, got {env!r}; {EACH}")
     elif isinstance(env, gym.Env):
         refuse_order(env, CBFActionFilter.layer, "protect")
         kind, single = ActionShield if isinstance(env.action_space, gym.spaces.Discrete) else kind, env
     else:
-        raise UnsupportedEnvError(f"expected one env, or a vector env, got {env!r}; {_of_no_env(env)}")
+        raise UnsupportedEnvError(
+            f"expected an env as gym.make returns it, or a Gymnasium vector env, got {env!r}; with other vector envs "
+            "protect each env of it, such as make_vec_env(..., wrapper_class=sw.protect)"
+        )
     family, name = family_of(single), recipe_of(single.spec.id) if single.spec is not None else None
     if name is None:
         raise UnsupportedEnvError(_without_recipe(kind.__name__, single))
@@ -116,12 +117,3 @@ def _without_recipe(kind: str, single: gym.Env[Any, Any]) -> str:
     similar = f"\nRecipes of similar names: {', '.join(near)}" if near else ""
     name = single.spec.id if single.spec is not None else repr(single.unwrapped)
     return f"no recipe for {name}. {by_hand}{similar}"
-
-
-def _of_no_env(given: Any) -> str:
-    """What to write instead, where the argument is not an env."""
-    if isinstance(given, str):
-        return f"write protect(gym.make({given!r}))"
-    if hasattr(given, "num_envs"):
-        return f"protect each env of it: make_vec_env(..., n_envs={given.num_envs}, wrapper_class=sw.protect)"
-    return "write protect(gym.make(...))"

@@ -3,31 +3,40 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative, positive
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.plants import default_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import constraint_from
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.layer import SAME_STEP, CommandReceiver, Env, LayerWrapper, Step
+from safe_wrappers.wrappers.serialize import constraint_from
 
 ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
 """Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""
 
 _ROW_TOLERANCE = 1e-9
 """Control units times normals: a row that is violated by less is kept."""
+
+
+_CHECKS: Final = (
+    (["localisation", "margin"], non_negative, "m"),
+    (["act_s"], non_negative, "s"),
+    (["acceleration"], non_negative, "m/s^2"),
+    (["braking"], positive, "m/s^2"),
+    (["top_speed"], positive, "m/s"),
+    (["closing_speed"], positive, "the constraint's unit per second"),
+)
 
 
 @dataclass(frozen=True)
@@ -67,25 +76,20 @@ class StoppingBudget:
         elif isinstance(given, type) or not callable(given):
             function = "a function of the env that returns clearances in m and approach speeds in m/s"
             raise ConfigurationError(f"clearance is a constraint or {function}; got {given!r}")
-        check_fields(self, non_negative, ["localisation", "margin"], "m")
-        check_fields(self, non_negative, ["act_s"], "s")
-        check_fields(self, non_negative, ["acceleration"], "m/s^2")
-        check_fields(self, positive, ["braking"], "m/s^2")
-        check_fields(self, positive, ["top_speed"], "m/s")
-        check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
+        for names, check, unit in _CHECKS:
+            check_fields(self, check, names, unit)
         name = type(self.clearance).__name__
         if not self.measures_approach:
             if self.closing_speed is None:
                 raise ConfigurationError(f"{name} does not say how fast it is approached: give closing_speed")
             if (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
                 raise ConfigurationError(f"{name} counts braking already: give closing_speed alone")
-            return
-        if self.braking is None and not isinstance(self.clearance, Clearance):
-            raise ConfigurationError("braking is missing: the least deceleration of the fallback, m/s^2")
-        if self.acceleration is None:
-            raise ConfigurationError("acceleration is missing: the largest that any command may cause, m/s^2")
-        if self.closing_speed is not None:
+        elif self.closing_speed is not None:
             raise ConfigurationError("closing_speed is for constraints that measure no approach speed")
+        elif self.braking is None and not isinstance(self.clearance, Clearance):
+            raise ConfigurationError("braking is missing: the least deceleration of the fallback, m/s^2")
+        elif self.acceleration is None:
+            raise ConfigurationError("acceleration is missing: the largest that any command may cause, m/s^2")
 
     @property
     def measures_approach(self) -> bool:
@@ -259,10 +263,10 @@ class CommandGate(LayerWrapper, CommandReceiver):
     _not_sent: ClassVar[str]
     """What happens instead with one that is not finite."""
 
-    def __init__(self, env: Env, control_dt: float | None) -> None:
+    def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
         space = check_actions(env)
-        self.control_dt = check_timing(env, control_dt)
+        self.control_dt = check_timing(env)
         self._same_s = SAME_STEP * self.control_dt
         self._shape, self._dtype = space.shape, space.dtype
         self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))

@@ -193,6 +193,7 @@ class Approaching(sw.Constraint, Model):
 @pytest.mark.parametrize(("left", "often"), [(0.5, 10), (-0.1, 1)])
 def test_slopes_are_kept_for_ten_control_steps_and_from_outside_for_none(left, often):
     plant = SimpleNamespace(has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1)
+    plant.model_version = 0
     limit, memory, made = Bound(Approaching(left), plant), {}, []
     for plant.observation_id in range(1, 25):
         limit.observe(memory)

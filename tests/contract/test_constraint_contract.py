@@ -12,7 +12,7 @@ import safe_wrappers as sw
 from safe_wrappers import constraints as of
 from safe_wrappers.constraints.obstacles import obstacle_from
 from safe_wrappers.errors import UnknownNameError
-from safe_wrappers.serialize import constraint_from, plain_data
+from safe_wrappers.wrappers.serialize import constraint_from, plain_data
 
 OBSTACLES = [
     of.Box([1.0, 0.0, 0.0], [0.1, 0.2, 0.3]),
@@ -40,7 +40,7 @@ CONSTRAINTS = [
     of.SingularityMargin(geom="tip", task_speed=0.1, rate_limit=6.0, horizon=7),
     of.SingularityMargin(0.003, site="grip"),
     of.SpeedLimit(1.5, "torso", "-x", "substep", 0.1, 4, 0.7, 0.6, True),
-    of.Stance(0.6, "exact", 0.2),
+    of.Stance(0.6, "exact"),
     of.SupportMargin(0.02, 0.01),
     of.TrackPermission("robot", 3.0, ("car0",)),
     of.Traction(["left", "right"], 0.1, 0.3, 0.4, 0.01),

@@ -38,7 +38,7 @@ MAKE = {
     "CBFActionFilter": lambda env: sw.CBFActionFilter(env, [BLOCKED]),
     "protect": sw.protect,
     "SlipLimiter": lambda env: sw.SlipLimiter(env, list(WHEELS)),
-    "WholeBodyFilter": lambda env: sw.WholeBodyFilter(env, contacts="pyramid"),
+    "Stance": lambda env: sw.CBFActionFilter(env, [sw.constraints.Stance()]),
     "LeaseExpiry": lambda env: sw.LeaseExpiry(env, sw.StoppingBudget(room, braking=9.0, acceleration=20.0)),
     "TeleopChannel": lambda env: sw.TeleopChannel(env, 0.06, 0.04),
     "OcclusionPenalty": tracked,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 from ..files import write_bytes
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from safe_wrappers.checks import Array
+from safe_wrappers.errors import Array
 
 from ..config import ArmConfig, ExperimentConfig, FilterConfig
 from ..files import read_rows, write_json, write_rows

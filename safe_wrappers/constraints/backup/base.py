@@ -6,8 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.shapes import NUMBERS
+from safe_wrappers.errors import Array
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.plant import Model, Trajectory
 

@@ -9,11 +9,18 @@ from typing import Any, ClassVar, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, finite_array, non_negative, positive, whole_number
 from safe_wrappers.constraints.backup.base import DetourClearance
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline, nearest_discs
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    check_fields,
+    finite_array,
+    non_negative,
+    positive,
+    whole_number,
+)
 from safe_wrappers.plants.mujoco.coasting import Coasting, Course
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant, Trajectory

@@ -6,12 +6,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.checks import Array, check_fields, non_negative
 from safe_wrappers.constraints.detour import Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup.heading_drive import clearances, look, way_to_rest
 from safe_wrappers.control.numerics.shapes import nearest_discs
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
 from safe_wrappers.plants.mujoco.plant import require_mujoco

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis, brake, step
 from safe_wrappers.control.compiled import compiled, hypot
+from safe_wrappers.errors import Array
 
 
 class Maneuver(NamedTuple):

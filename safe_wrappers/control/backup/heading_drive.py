@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.compiled import compiled, hypot
+from safe_wrappers.errors import Array
 
 REST_M: Final = 5e-4
 """A body that cannot get farther than this is as good as at rest."""

@@ -7,8 +7,7 @@ the clamp more control changes nothing, so it becomes a bound on the control.
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import Array, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, SCALAR_JOINTS, control_range
 
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)

@@ -7,8 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 # m/s, of the body and its farthest point: slower counts as at rest. Safety-Gymnasium's car then moves on by 0.8 mm.

@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.plants.mujoco.model import kinematics, named
 
 # Later versions of MuJoCo take one more argument.

@@ -5,9 +5,8 @@ import math
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import HeadingDrive
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import Array, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, SLIDE
 from safe_wrappers.plants.mujoco.plant import MujocoPlant

@@ -1,6 +1,5 @@
-"""WallClearance and EscapeClearance: for a point mass on two axes, out of walls and of what moves."""
+"""EscapeClearance: for a point mass on two axes, out of the way of what moves."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -8,8 +7,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import Array, check_fields, non_negative, positive
-from safe_wrappers.constraints.backup.base import BackupClearance
 from safe_wrappers.constraints.obstacles import (
     Disc,
     Discs,
@@ -18,104 +15,17 @@ from safe_wrappers.constraints.obstacles import (
     distances,
     obstacles_from,
 )
-from safe_wrappers.control.backup import point_decision
-from safe_wrappers.control.backup.damped_axis import braking
 from safe_wrappers.control.backup.evasive_maneuvers import (
     Around,
     EvasiveManeuvers,
     Maneuver,
     least_left,
 )
-from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
-from safe_wrappers.plants.mujoco.planar_point import planar_point, walls
+from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative, positive
+from safe_wrappers.filter.constraint import Constraint, Memory
+from safe_wrappers.plants.mujoco.planar_point import nearest_first, planar_point
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Model, Plant, Trajectory
-
-
-@dataclass
-class WallClearance(BackupClearance):
-    """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
-
-    A control is admitted if, held for one control step and followed by full braking of each axis, it keeps the point
-    clear of every fixed box of the MuJoCo model.
-
-    Proved: from a safe state the point never touches a wall, at any substep or in between. The plant's mass, damping
-    and gears must be the machine's, walls stand still, and `velocity_clip` is the env's. Under a plant's `delay_s`
-    the state is predicted without the clip: proved up to that speed.
-
-    Args:
-        margin: Beyond the distance at which MuJoCo reports a contact, m; covers rounding and the position error.
-        velocity_clip: Speed along each axis to which the env clips the motion at the start of every control step, m/s
-            (PointMaze: 5). None: not known; covers every clip.
-
-    Raises:
-        UnsupportedEnvError: At binding: no `MujocoPlant`, no such point, or walls that are not boxes along x and y.
-
-    Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
-
-    Example:
-        >>> import safe_wrappers as sw
-        >>> walls = sw.constraints.WallClearance(margin=0.01, velocity_clip=5.0)
-        >>> walls.promise
-        'proved'
-    """
-
-    margin: float = 0.001
-    velocity_clip: float | None = None
-
-    promise = "proved"
-
-    def __post_init__(self) -> None:
-        self.margin = non_negative("margin", self.margin, "m")
-        check_fields(self, positive, ("velocity_clip",), "m/s")
-
-    def setup(self, plant: Plant) -> None:
-        hint = "on an AnalyticPlant use Clearance([Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
-        super().setup(require_mujoco(plant, f"WallClearance needs a MujocoPlant; {hint}"))
-        clip = self.velocity_clip
-        self._point = point = planar_point(self.plant, math.inf if clip is None else clip)
-        around, reach = walls(self.plant.model, point.body)
-        self._room = room = reach + self.margin
-        known = clip is not None
-        at = point.axes, point.origin, point.joints, point.actuators
-        self._scene = point_decision.scene(*at, room, known, around)
-        self._motion = np.zeros(4)
-
-    def clearance(self) -> Array:
-        """Distance of the braking path from touching a wall, margin not taken off, m, shape (1,); no walls: (0,)."""
-        self._left = point_decision.room_left(self._scene, self.plant.qpos, self.plant.qvel, self._motion)
-        return np.array([self._left + self.margin] if len(self._scene[-1]) else [])
-
-    def leaves_clear(self, control: Array) -> bool:
-        return point_decision.is_admitted(self._scene, self._motion, self._left, control)
-
-    def _backup(self) -> Array:
-        """The control that is always admitted: brake both axes. From outside it leads back inside."""
-        pair = point_decision.backup_pair(self._scene, self._motion, self._left)
-        return self._point.control(np.zeros(self.plant.model.nu), pair)
-
-    def proposals(self, control: Array | None) -> list[Array]:
-        """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
-        if control is None:
-            return [self._backup()]
-        pairs = point_decision.candidates(self._scene, self._motion, self._left, control)
-        return [self._point.control(control, pair) for pair in pairs]
-
-    def points(self, path: Trajectory) -> Array:
-        """The way until rest under full braking, at the ends of the control steps, m, shape (instants, 1, 2)."""
-        x, y, vx, vy = self._motion.tolist()
-        ways = braking(self._point.axes[0], x, vx), braking(self._point.axes[1], y, vy)
-        longest = max(map(len, ways))
-        return np.stack([np.pad(way, (0, longest - len(way)), mode="edge") for way in ways], axis=1)[:, None]
-
-    def rows(self) -> HalfSpaces:
-        """Bounds on the control along x and y: a convex part of what is admitted, braking included."""
-        pairs, offsets = point_decision.half_spaces(self._scene, self._motion, self._left)
-        normals = np.zeros((len(offsets), self.plant.model.nu))
-        normals[:, self._point.actuators] = pairs
-        return HalfSpaces(normals, offsets)
-
 
 _EVERY = 2  # holds between the instants at which ways are checked
 _GOING_S = (0.3, 0.8)  # for how long the manoeuvres go before they brake, s
@@ -198,8 +108,8 @@ class EscapeClearance(Constraint, Model):
 
     def observe(self, memory: Memory) -> None:
         self._asked: list[tuple[Array, NDArray[np.intp]]] = []
-        joints = list(self._point.joints)
-        self._position = self.plant.qpos[joints] + np.asarray(self._point.origin)
+        joints = self._point.joints
+        self._position = self.plant.qpos[joints] + self._point.origin
         going_on, asked = None, memory.get("asked", ())
         if (
             asked
@@ -284,7 +194,7 @@ class EscapeClearance(Constraint, Model):
         return left
 
     def _driven(self, control: Array) -> Array:
-        return np.asarray(control)[list(self._point.actuators)]
+        return np.asarray(control)[self._point.actuators]
 
     def h_along(self, path: Trajectory) -> Array:
         """What the best way out after a held control leaves, m; now the distance from what is around."""
@@ -320,19 +230,15 @@ class EscapeClearance(Constraint, Model):
         left = self._slacks(firsts).max(axis=1)
         self._best = float(left.max())
         needed = self._needed()
-        good = _nearest_first(firsts[left >= needed], asked)
+        good = nearest_first(firsts[left >= needed], asked)
         if needed == 0.0 and len(good):
             ends = good[:_APPROACHED]
             tried = [asked + share * (end - asked) for end in ends for share in _BLENDS]
             tried += [np.array(pair) for x, y in ends for pair in ((asked[0], y), (x, asked[1]))]
             closer = np.array(tried)
             closer = closer[self._slacks(closer).max(axis=1) >= 0.0]
-            good = _nearest_first(np.concatenate([good, closer]), asked)
+            good = nearest_first(np.concatenate([good, closer]), asked)
         return [self._point.control(control, pair) for pair in good]
-
-
-def _nearest_first(controls: Array, asked: Array) -> Array:
-    return np.asarray(controls[np.argsort(((controls - asked) ** 2).sum(axis=1), kind="stable")])
 
 
 def _moves(obstacle: Any) -> bool:
