@@ -62,8 +62,8 @@ _MATTER = {
     "filter/linearize.py": "Tangents._corrected not",
     "control/projection.py": "_missed comparison; project_unchecked comparison",
     "filter/bound.py": "Bound._of min/max; Bound._wanted min/max; Bound.slack min/max; Bound.admits not",
-    "constraints/backup/base.py": "DetourClearance.observe arithmetic; DetourClearance._kept_side not",
-    "control/backup/drive_among_discs.py": "admits not; _to_disc not",
+    "constraints/detour.py": "Detour.observe arithmetic; Detour._kept_side comparison",
+    "control/backup/heading_drive.py": "clearances not; clearances comparison",
     "constraints/backup/coasting_clearance.py": "CoastingClearance.leaves_clear not;"
     " CoastingClearance._after min/max; CoastingClearance.h_along not",
     "constraints/backup/escape_clearance.py": "EscapeClearance.clearance not; EscapeClearance.proposals not",

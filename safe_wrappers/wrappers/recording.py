@@ -110,7 +110,7 @@ class RecordInterventions(LayerWrapper):
         path: A CSV file, one for each env, that gains one row per finished episode; an existing one is continued.
 
     Raises:
-        ConfigurationError: `path` is a folder, or a file with other columns; or a `ChunkHandover` inside.
+        ConfigurationError: `path` is a file with other columns; or a `ChunkHandover` inside.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -208,8 +208,6 @@ def _whole_lines(data: bytes) -> bytes:
 
 
 def _continue_file(path: Path) -> None:
-    if path.is_dir():
-        raise ConfigurationError(f"RecordInterventions: {str(path)!r} is a folder; give a file name in it.")
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         return

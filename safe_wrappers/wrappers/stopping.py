@@ -146,7 +146,9 @@ class BoundBudget:
     def measure(self) -> None:
         """Read clearances and approach speeds of the present state."""
         if self.bound is None:
-            self.clearance, self.speed = self._of_function()
+            function: Any = self._budget.clearance
+            answer = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in function(self._env))
+            self.clearance, self.speed = np.broadcast_arrays(*answer)
             return
         self.observe()
         if not np.isfinite(self.bound.plant.state).all():  # of which it may read only a part
@@ -199,17 +201,6 @@ class BoundBudget:
         assert self.bound is not None
         rows = self.bound.rows()
         return bool((rows.normals @ command <= rows.offsets + _ROW_TOLERANCE).all())
-
-    def _of_function(self) -> tuple[Array, Array]:
-        function: Any = self._budget.clearance
-        answer = function(self._env)
-        try:
-            clearance, speed = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in answer)
-            clearance, speed = np.broadcast_arrays(clearance, speed)
-        except (TypeError, ValueError):
-            wanted = "clearances in m and approach speeds in m/s, of one shape"
-            raise ConfigurationError(f"the clearance function must return {wanted}; got {answer!r}") from None
-        return clearance, speed
 
 
 class FallbackController:
