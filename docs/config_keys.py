@@ -24,7 +24,6 @@ _WRITTEN = {
     "arms": "mapping",
     "env.judge": "`constraints`",
     "env.observation": "`constraints`",
-    "learner.margin_curriculum": "mapping",
     "sweep": "mapping",
 }
 """Types in YAML where Python has another one."""

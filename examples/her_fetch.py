@@ -26,7 +26,7 @@ model = SAC(
     buffer_size=steps,
     learning_starts=min(1000, steps // 2),  # at least an episode, here 50 steps
     replay_buffer_class=ExecutedActionHerReplayBuffer,
-    replay_buffer_kwargs={"mode": "safe_action", "n_sampled_goal": 4},
+    replay_buffer_kwargs={"n_sampled_goal": 4},
     seed=0,
     device="cpu",
 )

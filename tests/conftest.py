@@ -19,8 +19,8 @@ settings.load_profile("reproducible")
 
 BEGIN = (
     # Each worker compiles other parts of the package first and finds those of the other one compiled.
-    "test_drive_among_discs",
-    "test_point_decision",
+    "test_heading_drive",
+    "test_point_among_walls",
     "test_support_distances",
     "test_contact_feasibility",
     # What takes long comes early, so that no worker is alone with it in the end.

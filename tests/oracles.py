@@ -9,7 +9,7 @@ from safe_wrappers.control.estimation import discretise
 
 def blind_covariance(start, a, q, time_s):
     """The covariance after a time without measurements, from the exact steps of `discretise`."""
-    transition, noise = discretise(a, q, time_s)
+    transition, _, noise = discretise(a, q, time_s)
     return transition @ start @ np.swapaxes(transition, -1, -2) + noise
 
 

@@ -118,8 +118,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         ),
     },
     "CostFunction": {
-        "a function": ("Reacher-v5", lambda: {"fn": _joint_speed}),
-        "its name": ("Reacher-v5", lambda: {"fn": f"{__name__}:_joint_speed"}),
+        "a function by its name": ("Reacher-v5", lambda: {"fn": f"{__name__}:_joint_speed"}),
     },
     "FilterObservation": {
         "constraints without a filter": (
@@ -248,10 +247,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                 "tolerance": 0.02,
             },
         ),
-        "the program with exact cones": (
-            "HalfCheetah-v5",
-            lambda: {"contacts": "cone", "friction_share": 0.5, "joint_tolerance": None},
-        ),
+        "contacts alone": ("HalfCheetah-v5", lambda: {"friction_share": 0.5, "joint_tolerance": None}),
     },
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""

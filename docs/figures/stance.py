@@ -33,7 +33,7 @@ def draw() -> Figure:
     ):
         distances = []
         for share in SHARES:
-            stance = Bound(sw.constraints.Stance(float(share), joint_tolerance=None, **options), plant)
+            stance = Bound(sw.constraints.Stance(float(share), **options), plant)
             stance.observe({})
             stance.admits(wanted)
             (answer,) = stance.candidates(wanted)

@@ -1,8 +1,9 @@
 """Safety requirements: each turns a plant into half-spaces on the control."""
 
 from safe_wrappers.constraints.backup.coasting_clearance import CoastingClearance
+from safe_wrappers.constraints.backup.escape_clearance import EscapeClearance
 from safe_wrappers.constraints.backup.heading_drive_clearance import HeadingDriveClearance
-from safe_wrappers.constraints.backup.point_clearance import EscapeClearance, WallClearance
+from safe_wrappers.constraints.backup.wall_clearance import WallClearance
 from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance, TrackPermission
 from safe_wrappers.constraints.contact_feasibility import ContactFeasibility, Stance, SupportMargin

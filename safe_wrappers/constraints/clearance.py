@@ -6,18 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.constraints.obstacles import (
-    Nearest,
-    Plain,
-    obstacles_from,
-    refuse_more_dimensions,
-)
-from safe_wrappers.control.backup.stopping import (
-    Machine,
-    approach_rows,
-    approach_rows_of,
-    approaches,
-)
+from safe_wrappers.constraints.obstacles import obstacles_from
+from safe_wrappers.control.backup.stopping import Machine, Nearest, approach_rows, approaches
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,
@@ -85,9 +75,7 @@ class Clearance(Constraint):
         super().setup(plant)
         named = {"body": self.bodies, "site": self.sites, "geom": self.geoms}
         self._named = [(kind, name) for kind, names in named.items() for name in names]
-        coordinates = len(self.position)
         if isinstance(plant, MujocoPlant):
-            coordinates = 3
             if not self._named:
                 there = ", ".join(plant.names("body"))
                 wanted = "name the bodies, sites or geoms to keep clear"
@@ -97,11 +85,6 @@ class Clearance(Constraint):
         elif not self.position:
             given = "position=[0, 1], velocity=[2, 3]"
             raise ConfigurationError(f"on an AnalyticPlant say where the point is in the state: {given}")
-        self._still: Array | None = None
-        if all(isinstance(o, Plain) and o.still for o in self.obstacles):
-            self._still = np.concatenate([o.surfaces(plant) for o in self.obstacles])
-            for surface in self._still:
-                refuse_more_dimensions(int(surface[1]), coordinates)
 
     def observe(self, memory: Memory) -> None:
         self._observed: tuple[Array, HalfSpaces] | None = None
@@ -130,15 +113,12 @@ class Clearance(Constraint):
         if self._observed is None:
             plant = self.plant
             limits = plant.lower, plant.upper, plant.delay_s, plant.control_dt
-            machine: Machine = *limits, self.radius, self.braking, self.state_error + self.margin
+            machine = Machine(*limits, self.radius, self.braking, self.state_error + self.margin)
             found = [
-                approach_rows(*self._surfaces(p), v, drift, effect, machine)
-                if self._still is None
-                else approach_rows_of(self._still, p, v, drift, effect, machine)
+                approach_rows(self._surfaces(p), v, drift, effect, machine)
                 for p, v, drift, effect in self._accelerations()
             ]
-            parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
-            rooms, normals, offsets = parts
+            rooms, normals, offsets = map(np.concatenate, zip(*found, strict=True))
             self._observed = rooms, HalfSpaces(normals, offsets)
         return self._observed
 
@@ -149,11 +129,8 @@ class Clearance(Constraint):
     def approach(self) -> tuple[Array, Array]:
         """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""
         # Not through `_look`: the accelerations, which only the rows need, are most of its work.
-        delay_s, radius = self.plant.delay_s, self.radius
-        found = [
-            approaches(near.distance, near.normal, near.velocity, v, delay_s, radius)
-            for near, v in ((self._surfaces(p), v) for p, v in self._motions())
-        ]
+        late = self.plant.delay_s, self.radius
+        found = [approaches(self._surfaces(p), v, *late) for p, v in self._motions()]
         clearances, speeds = zip(*found, strict=True)
         return np.concatenate(clearances), np.concatenate(speeds)
 

@@ -2,19 +2,18 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control import whole_body
 from safe_wrappers.control.contact import cone_excess
 from safe_wrappers.control.legged import support_distances
 from safe_wrappers.control.projection import Status
-from safe_wrappers.control.whole_body import WholeBodyProblem, WholeBodySolution, predicted_position_rows
+from safe_wrappers.control.whole_body import WholeBodyProblem, WholeBodySolution
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,
@@ -25,7 +24,7 @@ from safe_wrappers.errors import (
 )
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
-from safe_wrappers.plants.mujoco.contacts import ContactForecast, can_touch_the_world
+from safe_wrappers.plants.mujoco.contacts import Contacts, can_touch_the_world
 from safe_wrappers.plants.mujoco.dynamics import equations_of_motion
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -33,12 +32,27 @@ from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
 _EDGES = 8  # of the pyramids inside the friction cones
 _SETTLE_S = 0.05  # time constant in which what still moves at a contact is to come to rest, s
+_SAME = 1e-7  # distance from the program's answer that is the rounding of an action, control units
 _REFUSED = 1e-6  # by how much a control that no forces can hold misses at least, shares of the weight
-_SAME = 1e-9  # distance from the program's answer that is rounding, control units
+
+
+class _ContactConstraint(Constraint, Model):
+    """Of the contacts with the fixed world while a control is held for one control interval; `info_keys` is one."""
+
+    measures_state: ClassVar[bool] = False
+
+    def setup(self, plant: Plant) -> None:
+        hint = "forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
+        super().setup(require_mujoco(plant, f"{type(self).__name__} {hint}"))
+        self.report = dict.fromkeys(self.info_keys, 0.0)
+
+    def rollout(self, control: Array | None, horizon: int = 1) -> Contacts | None:
+        """The forecast; None of the present state, of which nothing is known."""
+        return None if control is None else self.plant.contact_forecast(control)
 
 
 @dataclass
-class ContactFeasibility(Constraint):
+class ContactFeasibility(_ContactConstraint):
     """Keep every contact force of the robot with the fixed world inside a narrower friction cone: `|f_t| <= mu f_n`.
 
     In a simulator all forces are inside the model's cone, and those on it slide: so the required cone is narrower.
@@ -65,15 +79,12 @@ class ContactFeasibility(Constraint):
         check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
 
     info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
-    measures_state: ClassVar[bool] = False
 
     def setup(self, plant: Plant) -> None:
-        super().setup(require_contacts(plant, "ContactFeasibility"))
-        self.model = ContactModel(self.plant)
+        super().setup(plant)
         self._chosen = np.flatnonzero(touching_bodies(self.plant, "there is no cone to stay in"))
-        self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
 
-    def h_along(self, path: ContactForecast | None) -> Array:
+    def h_along(self, path: Contacts | None) -> Array:
         """By how much each body's contact forces stay inside the cone, tolerance added, shares of the weight.
 
         At most as much as is asked for: differences between a touch and none would say nothing of the touch. NaN
@@ -89,22 +100,6 @@ class ContactFeasibility(Constraint):
         worst, least = worst[self._chosen], float(worst[self._chosen].min())
         self.report[keys.WHOLE_BODY_CONE_MARGIN] = least if np.isfinite(least) else 0.0
         return (np.minimum(worst, self.margin) + self.tolerance)[None]
-
-
-class ContactModel(Model):
-    """The contacts with the fixed world while a control is held for one control interval; None: nothing is known."""
-
-    def __init__(self, plant: MujocoPlant) -> None:
-        self._plant = plant
-
-    def rollout(self, control: Array | None, horizon: int = 1) -> ContactForecast | None:
-        return None if control is None else self._plant.contact_forecast(control)
-
-
-def require_contacts(plant: Plant, asker: str) -> MujocoPlant:
-    """The plant, if it can forecast contact forces."""
-    hint = "forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
-    return require_mujoco(plant, f"{asker} {hint}")
 
 
 def checked_friction_share(share: float) -> float:
@@ -127,7 +122,7 @@ def touching_bodies(plant: MujocoPlant, lacking: str) -> NDArray[np.bool_]:
 
 
 @dataclass
-class SupportMargin(Constraint):
+class SupportMargin(_ContactConstraint):
     """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
 
     Without at least three contact points in one plane that are not on a line there is no polygon and no requirement.
@@ -151,14 +146,8 @@ class SupportMargin(Constraint):
         self.margin = non_negative("margin", self.margin, "m")
 
     info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_ZMP_MARGIN,)
-    measures_state: ClassVar[bool] = False
 
-    def setup(self, plant: Plant) -> None:
-        super().setup(require_contacts(plant, "SupportMargin"))
-        self.model = ContactModel(self.plant)
-        self.report = {keys.WHOLE_BODY_ZMP_MARGIN: 0.0}
-
-    def h_along(self, path: ContactForecast | None) -> Array:
+    def h_along(self, path: Contacts | None) -> Array:
         """Distance to the edge minus the inset where it is least, m; the margin where there is no polygon."""
         if path is None:
             return np.zeros((1, 0))
@@ -183,21 +172,17 @@ class Stance(Constraint, Model):
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1].
         cone: "pyramid" is conservative and quick, "exact" is the cone itself.
-        joint_tolerance: How far driven joints may press their stops, rad or m; None leaves them alone.
 
     Source: appendix "Hierarchical whole-body control quadratic program".
     """
 
     friction_share: float = 0.7
     cone: Literal["pyramid", "exact"] = "pyramid"
-    joint_tolerance: float | None = 0.1
 
     def __post_init__(self) -> None:
         self.friction_share = checked_friction_share(self.friction_share)
         if self.cone not in ("pyramid", "exact"):
             raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
-        if self.joint_tolerance is not None:
-            self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
 
     info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
     measures_state: ClassVar[bool] = False
@@ -210,18 +195,12 @@ class Stance(Constraint, Model):
             raise UnsupportedEnvError(hint)
         refuse_mapped(self.plant.action_map, "Stance")
         touching_bodies(self.plant, "there is nothing to stand on")
-        if self.joint_tolerance is not None:
-            refuse_uncovered_stops(self.plant.model)
-        joints, low, high = stops(self.plant.model)
-        wider = self.joint_tolerance or 0.0
-        self._low, self._high = low - wider, high + wider
-        self._qpos, self._dofs = self.plant.model.jnt_qposadr[joints], self.plant.model.jnt_dofadr[joints]
         self.report = {keys.WHOLE_BODY_CONE_MARGIN: 0.0}
 
     def observe(self, memory: Memory) -> None:
         self._known = False
         self._problem: WholeBodyProblem | None = None
-        self._answer: WholeBodySolution | None = None
+        self._answers: dict[bytes, WholeBodySolution] = {}
 
     def problem(self, control: Array) -> WholeBodyProblem | None:
         """The observed state's program; the first control, shape (m,), says which contacts open. None: not finite."""
@@ -230,31 +209,24 @@ class Stance(Constraint, Model):
         return self._problem
 
     def _write_down(self, control: Array) -> WholeBodyProblem | None:
-        data = self.plant.under(control)
-        motion = equations_of_motion(self.plant.model, data, self.plant.actuators)
+        plant = self.plant
+        motion = equations_of_motion(plant.model, plant.under(control), plant.actuators)
         found = motion.contacts
         # Beyond this MuJoCo resets the state in its step.
-        within = bool((np.abs(self.plant.state) < mujoco.mjMAXVAL).all())
-        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
+        within = bool((np.abs(plant.state) < mujoco.mjMAXVAL).all())
+        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.force).all()):
             return None  # nothing can be said
-        ground = fixed_bodies(self.plant.model)[found.pushed_by]
+        ground = fixed_bodies(plant.model)[found.bodies[:, 0]]
         # What the robot's bodies do to each other, and other things to it, stays as it is.
-        bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
-        jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
-        pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
-        acceleration = -(jacobians @ self.plant.qvel) / _SETTLE_S
-        limits: dict[str, Any] = {}
-        if self.joint_tolerance is not None:
-            position, speed = self.plant.qpos[self._qpos], self.plant.qvel[self._dofs]
-            joints = self._dofs, position, speed, self._low, self._high
-            limits["accelerations"] = predicted_position_rows(
-                *joints, self.plant.control_dt, self.plant.model.nv
-            )
-        limits |= {"contact_acceleration": acceleration, "breaking": ~pressing}
-        limits["first_tangents"] = found.first_tangents[ground]
-        contacts = jacobians, drift, normals, self.friction_share * found.friction[ground]
-        controls = self.plant.lower, self.plant.upper, control
-        problem = WholeBodyProblem(motion.inertia, bias, motion.actuation, *contacts, *controls, **limits)
+        bias = motion.bias - np.einsum("kiv,ki->v", motion.jacobians[~ground], found.force[~ground])
+        jacobians, drift, normals = motion.jacobians[ground], motion.drift[ground], found.normal[ground]
+        pressing = np.einsum("ki,ki->k", found.force[ground], normals) > 0.0
+        problem = WholeBodyProblem(
+            *(motion.inertia, bias, motion.actuation, jacobians, drift, normals),
+            *(self.friction_share * found.friction[ground], plant.lower, plant.upper, control),
+            contact_acceleration=-(jacobians @ plant.qvel) / _SETTLE_S,
+            breaking=~pressing,
+        )
         # Two points of one rigid foot cannot come to rest each as it likes.
         attainable = whole_body.attainable_contact_acceleration(problem)
         return replace(problem, contact_acceleration=attainable)
@@ -263,23 +235,20 @@ class Stance(Constraint, Model):
         exact = self.cone == "exact"
         return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, _EDGES)
 
-    def _holds(self, control: Array) -> bool:
-        """Whether the standing contacts could answer this control with forces inside their cones."""
-        problem = self.problem(control)
-        if problem is None:
-            return False
-        answer = self._answer or self._ask(problem, control)
-        if np.array_equal(control, self._asked):
-            return answer.status is Status.INACTIVE
-        if answer.status is Status.INFEASIBLE:
-            return False  # whatever the control
-        if float(np.abs(control - answer.control).max()) <= _SAME:
-            return answer.status is not Status.FAILED
-        return self.solve(replace(problem, nominal=control)).status is Status.INACTIVE
+    def _solved(self, problem: WholeBodyProblem, control: Array) -> WholeBodySolution:
+        key = control.tobytes()
+        if key not in self._answers:
+            self._answers[key] = self.solve(replace(problem, nominal=control))
+        return self._answers[key]
 
-    def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
-        self._asked, self._answer = proposed.copy(), self.solve(replace(problem, nominal=proposed))
-        return self._answer
+    def _holds(self, problem: WholeBodyProblem, control: Array) -> bool:
+        """Whether the standing contacts could answer this control with forces inside their cones."""
+        for answer in self._answers.values():
+            if answer.status is Status.INFEASIBLE:
+                return False  # whatever the control
+            if answer.status is Status.PROJECTED and np.abs(control - answer.control).max() <= _SAME:
+                return True  # asked again it would move on, as forces have a price
+        return self._solved(problem, control).status is Status.INACTIVE
 
     def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
         """The present instant, under the control."""
@@ -298,7 +267,7 @@ class Stance(Constraint, Model):
         missed = cone_excess(forces, problem.normals, problem.friction)
         left = -float(missed.max()) / weight_n(self.plant.model) if len(forces) else 0.0
         self.report[keys.WHOLE_BODY_CONE_MARGIN] = left
-        return np.array([[max(left, 0.0) if self._holds(control) else min(left, -_REFUSED)]])
+        return np.array([[max(left, 0.0) if self._holds(problem, control) else min(left, -_REFUSED)]])
 
     def proposals(self, control: Array | None) -> Iterator[Array]:
         """The program's answer; where there is none, the proposed control, which is refused."""
@@ -306,5 +275,5 @@ class Stance(Constraint, Model):
             return
         proposed = np.clip(control, self.plant.lower, self.plant.upper)
         problem = self.problem(proposed)
-        if problem is not None:  # another constraint may have refused before this one was asked
-            yield (self._answer or self._ask(problem, proposed)).control
+        if problem is not None:
+            yield self._solved(problem, proposed).control

@@ -26,19 +26,13 @@ _FIXED = 1e-12  # mobility along the normal, 1/kg, below which a geom cannot mov
 
 
 class Contact(NamedTuple):
-    """Contacts, now or at the present speed, each field a number or shape (...)."""
+    """A contact, now or at the present speed."""
 
-    gap: float | Array  # m, negative inside
-    speed: float | Array  # of the approach, m/s, >= 0
-    mass: float | Array  # effective, kg
-    stiffness: float | Array  # N/m
-    push: float | Array  # what presses on besides the motion, N, >= 0
-    deflection: float | Array  # m, >= 0
-
-    @property
-    def peak(self) -> Array:
-        """Force by the deepest deflection, under a push that goes on, N."""
-        return peak_force(*self[1:])
+    gap: float  # m, negative inside
+    speed: float  # of the approach, m/s, >= 0
+    mass: float  # effective, kg
+    push: float  # what presses on besides the motion, N, >= 0
+    peak: float  # force by the deepest deflection, under a push that goes on, N
 
 
 @dataclass
@@ -88,9 +82,6 @@ class ImpactSpeedLimit(RolloutConstraint):
         m = self.plant.model
         self._gaps = GeomGaps(self.plant, self.bodies, self.against)
         self._probe = mujoco.MjData(m)
-        self._integration = np.zeros(mujoco.mj_stateSize(m, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
-        self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
-        self._mobile = np.zeros((1, m.nv))
         self.scale = self.force_limit
 
     def place(self, qpos: Array, qvel: Array, control: Array | None) -> None:
@@ -120,25 +111,21 @@ class ImpactSpeedLimit(RolloutConstraint):
         m, d = self.plant.model, self._probe
         gap, normal, points = self._gaps.nearest(self.plant.model, d, pair)
         robot, other = self._gaps.pairs[pair]
-        first, second, first_dot, second_dot = self._jacobians
-        mujoco.mj_jac(m, d, first, None, points[:3], m.geom_bodyid[robot])
-        mujoco.mj_jac(m, d, second, None, points[3:], m.geom_bodyid[other])
-        closing = first - second
-        row = normal @ closing
-        mujoco.mj_solveM(m, d, self._mobile, row[None])
-        given = self._mobile[0].copy()
-        mobility = float(row @ given)
-        speed = float(row @ self._speeds)
-        stiffness = self.stiffness
-        if mobility < _FIXED:
-            return Contact(gap, 0.0, 1.0 / _FIXED, stiffness, 0.0, 0.0)
-        mass = 1.0 / mobility
-        moving = float(given @ self._moving)
-        mujoco.mj_jacDot(m, d, first_dot, None, points[:3], m.geom_bodyid[robot])
-        mujoco.mj_jacDot(m, d, second_dot, None, points[3:], m.geom_bodyid[other])
-        moving += float(normal @ (first_dot - second_dot) @ self._speeds)
-        push = mass * max(moving, float(given @ self._resting), 0.0)
-        return Contact(gap, max(speed, 0.0), mass, stiffness, push, max(-gap, 0.0))
+        closing, turning, other_jacobian = np.zeros((3, 3, m.nv))
+        for of, found in ((mujoco.mj_jac, closing), (mujoco.mj_jacDot, turning)):
+            of(m, d, found, None, points[:3], m.geom_bodyid[robot])
+            of(m, d, other_jacobian, None, points[3:], m.geom_bodyid[other])
+            found -= other_jacobian
+        row, given = normal @ closing, np.zeros((1, m.nv))
+        mujoco.mj_solveM(m, d, given, row[None])
+        mobility = float(row @ given[0])
+        mass, speed, push = 1.0 / max(mobility, _FIXED), 0.0, 0.0
+        if mobility >= _FIXED:
+            speed = max(float(row @ self._speeds), 0.0)
+            moving = float(given[0] @ self._moving + normal @ turning @ self._speeds)
+            push = mass * max(moving, float(given[0] @ self._resting), 0.0)
+        peak = float(peak_force(speed, mass, self.stiffness, push, max(-gap, 0.0)))
+        return Contact(gap, speed, mass, push, peak)
 
     def proposals(self, control: Array | None) -> Iterable[Array]:
         """The braking with which every trajectory goes on: what was admitted for its sake stays admissible."""
@@ -151,41 +138,26 @@ class ImpactSpeedLimit(RolloutConstraint):
         k, pairs = len(path.qpos), len(self._gaps.pairs)
         if not np.isfinite(path.qpos[-1]).all():
             return np.full((k, pairs), np.nan)  # MuJoCo's simulation has diverged
-        touched: dict[int, list[int]] = {}
+        soon, left = self.plant.substeps - 1, np.full((k, pairs), self.force_limit)
         for pair in range(pairs):
-            for instant in self._gaps.touched(self.plant, path, self._probe, pair):
-                touched.setdefault(instant, []).append(pair)
-        soon = self.plant.substeps - 1
-        left = np.full((k, pairs), self.force_limit)
-        judged: list[tuple[int, int]] = []
-        contacts: list[Contact] = []
-        for instant, those in touched.items():
-            # At the end of the held step another control takes over.
-            control = path.control if instant < soon or instant == 0 else None
-            self.place(path.qpos[instant], path.qvel[instant], control)
-            for pair in those:
-                judged.append((instant, pair))
-                contacts.append(self.contact(pair))
-        if judged:
-            instants, those = np.transpose(judged)
-            left[instants, those] = self.force_limit - _together(contacts).peak
+            for instant in list(self._gaps.touched(self.plant, path, self._probe, pair)):
+                # At the end of the held step another control takes over.
+                control = path.control if instant < soon or instant == 0 else None
+                self.place(path.qpos[instant], path.qvel[instant], control)
+                left[instant, pair] -= self.contact(pair).peak
         return left
 
     def _now(self) -> Array:
-        m, d = self.plant.model, self._probe
-        data, what = self.plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
-        mujoco.mj_getState(m, data, self._integration, what)
-        mujoco.mj_setState(m, d, self._integration, what)
+        m, d, what = self.plant.model, self._probe, int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        state = np.zeros(mujoco.mj_stateSize(m, what))
+        mujoco.mj_getState(m, self.plant.pose(), state, what)
+        mujoco.mj_setState(m, d, state, what)
         self.place(self.plant.qpos, self.plant.qvel, None)
-        contacts = _together([self.contact(pair) for pair in range(len(self._gaps.pairs))])
-        there, left = contacts.gap <= self._gaps.touch, self.force_limit - contacts.peak
+        contacts = [self.contact(pair) for pair in range(len(self._gaps.pairs))]
+        left = self.force_limit - np.array([contact.peak for contact in contacts])
         # Only a contact that is there counts; before it, how it will be is the forecast's to say.
+        there = np.array([contact.gap for contact in contacts]) <= self._gaps.touch
         return np.where(there, left, np.maximum(left, 0.0))[None]
-
-
-def _together(contacts: Sequence[Contact]) -> Contact:
-    """One of arrays, shape (contacts,)."""
-    return Contact(*np.array(contacts, dtype=np.float64).T)
 
 
 class GeomGaps:
@@ -224,8 +196,17 @@ class GeomGaps:
         self.touch = np.array([max(m.geom_margin[a], m.geom_margin[b], 0.0) for a, b in self.pairs])
 
     def nearest(self, model: mujoco.MjModel, data: mujoco.MjData, pair: int) -> tuple[float, Array, Array]:
-        """Distance (m), the unit normal from the machine to the world, and the nearest points of both, shape (6,)."""
-        return nearest(model, data, *self.pairs[pair])
+        """Distance (m), the unit normal from the machine to the world, and the nearest points of both, shape (6,).
+
+        `data` has the geoms' poses; they are the same afterwards.
+        """
+        points, (first, second) = np.zeros(6), self.pairs[pair]
+        gap = geom_distance(model, data, first, second, points)
+        between = points[3:] - points[:3]
+        length = float(np.linalg.norm(between))
+        if length < _NORMAL:
+            return gap, _steepest(model, data, first, second), points
+        return gap, np.asarray(between * (np.sign(gap) / length)), points
 
     def touched(
         self, plant: MujocoPlant, path: MujocoTrajectory, data: mujoco.MjData, pair: int
@@ -286,22 +267,6 @@ def _farthest(model: mujoco.MjModel, geom: int, centres: Array, axes: Array) -> 
     moved = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     turned = np.linalg.norm(np.diff(axes, axis=0).reshape(-1, 9), axis=1)
     return np.asarray(moved + model.geom_rbound[geom] * turned)
-
-
-def nearest(
-    model: mujoco.MjModel, data: mujoco.MjData, first: int, second: int
-) -> tuple[float, Array, Array]:
-    """Distance (m), the unit normal from the first geom to the second, and the nearest points of both, shape (6,).
-
-    `data` has the geoms' poses; they are the same afterwards.
-    """
-    points = np.zeros(6)
-    gap = geom_distance(model, data, first, second, points)
-    between = points[3:] - points[:3]
-    length = float(np.linalg.norm(between))
-    if length < _NORMAL:
-        return gap, _steepest(model, data, first, second), points
-    return gap, np.asarray(between * (np.sign(gap) / length)), points
 
 
 def _steepest(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> Array:

@@ -12,7 +12,7 @@ from safe_wrappers.errors import Array, ConfigurationError, float_array, name_li
 from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, FREE, SCALAR_JOINTS
-from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 
@@ -64,16 +64,15 @@ def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, 
 
 
 def stops(model: mujoco.MjModel) -> tuple[list[int], Array, Array]:
-    """The driven hinges and slides that have a range, and its ends, rad or m."""
-    limited = [j for j in driven_joints(model) if model.jnt_limited[j]]
+    """The driven hinges and slides that have a range, and its ends, rad or m.
+
+    Refused where an action moves other joints that have one as well.
+    """
+    every = np.flatnonzero(model.jnt_limited).tolist()
+    refuse_uncovered(model, every, "joint_tolerance=None leaves all joints alone")
+    limited = [j for j in driven_joints(model) if j in every]
     low, high = model.jnt_range[limited].T
     return limited, low, high
-
-
-def refuse_uncovered_stops(model: mujoco.MjModel) -> None:
-    """Refuse to guard the driven joints' stops where an action moves other joints that have some as well."""
-    limited = np.flatnonzero(model.jnt_limited).tolist()
-    refuse_uncovered(model, limited, "joint_tolerance=None leaves all joints alone")
 
 
 def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
@@ -205,8 +204,6 @@ class JointSpeedLimit(RolloutConstraint):
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
 
     def setup(self, plant: Plant) -> None:
-        hint = "on an AnalyticPlant write Barrier(lambda x: limit**2 - x[i]**2)"
-        require_mujoco(plant, f"JointSpeedLimit needs a MujocoPlant (named joints); {hint}")
         super().setup(plant)
         ids = scalar_joints(self.plant, self.joints)
         self._dofs = self.plant.model.jnt_dofadr[ids]

@@ -3,19 +3,12 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from safe_wrappers.control.backup.stopping import Nearest
 from safe_wrappers.control.estimation import Tracks
-from safe_wrappers.control.numerics.shapes import (
-    BLOCK,
-    PLANE,
-    ROUND,
-    SURFACE_NUMBERS,
-    nearest_points,
-    surface_distances,
-)
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,
@@ -26,16 +19,8 @@ from safe_wrappers.errors import (
 )
 from safe_wrappers.plants.plant import Plant
 
+_AT_THE_CENTRE = 1e-12  # m; closer to the centre of a round one every way out is as good
 _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)  # of the horizon, at which growth is looked at; the first: its rate now
-
-
-class Nearest(NamedTuple):
-    """For one point and k surfaces in d dimensions."""
-
-    distance: Array  # signed, m, negative inside, shape (k,)
-    normal: Array  # unit vectors from the surface towards the point, shape (k, d)
-    velocity: Array  # of the surface, m/s, shape (k, d)
-    curvature: Array  # of the surface of equal distance through the point, along each coordinate, 1/m, (k, d)
 
 
 class Obstacle(Protocol):
@@ -53,10 +38,18 @@ def distances(obstacle: Obstacle, points: Array, plant: Plant) -> Array:
     return np.stack([obstacle.nearest(point, plant).distance for point in points])
 
 
-def refuse_more_dimensions(obstacle: int, point: int, kind: str = "obstacles") -> None:
-    """Refuse an obstacle of more dimensions than the point that is kept clear of it."""
-    if obstacle > point:
-        raise ConfigurationError(f"{obstacle}-dimensional {kind} cannot meet a {point}-dimensional point")
+def _seen(obstacle: int, points: Array, kind: str = "obstacles") -> Array:
+    """Those coordinates of points (..., d) that an obstacle has; along the others it reaches without end."""
+    if obstacle > points.shape[-1]:
+        raise ConfigurationError(
+            f"{obstacle}-dimensional {kind} cannot meet a {points.shape[-1]}-dimensional point"
+        )
+    return points[..., :obstacle]
+
+
+def _spread(parts: Array, d: int) -> Array:
+    """Of vectors (k, n) those with zeros along the other coordinates, shape (k, d)."""
+    return np.pad(parts, ((0, 0), (0, d - parts.shape[1])))
 
 
 def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
@@ -69,49 +62,7 @@ def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[
     return found
 
 
-class Plain(ABC):
-    """Planes, balls, cylinders and blocks: `control/numerics/shapes.py` knows what is nearest."""
-
-    still: ClassVar[bool] = True
-    """Whether `surfaces` is always the same, and nothing moves."""
-
-    @abstractmethod
-    def surfaces(self, plant: Plant) -> Array:
-        """As in `control/numerics/shapes.py`, shape (k, 8)."""
-
-    def _velocities(self, plant: Plant) -> Array | None:
-        """Of the surfaces, m/s, shape (k, coordinates), or None: they stand still."""
-        return None
-
-    def _seen_from(self, coordinates: int, plant: Plant) -> Array:
-        surfaces = self.surfaces(plant)
-        if len(surfaces):
-            refuse_more_dimensions(int(surfaces[0, 1]), coordinates)
-        return surfaces
-
-    def distances(self, points: Array, plant: Plant) -> Array:
-        """Signed distances of points of shape (k, d), shape (k, surfaces), m."""
-        return surface_distances(self._seen_from(points.shape[1], plant), points)
-
-    def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """What is nearest of every surface."""
-        surfaces = self._seen_from(point.size, plant)
-        distance, normal, curvature = nearest_points(surfaces, point)
-        velocities, moving = self._velocities(plant), np.zeros_like(normal)
-        if velocities is not None:
-            moving[:, : velocities.shape[1]] = velocities
-        return Nearest(distance, normal, moving, curvature)
-
-
-def _surface(kind: float, first: Sequence[float], second: Sequence[float]) -> Array:
-    """One surface, shape (1, 8)."""
-    row = np.zeros((1, SURFACE_NUMBERS))
-    row[0, :2] = kind, len(first)
-    row[0, 2 : 2 + len(first)], row[0, 5 : 5 + len(second)] = first, second
-    return row
-
-
-class _Round(Plain):
+class Round(ABC):
     """Discs and spheres of one radius; a disc seen from three dimensions is an upright cylinder."""
 
     radius: float
@@ -120,16 +71,32 @@ class _Round(Plain):
     def centers(self, plant: Plant) -> Array:
         """Where they are now, shape (k, d), m."""
 
-    def surfaces(self, plant: Plant) -> Array:
+    def _velocities(self, plant: Plant) -> Array | None:
+        """Of the centres, m/s, shape (k, d), or None: they stand still."""
+        return None
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Signed distances of points of shape (k, d), shape (k, surfaces), m."""
         centers = self.centers(plant)
-        found = np.zeros((len(centers), SURFACE_NUMBERS))
-        found[:, 0], found[:, 1], found[:, 5] = ROUND, centers.shape[1], self.radius
-        found[:, 2 : 2 + centers.shape[1]] = centers
-        return found
+        away = _seen(centers.shape[1], points)[:, None] - centers
+        return np.asarray(np.sqrt((away * away).sum(axis=2)) - self.radius)
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """What is nearest of every surface; at a centre every way out is as good."""
+        centers, velocities = self.centers(plant), self._velocities(plant)
+        away = _seen(centers.shape[1], point) - centers
+        length = np.sqrt((away * away).sum(axis=1))[:, None]
+        away = np.where(length > _AT_THE_CENTRE, away, np.eye(1, centers.shape[1]))
+        normal = away / np.where(length > _AT_THE_CENTRE, length, 1.0)
+        curvature = np.broadcast_to(1.0 / np.maximum(length, 1e-9), away.shape)
+        moving = np.zeros_like(away) if velocities is None else velocities
+        return Nearest(
+            length[:, 0] - self.radius, *(_spread(part, point.size) for part in (normal, moving, curvature))
+        )
 
 
 @dataclass
-class _Still(_Round):
+class _Still(Round):
     """One that stands still."""
 
     center: Sequence[float]
@@ -157,7 +124,7 @@ class Sphere(_Still):
 
 
 @dataclass
-class Plane(Plain):
+class Plane:
     """A wall: everything behind `point` against the outward `normal` is forbidden; 1, 2 or 3 dimensions."""
 
     point: Sequence[float]
@@ -171,12 +138,20 @@ class Plane(Plain):
             raise ConfigurationError("normal must not be zero: it points from the wall into free space")
         self.normal = [n / length for n in self.normal]
 
-    def surfaces(self, plant: Plant) -> Array:
-        return _surface(PLANE, self.point, self.normal)
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Signed distances of points of shape (k, d), shape (k, 1), m."""
+        offset = _seen(len(self.point), points) - self.point
+        return np.asarray((offset * self.normal).sum(axis=1, keepdims=True))
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """The wall."""
+        still = np.zeros((1, point.size))
+        normal = _spread(np.array([self.normal]), point.size)
+        return Nearest(self.distances(point[None], plant)[0], normal, still, still)
 
 
 @dataclass
-class Box(Plain):
+class Box:
     """An axis-aligned block of `half_size` (m per axis) at `center`; 2 or 3 dimensions. It stands still."""
 
     center: Sequence[float]
@@ -188,12 +163,36 @@ class Box(Plain):
         for half in self.half_size:
             positive("half_size", half, "m")
 
-    def surfaces(self, plant: Plant) -> Array:
-        return _surface(BLOCK, self.center, self.half_size)
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Signed distances of points of shape (k, d), shape (k, 1), m."""
+        offset = _seen(len(self.center), points) - self.center
+        return _from_block(offset, np.array(self.half_size))[0][:, None]
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """The nearest face, edge or corner."""
+        offset = _seen(len(self.center), point) - self.center
+        distance, normal = _from_block(offset[None], np.array(self.half_size))
+        sides = normal != 0.0
+        # About edges and corners the surfaces of equal distance are round.
+        round_ = sides & (sides.sum(axis=1, keepdims=True) > 1)
+        curvature = np.where(round_, 1.0 / np.where(round_, distance[:, None], 1.0), 0.0)
+        normal, curvature = (_spread(part, point.size) for part in (normal, curvature))
+        return Nearest(distance, normal, np.zeros_like(normal), curvature)
+
+
+def _from_block(offset: Array, half: Array) -> tuple[Array, Array]:
+    """Signed distances, shape (k,), and normals, shape (k, n), of offsets (k, n) from blocks' centres."""
+    beyond = np.abs(offset) - half
+    outside, towards = np.maximum(beyond, 0.0), np.where(offset < 0.0, -1.0, 1.0)
+    length, deepest = np.sqrt((outside * outside).sum(axis=1)), beyond.max(axis=1)
+    face = np.eye(offset.shape[1])[beyond.argmax(axis=1)]
+    inside = ~(length > 0.0)
+    normal = np.where(inside[:, None], face, outside / np.where(inside, 1.0, length)[:, None])
+    return np.where(inside, deepest, length), normal * towards
 
 
 @dataclass
-class Discs(_Round):
+class Discs(Round):
     """Discs (or spheres) whose centres the env publishes, for example `hazard_positions`.
 
     Args:
@@ -205,8 +204,6 @@ class Discs(_Round):
     attribute: str
     radius: float
     velocity_attribute: str | None = None
-
-    still = False
 
     def __post_init__(self) -> None:
         self.radius = positive("radius", self.radius, "m")
@@ -263,22 +260,14 @@ class TrackedDiscs:
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         times = self.horizon_s * np.array(_SHARES)
         centers, halves = self.boxes(plant, np.concatenate([[0.0], times]))
-        n, d = centers.shape[1:]
-        refuse_more_dimensions(d, point.size, "tracks")
-        blocks = np.zeros((n, SURFACE_NUMBERS))
-        blocks[:, 0], blocks[:, 1], blocks[:, 2 : 2 + d], blocks[:, 5 : 5 + d] = (
-            BLOCK,
-            d,
-            centers[0],
-            halves[0],
-        )
-        distance, normal, _ = nearest_points(blocks, point)
+        d = centers.shape[2]
+        distance, facing = _from_block(_seen(d, point, "tracks") - centers[0], halves[0])
+        normal = _spread(facing, point.size)
         # The estimated velocity, and along the normal the fastest rate at which the box moves outwards.
-        out, own = normal[:, :d], self.tracks(plant).velocities
+        out, own = facing, self.tracks(plant).velocities
         reach = (centers * out + halves * np.abs(out)).sum(axis=-1)
         fastest = ((reach[1:] - reach[0]) / times[:, None]).max(axis=0)
-        velocity = np.zeros_like(normal)
-        velocity[:, :d] = own + (fastest - (own * out).sum(axis=-1))[:, None] * out
+        velocity = _spread(own + (fastest - (own * out).sum(axis=-1))[:, None] * out, point.size)
         return Nearest(distance - self.radius, normal, velocity, np.zeros_like(normal))
 
     def boxes(self, plant: Plant, times_s: Array) -> tuple[Array, Array]:

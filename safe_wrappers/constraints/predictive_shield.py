@@ -1,7 +1,6 @@
 """PredictiveShield: an action is admitted if some backup keeps h after it, in a simulation."""
 
 import contextlib
-import functools
 import math
 import warnings
 from collections.abc import Callable, Iterable
@@ -132,16 +131,13 @@ class PredictiveShield(Constraint, Model):
             raise ConfigurationError(
                 "a discrete action has no zero: give as backup the action that is safe, or hold, or a function"
             )
-        self._backups = [self._prepared(one) for one in self.backup]
+        self._backups = [self._function(one) for one in self.backup]
         self._needed = self.margin + self.plant.margins(self._measure, self.horizon)
         self._points = np.random.default_rng(0).random((self.candidates, self.plant.lower.size))
 
     def observe(self, memory: Memory) -> None:
-        begins, none = (
-            not memory,
-            np.clip(np.zeros_like(self.plant.lower), self.plant.lower, self.plant.upper),
-        )
-        self._last = memory.get("control", none)
+        begins = not memory
+        self._last = memory.get("control", np.clip(0.0, self.plant.lower, self.plant.upper))
         self._known: dict[bytes, Plan] = {}
         plans: dict[bytes, Plan] = memory.get("plans", {})
         executed = plans.get(self._last.tobytes())
@@ -177,31 +173,21 @@ class PredictiveShield(Constraint, Model):
     def _seen(self, view: View) -> Any:
         return view if self.sees == "view" else getattr(view, self.sees)
 
-    def _terminal(self, view: View) -> bool:
-        assert self.terminal is not None
-        return bool(self.terminal(self._seen(view)))
-
-    def _prepared(self, backup: Any) -> Any:
-        """A function, a control, shape (m,), or "hold"."""
-        if callable(backup) or (isinstance(backup, str) and backup == "hold"):
-            return backup
-        zero = isinstance(backup, str)
-        return self.plant.control(np.zeros(self.plant.lower.shape) if zero else backup, "the backup")
-
-    def _control(self, backup: Any, view: View) -> Array:
-        """What a backup that does not hold would do, shape (m,)."""
+    def _function(self, backup: Any) -> Callable[[View], Array] | None:
+        """What a backup does in a state, a control of shape (m,); None: the action goes on."""
+        plant, named = self.plant, isinstance(backup, str)
+        if named and backup == "hold":
+            return None
         if not callable(backup):
-            return np.asarray(backup)
-        seen = view.observation if isinstance(backup, _PolicyBackup) else self._seen(view)
-        found: Array = self.plant.control(backup(seen), "the backup")
-        return found
+            constant = plant.control(np.zeros(plant.lower.shape) if named else backup, "the backup")
+            return lambda view: np.asarray(constant)
+        if isinstance(backup, _PolicyBackup):
+            return lambda view: np.asarray(plant.control(backup(view.observation), "the backup"))
+        return lambda view: np.asarray(plant.control(backup(self._seen(view)), "the backup"))
 
-    def _action(self, backup: Any, view: View) -> Any:
-        return self.plant.action(self._control(backup, view))
-
-    def _first(self, backup: Any) -> Array:
+    def _first(self, backup: Callable[[View], Array] | None) -> Array:
         """What a backup would do now, shape (m,)."""
-        return self._last if isinstance(backup, str) else self._control(backup, self.plant.view)
+        return self._last if backup is None else backup(self.plant.view)
 
     def _firsts(self) -> list[Array]:
         """What the backups would do now that have an answer."""
@@ -226,20 +212,18 @@ class PredictiveShield(Constraint, Model):
             self._known[key] = best
         return self._known[key]
 
-    def _after(self, control: Array, backup: Any) -> float:
+    def _after(self, control: Array, backup: Callable[[View], Array] | None) -> float:
         """The slack of a control with a backup after it; NaN where an h is."""
-        policy = None if isinstance(backup, str) else functools.partial(self._action, backup)
-        until = None if self.terminal is None else self._terminal
-        least = float(self._needed.min())
+        plant, terminal, least = self.plant, self.terminal, float(self._needed.min())
+        policy = None if backup is None else lambda view: plant.action(backup(view))
+        until = None if terminal is None else lambda view: bool(terminal(self._seen(view)))
         try:
-            rollout = self.plant.rollout(
-                control, self.horizon, policy, self._measure, least, until, self._between
-            )
+            rollout = plant.rollout(control, self.horizon, policy, self._measure, least, until, self._between)
         except NotFiniteError:
             return -math.inf  # the backup has no answer
         values = np.array(rollout.values)
         slack = float((values - self._needed[: len(values)]).min())
-        if until is not None and not (rollout.reached or rollout.ended):
+        if terminal is not None and not (rollout.reached or rollout.ended):
             return min(slack, _NOT_REACHED)
         return slack
 

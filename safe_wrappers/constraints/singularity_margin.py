@@ -11,7 +11,6 @@ from safe_wrappers.constraints.joints import chain, driven_joints, refuse_uncove
 from safe_wrappers.constraints.rollout import RolloutConstraint
 from safe_wrappers.control import barriers as of_arm
 from safe_wrappers.errors import Array, ConfigurationError, check_fields, name_list, positive
-from safe_wrappers.filter.constraint import HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory
 from safe_wrappers.plants.mujoco.model import SCALAR_JOINTS, SLIDE
 from safe_wrappers.plants.plant import Plant
@@ -19,9 +18,6 @@ from safe_wrappers.plants.plant import Plant
 _JACOBIANS: Final = {"site": mujoco.mj_jacSite, "body": mujoco.mj_jacBody, "geom": mujoco.mj_jacGeom}
 _SAMPLES = 2000  # configurations that say which manipulability can be reached
 _STILL = 1e-9  # columns with a smaller norm are zero, m or rad per rad
-# Time constant of the rows, control intervals: a longer one brakes early, a shorter one is refused by forecasts.
-_DECAY_HOLDS = 2.0
-_STEP, _ALONG = 1e-6, 1e-4  # widths of differences of w, over one joint and along the motion, rad or m
 
 
 @dataclass
@@ -97,9 +93,7 @@ class SingularityMargin(RolloutConstraint):
         name = getattr(self, kind)
         self._index, what = self.plant.named(kind, name), f"the {kind} {name!r}"
         body = self._index if kind == "body" else int(getattr(model, f"{kind}_bodyid")[self._index])
-        carriers = sorted(chain(model, body))
-        self._carriers = [j for j in carriers if model.jnt_type[j] in SCALAR_JOINTS]
-        self._scalar = len(self._carriers) == len(carriers)
+        self._carriers = [j for j in sorted(chain(model, body)) if model.jnt_type[j] in SCALAR_JOINTS]
         self._joints = self._doing(what)
         self._data = mujoco.MjData(model)
         sampled = self._sample()
@@ -199,24 +193,3 @@ class SingularityMargin(RolloutConstraint):
             self._side = 1.0
             self._side = -1.0 if self._measure(path.qpos)[0] < 0.0 else 1.0
         return np.asarray(self._measure(path.qpos) / self._threshold - 1.0)[:, None]
-
-    def rows(self) -> HalfSpaces | None:
-        """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides."""
-        if not (self._scalar and self.plant.has_acceleration):
-            return None
-        model, n = self.plant.model, len(self._carriers)
-        places, dofs = model.jnt_qposadr[self._carriers], model.jnt_dofadr[self._carriers]
-        speeds = self.plant.qvel[dofs]
-        along = _ALONG / max(float(np.linalg.norm(speeds)), 1e-6)  # s
-        beside = np.tile(self.plant.qpos, (2 * n + 2, 1))
-        beside[:, places] += np.concatenate(
-            [_STEP * np.eye(n), -_STEP * np.eye(n), along * np.outer([1, -1], speeds)]
-        )
-        w, now = self._measure(beside) / self._threshold, float(self._measure(self.plant.qpos[None])[0])
-        left = now / self._threshold - 1.0
-        slope = (w[:n] - w[n : 2 * n]) / (2.0 * _STEP)
-        curvature = (w[-2] - 2.0 * (left + 1.0) + w[-1]) / along**2
-        a = 1.0 / (_DECAY_HOLDS * self.plant.control_dt)
-        decay = 2.0 * a * (slope @ speeds) + a * a * (left - self.margin)
-        drift, effect = self.plant.acceleration
-        return HalfSpaces(-(slope @ effect[dofs])[None], np.array([slope @ drift[dofs] + curvature + decay]))

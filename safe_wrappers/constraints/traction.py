@@ -102,8 +102,7 @@ class Traction(Constraint):
                 f"({self.plant.delay_s} s) predicts instead; use delay_s=0"
             )
         self._wheels = DrivenWheels(self.plant, self.wheels)
-        self._wheels.refuse_stiff_servos(self.plant)
-        self.constants = self._wheels.constants(self.plant)
+        self.constants = self._wheels.wheel
         options, feedback = self.plant.model.opt, self._wheels.feedback
         hold = float(options.timestep), self.plant.substeps
         self._response = self.constants.response(*hold, feedback, int(options.integrator) in _IMPLICIT)
@@ -123,7 +122,7 @@ class Traction(Constraint):
         self.report[keys.SLIP_MU_ESTIMATE] = seen.estimate.mean
 
     def _measure(self, seen: TractionMemory) -> None:
-        rate, ground, sideways = self._wheels.motion(self.plant)
+        rate, ground, sideways = self._wheels.motion()
         published = self.plant.published()
         assert published is not None  # there is no delay
         load = self._wheels.loads(self.plant.attribute("model"), published)
@@ -196,7 +195,7 @@ class Traction(Constraint):
         """Two per wheel, for driving and braking torque, where the drive could exceed them."""
         if self.seen.rate is None:  # says nothing, and a row that is not a number fails
             return HalfSpaces(np.full((1, self.plant.lower.size), np.nan), np.full(1, np.nan))
-        bias, effect = self._wheels.drive(self.plant)
+        bias, effect = self._wheels.drive()
         carried = 0.0 if self.friction is None else self.friction * self.seen.load
         most = self._torques(self._window[1], np.maximum(self.seen.present, carried)) - bias
         least = self._torques(self._window[0], np.minimum(self.seen.present, -carried)) - bias
@@ -224,7 +223,7 @@ class Traction(Constraint):
     def _braking(self) -> Array:
         if self.seen.rate is None:
             return np.zeros_like(self.plant.lower)
-        bias, effect = self._wheels.drive(self.plant)
+        bias, effect = self._wheels.drive()
         speed = self.seen.ground + self.seen.ahead
         low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
         wanted = np.where(speed > 0.0, low, high)

@@ -82,19 +82,17 @@ def _lie_along(h: Callable[..., float], f: Callable[..., Array], step: float, x:
 
 
 def manipulability(jacobian: ArrayLike) -> Array:
-    """`w = sqrt(det(J J'))` of Jacobians (..., m, n), shape (...); exactly zero where rows depend on each other.
+    """`w = sqrt(det(J J'))` of Jacobians (..., m, n), shape (...); NaN where the Jacobian has one.
 
     By a QR factorisation of J', as accurate as an SVD in a quarter of the time. In (m/s)^m per (rad/s)^m for m
-    translations and hinges. NaN where the Jacobian has one.
+    translations and hinges.
     """
     j = np.asarray(jacobian, dtype=np.float64)
     m, n = j.shape[-2:]
     if n < m:
         return np.zeros(j.shape[:-2])
-    diagonal = np.abs(np.diagonal(np.linalg.qr(np.swapaxes(j, -1, -2), mode="r"), axis1=-2, axis2=-1))
-    # A dependent row leaves rounding on the diagonal, in proportion to its own length.
-    noise = n * EPSILON * np.linalg.norm(j, axis=-1)
-    return np.asarray(np.prod(np.where(diagonal <= noise, 0.0, diagonal), axis=-1))
+    triangle = np.linalg.qr(np.swapaxes(j, -1, -2), mode="r")
+    return np.asarray(np.abs(np.prod(np.diagonal(triangle, axis1=-2, axis2=-1), axis=-1)))
 
 
 def worst_joint_rates(jacobian: ArrayLike) -> Array:

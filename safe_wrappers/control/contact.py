@@ -42,46 +42,38 @@ def cone_excess(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -> A
     return np.asarray(np.maximum(np.linalg.norm(rest, axis=-1) - np.asarray(friction) * along, -along))
 
 
-def tangents(normals: ArrayLike, first: ArrayLike | None = None) -> Array:
+def tangents(normals: ArrayLike) -> Array:
     """Two unit tangents for each unit normal, shape (..., 2, 3); with the normal as third they are right-handed.
 
-    The first tangent follows the tangential part of `first`, shape (..., 3), not parallel to the normal; None takes
-    the axis of the world that is farthest from the normal.
+    The first follows the axis of the world that is farthest from the normal.
     """
     n = np.asarray(normals, dtype=np.float64)
-    if first is None:
-        first = np.zeros(n.shape)
-        np.put_along_axis(first, np.abs(n).argmin(axis=-1)[..., None], 1.0, axis=-1)
-    wanted, n = np.broadcast_arrays(np.asarray(first, dtype=np.float64), n)
-    along = wanted - np.einsum("...i,...i->...", wanted, n)[..., None] * n
-    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    axis = np.eye(3)[np.abs(n).argmin(axis=-1)]
+    along = axis - (axis * n).sum(axis=-1, keepdims=True) * n
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
     return np.stack([along, np.cross(n, along)], axis=-2)
 
 
-def friction_pyramid(
-    normals: ArrayLike, friction: ArrayLike, edges: int = 4, first: ArrayLike | None = None
-) -> Array:
+def friction_pyramid(normals: ArrayLike, friction: ArrayLike, edges: int = 4) -> Array:
     """Half-spaces inside the friction cone: `rows @ f <= 0` is a pyramid whose edges lie on the cone.
 
-    Halfway between two edges it allows `cos(pi / edges)` of the friction (four edges: 71 %, eight: 92 %).
+    Halfway between two edges it allows `cos(pi / edges)` of the friction (four edges: 71 %, eight: 92 %). The first
+    edge is along the first of the `tangents`.
 
     Args:
         normals: Unit normals, pointing at the robot, shape (..., 3).
         friction: Coefficient mu, at least 0, shape (...).
         edges: Of the pyramid, at least 3.
-        first: Direction of the first edge, as of `tangents`. With four edges and the first axis of a contact frame
-            of MuJoCo, the pyramid is MuJoCo's own.
 
     Returns:
-        Shape (..., edges + 1, 3): one row for each side, then `-normal`.
+        One row for each side, shape (..., edges, 3); together they imply that nothing pulls.
     """
     edges = whole_number("edges", edges, 3)
     n, mu = np.asarray(normals, dtype=np.float64), np.asarray(friction, dtype=np.float64)
     middle = (np.arange(edges) + 0.5) * (2.0 * math.pi / edges)
     facing = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
     slope = mu[..., None, None] * math.cos(math.pi / edges) * n[..., None, :]
-    sides = facing @ tangents(n, first) - slope
-    return np.concatenate([sides, np.broadcast_to(-n, (*sides.shape[:-2], 3))[..., None, :]], axis=-2)
+    return np.asarray(facing @ tangents(n) - slope)
 
 
 def complementarity_residuals(gap: Numbers, force: Numbers) -> tuple[Array, Array]:

@@ -31,34 +31,30 @@ _PIVOT: Final = 0.1
 """Share of the largest coefficient from which on one may be divided by."""
 
 
-def discretise(A: ArrayLike, Q: ArrayLike, time_s: float) -> tuple[Array, Array]:
-    """The exact step over a time, x -> F x plus noise of covariance Q_d: F = exp(A t) and Q_d, shape (n, n) each.
+def discretise(
+    A: ArrayLike, Q: ArrayLike, time_s: float, b: ArrayLike | None = None
+) -> tuple[Array, Array, Array]:
+    """The exact step over a time, x -> F x + d plus noise of covariance Q_d: F (n, n), d (n,) and Q_d (n, n).
 
-    A in 1/s and the noise's intensity Q, positive semidefinite, have the shape (n, n). The exponential is taken over
-    a time in which A changes little, where it is well conditioned, and doubled.
+    A in 1/s and the noise's intensity Q, positive semidefinite, have the shape (n, n), a constant drift b (n,). The
+    exponential is taken over a time in which A changes little, where it is well conditioned, and doubled.
     """
     from scipy.linalg import expm  # here: SciPy takes a while to import
 
-    a, q = np.asarray(A, dtype=np.float64), np.asarray(Q, dtype=np.float64)
-    n, size = len(a), float(np.linalg.norm(q)) or 1.0
+    n = len(np.asarray(A))
+    a, q = np.zeros((2, n + 1, n + 1))  # of the state and 1, which b multiplies
+    a[:n, :n], q[:n, :n] = A, Q
+    a[:n, n] = 0.0 if b is None else b
+    size = float(np.linalg.norm(q)) or 1.0
     doublings = max(math.ceil(math.log2(max(float(np.linalg.norm(a)) * time_s, 1.0))), 0)
     base = time_s / 2.0**doublings
-    exponential = expm(base * np.block([[-a, q / size], [np.zeros((n, n)), a.T]]))
-    transition = exponential[n:, n:].T
-    noise = size * (transition @ exponential[:n, n:])
+    exponential = expm(base * np.block([[-a, q / size], [np.zeros_like(a), a.T]]))
+    transition = exponential[n + 1 :, n + 1 :].T
+    noise = size * (transition @ exponential[: n + 1, n + 1 :])
     for _ in range(doublings):
         noise = transition @ noise @ transition.T + noise
         transition = transition @ transition
-    return transition, 0.5 * (noise + noise.T)
-
-
-def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: float) -> Array:
-    """Displacement by a constant drift b of x' = A x + b, the integral of `exp(A s) b` over a time, shape (n,)."""
-    from scipy.linalg import expm
-
-    a, drift = np.asarray(A, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    whole = np.block([[a, drift[:, None]], [np.zeros((1, len(a) + 1))]])
-    return np.asarray(expm(time_s * whole)[:-1, -1])
+    return transition[:n, :n], transition[:n, n], 0.5 * (noise + noise.T)[:n, :n]
 
 
 def predict(
@@ -98,17 +94,14 @@ class Motion(NamedTuple):
     def matrices(self) -> tuple[Array, Array, Array]:
         """A (2d, 2d), the constant drift b (2d,) and the noise intensity Q (2d, 2d) of `x' = A x + b + w`."""
         d, rate = self.mean_velocity.size, 1.0 / self.reversion_s
-        a, q = np.zeros((2 * d, 2 * d)), np.zeros((2 * d, 2 * d))
-        a[:d, d:] = np.eye(d)
-        a[d:, d:] = -rate * np.eye(d)
-        q[d:, d:] = self.intensity
+        a, q = np.zeros((2, 2 * d, 2 * d))
+        a[:d, d:], a[d:, d:], q[d:, d:] = np.eye(d), -rate * np.eye(d), self.intensity
         return a, np.concatenate([np.zeros(d), rate * self.mean_velocity]), q
 
     def over(self, time_s: float) -> tuple[Array, Array, Array]:
         """Transition (2d, 2d), drift (2d,) and noise (2d, 2d) over a time."""
         a, b, q = self.matrices()
-        transition, noise = discretise(a, q, time_s)
-        return transition, discretise_drift(a, b, time_s), noise
+        return discretise(a, q, time_s, b)
 
 
 class Tracks:
@@ -178,21 +171,14 @@ class Tracks:
         if time_s not in self._known:
             if len(self._known) >= _KEPT:
                 self._known.clear()
-            different = {id(motion): motion for motion in self.motions}
-            each = {key: motion.over(time_s) for key, motion in different.items()}
-            parts = zip(*(each[id(motion)] for motion in self.motions), strict=True)
+            parts = zip(*(motion.over(time_s) for motion in self.motions), strict=True)
             self._known[time_s] = tuple(np.stack(part) for part in parts)
         return self._known[time_s]
 
 
 def largest_deviation(covariances: Array) -> Array:
     """The standard deviation in the direction in which it is largest, shape (...,), of covariances (..., d, d)."""
-    if covariances.shape[-1] == 2:
-        a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
-        largest = np.asarray(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
-    else:
-        largest = np.asarray(np.linalg.eigvalsh(covariances)[..., -1])
-    return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[..., -1], 0.0)))
 
 
 def unobservable_subspace(a: Array, c: Array) -> Array:

@@ -97,29 +97,28 @@ def join(
     if not len(sent):
         plan, limited = limit_rate(new, None, step)
         return Seam(plan, 0, limited)
-    fewest = min(fewest, len(new) - 1)
-    uncut: NDArray[np.bool_] = np.ones(len(new), dtype=bool)
-    if accepts is None and fewest == 0 and (np.abs(new[0] - sent[-1]) <= step).all():
-        candidates, first = new[None, :], 0
-    else:
-        first = max(fewest, 1) if accepts is None and len(new) > 1 else fewest
-        if blend == "smoothstep":
-            candidates = _mixed(sent, prior, new, first)
-        else:
-            bridges = _bridged(sent, new, first)
-            candidates = np.clip(bridges, low, high)
-            uncut = np.asarray(np.isclose(bridges, candidates, rtol=1e-9, atol=1e-12).all(axis=(1, 2)))
-    peaks = _peaks(candidates, sent[-1], first, step)
-    kept = np.flatnonzero(peaks <= 1.0)
-    chosen: int | None = int(kept[0]) if kept.size else int(np.argmin(peaks))
-    if accepts is not None:
-        chosen = next((int(c) for c in kept if uncut[c] and accepts(first + int(c))), None)
+    first = min(fewest, len(new) - 1)
+    if accepts is None and first == 0 and len(new) > 1 and (np.abs(new[0] - sent[-1]) > step).any():
+        first = 1
+    chosen, least = None, np.inf
+    for steps in range(first, len(new)):
+        made = _mixed(sent, prior, new, steps) if blend == "smoothstep" else _bridged(sent, new, steps)
+        boxed = made if blend == "smoothstep" else np.clip(made, low, high)
+        plan = np.concatenate([boxed, new[steps:]])
+        way = np.diff(np.concatenate([sent[-1:], plan[: steps + 1]]), axis=0)
+        peak = float((np.abs(way) / step).max())
+        if accepts is None:
+            if chosen is None or peak < least:
+                chosen, least = (plan, steps), peak
+            if peak <= 1.0:
+                break
+        elif peak <= 1.0 and np.allclose(made, boxed, rtol=1e-9, atol=1e-12) and accepts(steps):
+            chosen = plan, steps
+            break
     if chosen is None:
         return None
-    steps = first + chosen
-    plan = np.concatenate([candidates[chosen, :steps], new[steps:]])
-    plan, limited = limit_rate(plan, sent[-1], step)
-    return Seam(plan, steps, limited)
+    plan, limited = limit_rate(chosen[0], sent[-1], step)
+    return Seam(plan, chosen[1], limited)
 
 
 def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
@@ -141,49 +140,30 @@ def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tu
     return kept, limited
 
 
-def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:
-    """The largest difference inside each blend, in units of the largest allowed one, shape (c,)."""
-    start = np.broadcast_to(before, (len(candidates), 1, before.size))
-    steps = (np.abs(np.diff(np.concatenate([start, candidates], axis=1), axis=1)) / step).max(axis=2)
-    mixed = np.arange(steps.shape[1]) <= first + np.arange(len(candidates))[:, None]
-    return np.asarray(np.where(mixed, steps, 0.0).max(axis=1))
-
-
-def _phases(first: int, longest: int) -> Array:
-    """Normalised time at every step of blends of `first` to `longest` steps, 1 from an end on, (c, longest + 1)."""
-    steps = np.arange(longest + 1) + 1.0
-    return np.asarray(np.minimum(steps / steps[first:, None], 1.0))
+def _phases(steps: int) -> Array:
+    """Normalised time of the commands of a blend, which arrives one command after them, shape (steps,)."""
+    return np.asarray(np.arange(1.0, steps + 1.0) / (steps + 1.0))
 
 
 @lru_cache(maxsize=256)
-def _basis(first: int, longest: int) -> Array:
-    """Contribution of each boundary value of a quintic of unit duration at every step, (c, longest + 1, 6)."""
+def _basis(steps: int) -> Array:
+    """Contribution of each boundary value of a quintic of unit duration to each command, (steps, 6)."""
     from scipy.interpolate import BPoly  # here: SciPy takes a while to import
 
     unit = np.eye(6)
-    return np.asarray(BPoly.from_derivatives([0.0, 1.0], [unit[:3], unit[3:]])(_phases(first, longest)))
+    return np.asarray(BPoly.from_derivatives([0.0, 1.0], [unit[:3], unit[3:]])(_phases(steps)))
 
 
-def _mixed(sent: Array, prior: Array, new: Array, first: int) -> Array:
-    """Every candidate blend of the two streams, shape (c, n, m)."""
-    n = len(new)
-    weight = smoothstep(_phases(first, n - 1))[:, :, None]
-    moving = np.concatenate([prior[:n], np.broadcast_to(sent[-1], (max(n - len(prior), 0), sent.shape[1]))])
-    lengths = np.arange(first, n)[:, None, None]
-    before = np.where(lengths <= len(prior), moving, sent[-1])
-    return np.asarray(np.where(weight < 1.0, before + weight * (new - before), new))
+def _mixed(sent: Array, prior: Array, new: Array, steps: int) -> Array:
+    """The commands of a blend of two streams, shape (steps, m)."""
+    before = prior[:steps] if steps <= len(prior) else sent[-1]
+    return np.asarray(before + smoothstep(_phases(steps))[:, None] * (new[:steps] - before))
 
 
-def _bridged(sent: Array, new: Array, first: int) -> Array:
-    """Every candidate bridge, shape (c, n, m). Derivatives are per control step: n steps last n + 1 of them."""
-    n = len(new)
-    ends = np.arange(first, n)
-    at_start, at_end = _backward_differences(sent), _stream_derivatives(new)
-    lasts = (ends + 1.0)[:, None]
-    given = [np.broadcast_to(d, (len(ends), d.size)) * lasts**k for k, d in enumerate(at_start)]
-    given += [d[ends] * lasts**k for k, d in enumerate(at_end)]
-    bridged = _basis(first, n - 1) @ np.stack(given, axis=1)
-    return np.asarray(np.where((np.arange(n) < ends[:, None])[:, :, None], bridged, new))
+def _bridged(sent: Array, new: Array, steps: int) -> Array:
+    """The commands of a bridge, shape (steps, m). Derivatives are per control step, of which it lasts one more."""
+    given = np.stack([*_backward_differences(sent), *(d[steps] for d in _stream_derivatives(new))])
+    return np.asarray(_basis(steps) @ (given * (steps + 1.0) ** np.array([0, 1, 2, 0, 1, 2])[:, None]))
 
 
 def _backward_differences(sent: Array) -> list[Array]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.compiled import compiled, hypot
+from safe_wrappers.control.contact import tangents
 from safe_wrappers.errors import Array
 
 COPLANAR_M = 0.01
@@ -29,87 +29,51 @@ _FACING = math.cos(0.05) - _ROUNDING
 def support_distances(instant: NDArray[np.intp], points: Array, normals: Array, forces: Array) -> Array:
     """Distances, m, negative outside, where three or more contacts of one plane, not on a line, are pressed.
 
-    One for each of these instants in turn; the others have none. Contacts are given by the number of their instant,
-    shape (n,), in any order, their points, m, unit normals and forces on the robot, N, shape (n, 3) each.
+    One for each of these instants, in any order; the others have none. Contacts are given by the number of their
+    instant, shape (n,), their points, m, unit normals and forces on the robot, N, shape (n, 3) each.
     """
-    order = np.argsort(instant, kind="stable")
-    each = np.split(order, np.flatnonzero(np.diff(instant[order])) + 1)
-    found = np.array([_distance(points[these], normals[these], forces[these]) for these in each])
-    return np.asarray(found[found != math.inf])
+    _, which, counts = np.unique(instant, return_inverse=True, return_counts=True)
+    order, found = np.argsort(which, kind="stable"), [np.zeros(0)]
+    for count in set(counts[counts > 2].tolist()):  # instants of as many contacts together
+        chosen = order[counts[which[order]] == count].reshape(-1, count)
+        found.append(_distances(points[chosen], normals[chosen], forces[chosen]))
+    return np.concatenate(found)
 
 
-@compiled
-def _distance(points: Array, normals: Array, forces: Array) -> float:
-    """Of the contacts of one instant; infinite where there is no polygon, or nothing presses."""
-    k, mean = len(points), _total(normals)
-    length = math.sqrt(_dot(mean, mean))
-    if k < 3 or length < 0.5 * k:
-        return math.inf
-    mean /= length
-    origin, force, moment = _total(points) / k, _total(forces), np.zeros(3)
-    for i in range(k):
-        arm = points[i] - origin
-        if abs(_dot(arm, mean)) > COPLANAR_M or _dot(normals[i], mean) < _FACING:
-            return math.inf
-        moment += _cross(arm, forces[i])
-    pressure = _dot(force, mean)
-    if not pressure > 0.0:
-        return math.inf
-    first = np.zeros(3)
-    first[np.argmin(np.abs(mean))] = 1.0  # the axis of the world that is farthest from the normal
-    first -= _dot(first, mean) * mean
-    first /= math.sqrt(_dot(first, first))
-    zmp, second, flat = _cross(mean, moment) / pressure, _cross(mean, first), np.empty((k, 2))
-    for i in range(k):
-        flat[i, 0], flat[i, 1] = _dot(points[i] - origin, first), _dot(points[i] - origin, second)
-    return _from_edges(flat, np.array([_dot(zmp, first), _dot(zmp, second)]))
+def _distances(points: Array, normals: Array, forces: Array) -> Array:
+    """Of instants with k contacts each, shapes (n, k, 3), where there is a polygon and something presses."""
+    total, arms = normals.sum(axis=1), points - points.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(total, axis=1)
+    mean = total / np.maximum(length, 0.5 * points.shape[1])[:, None]
+    pressure = np.einsum("ni,ni->n", forces.sum(axis=1), mean)
+    level = np.abs(np.einsum("nki,ni->nk", arms, mean)) <= COPLANAR_M
+    facing = np.einsum("nki,ni->nk", normals, mean) >= _FACING
+    there = level.all(axis=1) & facing.all(axis=1) & (pressure > 0.0)
+    mean, arms = mean[there], arms[there]
+    moment = np.cross(arms, forces[there]).sum(axis=1)
+    across = tangents(mean)
+    zmp = np.einsum("ni,nai->na", np.cross(mean, moment) / pressure[there, None], across)
+    return _from_edges(np.einsum("nki,nai->nka", arms, across), zmp)
 
 
-@compiled
-def _from_edges(points: Array, x: Array) -> float:
-    """Of one point (2,) among others (k, 2); infinite where these are on a line, NaN where it is not finite."""
-    if not (math.isfinite(x[0]) and math.isfinite(x[1])):
-        return math.nan
-    width, longest, inside, outside = math.inf, 0.0, math.inf, math.inf
-    for i in range(len(points)):
-        for j in range(i + 1, len(points)):
-            along_x, along_y = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
-            length = hypot(along_x, along_y)
-            to_x, to_y, share = x[0] - points[i, 0], x[1] - points[i, 1], 0.0
-            if length > 0.0:
-                across_x, across_y = -along_y / length, along_x / length
-                low, high = math.inf, -math.inf
-                for other in points:
-                    side = across_x * other[0] + across_y * other[1]
-                    low, high = min(low, side), max(high, side)
-                level = across_x * x[0] + across_y * x[1]
-                width, longest = min(width, high - low), max(longest, length)
-                inside = min(inside, high - level, level - low)
-                # Outside, the nearest point of the hull is on one of the lines between two points.
-                share = min(max((to_x * along_x + to_y * along_y) / length**2, 0.0), 1.0)
-            outside = min(outside, hypot(to_x - share * along_x, to_y - share * along_y))
-    if longest == 0.0 or width <= _ROUNDING * longest:
-        return math.inf
-    return inside if inside >= 0.0 else -outside
-
-
-@compiled
-def _total(rows: Array) -> Array:
-    total = np.zeros(3)
-    for row in rows:
-        total += row
-    return total
-
-
-@compiled
-def _dot(a: Array, b: Array) -> float:
-    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
-
-
-@compiled
-def _cross(a: Array, b: Array) -> Array:
-    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    return np.array([x, y, z])
+def _from_edges(points: Array, x: Array) -> Array:
+    """Distances of points (n, 2) from the edges of the hulls of others (n, k, 2), but of those on a line."""
+    one, other = np.triu_indices(points.shape[1], 1)
+    start = points[:, one]
+    along = points[:, other] - start
+    length = np.linalg.norm(along, axis=2)
+    same = length == 0.0
+    along = along / np.where(same, 1.0, length)[:, :, None]
+    across = np.stack([-along[:, :, 1], along[:, :, 0]], axis=2)
+    sides = across @ points.swapaxes(1, 2)
+    low, high, level = sides.min(axis=2), sides.max(axis=2), np.einsum("npa,na->np", across, x)
+    inside = np.where(same, np.inf, np.minimum(high - level, level - low)).min(axis=1)
+    # Outside, the nearest point of the hull is on one of the lines between two points.
+    to = x[:, None] - start
+    share = np.clip(np.einsum("npa,npa->np", to, along), 0.0, length)
+    outside = np.linalg.norm(to - share[:, :, None] * along, axis=2).min(axis=1)
+    wide = np.where(same, np.inf, high - low).min(axis=1) > _ROUNDING * length.max(axis=1)
+    return np.asarray(np.where(inside >= 0.0, inside, -outside)[wide & ~same.all(axis=1)])
 
 
 class CentroidalMomentum(NamedTuple):

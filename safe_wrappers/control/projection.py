@@ -2,14 +2,13 @@
 
 Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1.
 
-An admissible nominal is returned bit for bit. Otherwise daqp answers. Where it has no answer that passes the check,
-least distance programming by SciPy's non-negative least squares decides (Lawson and Hanson, "Solving Least Squares
-Problems", 1974, chapter 23): it is exact to rounding in thin wedges, and "infeasible" is believed only with
-multipliers that prove it. Calls share no state.
+An admissible nominal is returned bit for bit. Otherwise daqp answers, and its answer is measured on the rows. Where
+it misses one, daqp solves again with rows that may be violated; what that still violates is infeasible.
 """
 
 import functools
 import math
+from collections.abc import Iterator
 from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
@@ -21,24 +20,14 @@ from safe_wrappers.control.compiled import compiled
 from safe_wrappers.errors import Array, ConfigurationError
 
 _TOLERANCE: Final = 1e-9
-"""Largest residual that the nominal may have, as a share of `_scale`; answers may have ten times as much."""
-_EXACT: Final = 1e-3
-"""Share of what the nominal is allowed that round-off leaves. More may be far from every admissible control."""
-_NARROWEST: Final = 1e-6  # share of its distance from zero below which a box's width is rounding
-_ORDINARY: Final = 16.0  # half of a box; where it is wider the sizes of the numbers matter
+"""Largest residual of the nominal, as a share of the numbers that the row adds up."""
+_ALLOWANCE: Final = 10.0  # times as much may an answer miss
+_WIDE: Final = 1.0  # control units; wider boxes do not make the tolerance larger
 _NO_BOUND: Final = 1e15  # a box that reaches farther (control units) bounds nothing
 _UNBOUNDED: Final = 1e30  # what daqp takes as "no bound"
-_LARGEST: Final = 1e150  # from here on squares may overflow
-_OVERFLOWING: Final = 1e300  # an offset from here on asks for nothing
-_SHORTEST: Final = 1e-150  # rows below this are zero
-_ROUNDING: Final = 1e-15  # share of the numbers that are compared which round-off may leave
-_OPTIMAL: Final = 1e-9  # share of the controls by which the multipliers' control may miss the answer
-_DOWNHILL: Final = 1e-4  # likewise of a least squares answer
+_ROUNDING: Final = 1e-15  # primal tolerance of daqp
 _SOFT: Final = 1e-10  # weight of the distance from the nominal beside squared violations
-_FAR: Final = 1e8  # from the nominal, in the program's units: nobody looks for a control farther away
 _SOFTENED: Final = 8  # daqp's mark of a row that may be violated
-_SLACK, _LENGTH, _ALLOWED = range(3)
-_ADMITTED, _UNUSUAL, _BAD_NOMINAL, _BAD_BOX = -1, -2, -3, -4
 
 
 class Status(StrEnum):
@@ -51,7 +40,7 @@ class Status(StrEnum):
     INFEASIBLE = "infeasible"
     """No control in the box satisfies everything; of rows, `control` violates them least."""
     FAILED = "failed"
-    """No method gave an answer that passed the check; `control` is only inside the box."""
+    """There is no answer; `control` is only inside the box."""
 
 
 class Projection(NamedTuple):
@@ -67,9 +56,8 @@ def project(
 ) -> Projection:
     """Project a nominal control onto `{u : normals @ u <= offsets, lower <= u <= upper}`.
 
-    A nominal that misses a row by up to 1e-9 of what half of the box changes of it counts as admissible; an answer
-    may miss it by ten times as much. Where the box is wide (more than 16 control units) or open, the numbers that the
-    row compares take its place. An infeasible problem gives the least violation: the smallest sum of squared,
+    A nominal that misses a row by up to 1e-9 of the numbers that the row adds up counts as admissible; an answer may
+    miss it by ten times as much. An infeasible problem gives the least violation: the smallest sum of squared,
     normalised violations, and among those the control closest to `u_nom`.
 
     Args:
@@ -94,265 +82,108 @@ def project(
         lo, hi = (end if end.shape == u.shape else np.full(u.shape, end) for end in (lo, hi))
     except ValueError:
         raise ConfigurationError(f"expected bounds of shape {u.shape}; got {lo.shape}, {hi.shape}") from None
+    if not np.isfinite(u).all():
+        raise ConfigurationError(f"u_nom must be finite, got {u}; replace it before projecting")
+    if not (lo <= hi).all():
+        raise ConfigurationError(f"lower must not exceed upper, got {lo} and {hi}")
     return project_unchecked(u, a, b, lo, hi)
 
 
-class _Problem(NamedTuple):
-    """The arguments of a projection, as compiled code takes them, and what `_prepare` writes.
+def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Projection:
+    """`project` for callers that have already checked types, shapes and numbers."""
+    u, a, b, lo, hi = _plain(u, a, b, lo, hi)
+    control = np.minimum(np.maximum(u, lo), hi)
+    share, violation = _missed(control, u, a, b, lo, hi)
+    if share <= 1.0:
+        inside = bool((control == u).all())
+        return (
+            Projection(u, Status.INACTIVE, 0.0)
+            if inside
+            else Projection(control, Status.PROJECTED, violation)
+        )
+    if violation == math.inf:  # a row that is not finite, or too large to be added up
+        return Projection(control, Status.FAILED, violation)
+    linear, normals, upper, lower, unit = _program(u, a, b, lo, hi)
+    for sense in (0, _SOFTENED):
+        senses = np.zeros(len(upper), np.int32)
+        senses[u.size :] = sense
+        rows, tolerance = (normals, upper, lower, senses), _SOFT if sense else _ROUNDING
+        found, _, flag, _ = daqp.solve(_identity(u.size), linear, *rows, primal_tol=tolerance, rho_soft=_SOFT)
+        answer = np.minimum(np.maximum(found * unit, lo), hi)
+        share, missed = _missed(answer, u, a, b, lo, hi)
+        if flag > 0 and share <= _ALLOWANCE:
+            return Projection(answer, Status.PROJECTED, missed)
+    if flag > 0 and missed < math.inf:
+        return Projection(answer, Status.INFEASIBLE, missed)
+    return Projection(control, Status.FAILED, violation)
 
-    In the program rows have length one and controls are of order one, by a division by a power of two, which rounds
-    nothing: solvers know only absolute tolerances.
-    """
 
-    u: Array  # shape (m,)
-    a: Array  # shape (k, m)
-    b: Array  # shape (k,)
-    lo: Array  # shape (m,)
-    hi: Array  # shape (m,)
-    control: Array  # the nominal, clipped to the box
-    rows: Array  # shape (3, k): _SLACK, _LENGTH (0: asks for nothing), _ALLOWED, in row units
-    target: Array  # of the program: u, shape (m,)
-    normals: Array  # of the program, shape (k, m)
-    upper: Array  # of the program: of the controls, then of the rows, shape (m + k,)
-    lower: Array  # likewise
-
-    @staticmethod
-    def of(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> "_Problem":
-        """Copied where compiled code would have to be compiled anew: strides, read-only memory."""
-        u, a, b, lo, hi = (part if part.flags.carray else part.copy() for part in (u, a, b, lo, hi))
-        m, k = u.size, b.size
-        program = np.empty(m), np.empty((k, m)), np.empty(m + k), np.empty(m + k)
-        return _Problem(u, a, b, lo, hi, np.empty(m), np.empty((3, k)), *program)
+def _plain(*arrays: Array) -> Iterator[Array]:
+    """Copied where compiled code would have to be compiled anew: strides, read-only memory."""
+    return (part if part.flags.carray else part.copy() for part in arrays)
 
 
 @compiled
 def _half_width(low: float, high: float) -> float:
-    """Half of what a box spans in one component, control units."""
-    return min(max(0.5 * high - 0.5 * low, _NARROWEST * max(high, -low)), _UNBOUNDED)
+    """Half of what a box spans in one component, control units; 0 where it is open."""
+    half = 0.5 * high - 0.5 * low
+    return half if half < _NO_BOUND else 0.0
 
 
 @compiled
-def _scale(box: float, length: float, values: float, widest: float) -> float:
-    """What a residual is compared with, row units: how far the row's value changes over half of the box, or `values`.
+def _missed(x: Array, u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple[float, float]:
+    """By how much a control x, for a nominal u, misses the rows: in tolerances of the worst one, and in row units.
 
-    The length is that of the normal, `values` the size of the two numbers that the row compares, `widest` half of the
-    box's largest width, control units.
+    A tolerance is a share of the numbers that the row adds up, or would in a box of order one. Both are infinite
+    where that is no number.
     """
-    if widest <= _ORDINARY:
-        return box
-    return values if box >= _NO_BOUND * length else min(box, max(values, length))
+    share = violation = 0.0
+    for i in range(len(b)):
+        excess, size = -b[i], 0.0
+        for j in range(len(x)):
+            reach = max(abs(x[j]), abs(u[j]), min(_half_width(lo[j], hi[j]), _WIDE))
+            excess += a[i, j] * x[j]
+            size += abs(a[i, j]) * reach
+        if not (size < math.inf and excess < math.inf):
+            return math.inf, math.inf
+        if excess > 0.0:
+            share = max(share, excess / (_TOLERANCE * size) if size > 0.0 else math.inf)
+            violation = max(violation, excess)
+    return share, violation
 
 
 @compiled
-def _prepare(p: _Problem) -> tuple[int, float]:
-    """Read a problem and write what is small in it, and the program.
+def _program(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple[Array, Array, Array, Array, float]:
+    """What daqp is given: linear term, normals, bounds of controls and rows from above and below, and the unit.
 
-    Returns:
-        How many rows ask for something, or a code below 0; the power of two that is one in the program.
+    Rows have length one and controls are of order one, by a division by a power of two, which rounds nothing: daqp
+    knows only absolute tolerances.
     """
-    k, m = p.a.shape
-    usual, inside, within, unit = True, True, True, 1.0
-    largest = farthest = widest = away = 0.0
+    k, m = a.shape
+    normals, upper, lower = a.copy(), np.full(m + k, _UNBOUNDED), np.full(m + k, -_UNBOUNDED)
+    size = away = widest = 0.0
     for j in range(m):
-        x, low, high = p.u[j], p.lo[j], p.hi[j]
-        if not math.isfinite(x):
-            return _BAD_NOMINAL, unit
-        if not low <= high:
-            return _BAD_BOX, unit
-        p.control[j] = min(max(x, low), high)
-        inside = inside and p.control[j] == x
-        usual = usual and abs(x) < _LARGEST and abs(p.control[j]) < _LARGEST
-        largest, farthest = max(largest, abs(x)), max(farthest, abs(p.control[j]))
-        p.target[j] = _half_width(low, high)
-        widest = max(widest, p.target[j])
+        half = _half_width(lo[j], hi[j])
+        widest = max(widest, half if half > 0.0 else math.inf)
+        size = max(size, min(half, _WIDE), abs(u[j]))
     for i in range(k):
-        excess = -p.b[i]
+        square, excess = 0.0, -b[i]
         for j in range(m):
-            usual = usual and abs(p.a[i, j]) < _LARGEST
-            excess += p.a[i, j] * p.u[j]
-        usual = usual and p.b[i] > -_OVERFLOWING
-        p.rows[_ALLOWED, i] = excess
-        within = within and excess <= 0.0
-    if not usual:
-        return _UNUSUAL, unit
-    if inside and within:
-        return _ADMITTED, unit
-    asking, within = 0, True
-    for i in range(k):
-        length = box = 0.0
-        for j in range(m):
-            length += p.a[i, j] * p.a[i, j]
-        length = math.sqrt(length)
-        for j in range(m if length > 0.0 else 0):
-            part = p.a[i, j] / length * p.target[j]
-            box += part * part
-        offset, excess = abs(p.b[i]), p.rows[_ALLOWED, i]
-        p.rows[_SLACK, i] = _TOLERANCE * _scale(
-            length * math.sqrt(box), length, length * largest + offset, widest
-        )
-        within = within and excess <= p.rows[_SLACK, i]
-        rounding = _ROUNDING * (length * max(largest, farthest) + offset)
-        p.rows[_ALLOWED, i] = max(_EXACT * p.rows[_SLACK, i], rounding)
-        asks = length > _SHORTEST and offset < _OVERFLOWING
-        p.rows[_LENGTH, i] = length if asks else 0.0
-        if asks:
-            away, asking = max(away, excess / length), asking + 1
-    if inside and within:
-        return _ADMITTED, unit
-    size = widest
-    if size > _ORDINARY:
-        size = min(_scale(size, 1.0, max(largest, away), size), _LARGEST)
-    if size > 0.0:
-        while unit > size:
-            unit *= 0.5
-        while 2.0 * unit <= size:
-            unit *= 2.0
+            square += a[i, j] * a[i, j]
+            excess += a[i, j] * u[j]
+        length = math.sqrt(square)
+        if length > 0.0 and b[i] < _UNBOUNDED * length:
+            upper[m + i] = b[i] / length
+            away = max(away, excess / length)
+            for j in range(m):
+                normals[i, j] = a[i, j] / length
+    size = min(max(size, away), widest)
+    unit = math.ldexp(1.0, math.frexp(size)[1] - 1) if 0.0 < size < math.inf else 1.0
     for j in range(m):
-        p.target[j] = p.u[j] / unit
-        p.upper[j], p.lower[j] = min(p.hi[j] / unit, _UNBOUNDED), max(p.lo[j] / unit, -_UNBOUNDED)
-    for i in range(k):
-        length = p.rows[_LENGTH, i]
-        for j in range(m):
-            p.normals[i, j] = p.a[i, j] / length if length > 0.0 else 0.0
-        p.upper[m + i] = p.b[i] / length / unit if length > 0.0 else _UNBOUNDED
-        p.lower[m + i] = -_UNBOUNDED
-    return asking, unit
-
-
-@compiled
-def _judge(p: _Problem, unit: float, found: Array, multipliers: Array) -> tuple[bool, bool, float]:
-    """Check the program's answer and write it, inside the box, to `control`.
-
-    Returns:
-        Whether it keeps the rows but for round-off, and its multipliers lead to it from the nominal; whether it
-        misses none by more than an answer may; its violation.
-    """
-    k, m = p.a.shape
-    closest, within, violation, size, widest = True, True, 0.0, 0.0, 0.0
-    for j in range(m):
-        finite = math.isfinite(found[j] * unit)
-        closest = closest and finite
-        p.control[j] = min(max(found[j] * unit if finite else p.u[j], p.lo[j]), p.hi[j])
-        size = max(size, abs(p.u[j]), abs(p.control[j]))
-        widest = max(widest, _half_width(p.lo[j], p.hi[j]))
-    for i in range(k):
-        excess = -p.b[i]
-        for j in range(m):
-            excess += p.a[i, j] * p.control[j]
-        violation = max(violation, excess)
-        within = within and excess <= 10.0 * p.rows[_SLACK, i]
-        closest = closest and (excess <= 2.0 * p.rows[_ALLOWED, i] or p.rows[_LENGTH, i] == 0.0)
-    for j in range(m):
-        pulled, pull = p.target[j], 0.0
-        for i in range(k):
-            step = max(multipliers[m + i], 0.0) * p.normals[i, j]
-            pulled, pull = pulled - step, pull + abs(step)
-        near = _EXACT * _TOLERANCE * _scale(_half_width(p.lo[j], p.hi[j]), 1.0, size, widest)
-        away = abs(min(max(pulled * unit, p.lo[j]), p.hi[j]) - p.control[j])
-        closest = closest and away <= _OPTIMAL * size + 10.0 * _ROUNDING * pull * unit + near
-    return closest, within, violation
-
-
-def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Projection:
-    """`project` for callers that have already checked types and shapes.
-
-    Raises:
-        ConfigurationError: A nominal that is not finite, or bounds that cross.
-    """
-    p = _Problem.of(u, a, b, lo, hi)
-    asking, unit = _prepare(p)
-    if asking == _ADMITTED:
-        return Projection(u, Status.INACTIVE, 0.0)
-    if asking == _BAD_NOMINAL:
-        raise ConfigurationError(f"u_nom must be finite, got {p.u}; replace it before projecting")
-    if asking == _BAD_BOX:
-        raise ConfigurationError(f"lower must not exceed upper, got {p.lo} and {p.hi}")
-    if asking == _UNUSUAL:  # numbers that are not finite, or too large, cannot be checked
-        return Projection(p.control, Status.FAILED, math.inf)
-    clipped = p.control.copy()
-    closest, within, violation = _judge(p, unit, *_by_daqp(p))
-    if closest:
-        return Projection(p.control, _status(within), violation)
-    softened = _by_daqp(p, _SOFTENED)
-    proved = _prove_that_none_exists(p, softened[1])
-    if not proved:  # thin, or daqp has failed
-        found = _by_least_distance(p)
-        proved = _prove_that_none_exists(p, found[1])
-        closest, within, violation = _judge(p, unit, *_polished(p, *found))
-        if closest and not proved:
-            return Projection(p.control, _status(within), violation)
-    if proved and bool(np.isfinite(softened[0]).all()):
-        _, within, violation = _judge(p, unit, *softened)
-        return Projection(p.control, _status(within), violation)
-    return Projection(clipped, Status.FAILED, max(0.0, float((a @ clipped - b).max())))
-
-
-def _status(within: bool) -> Status:
-    return Status.PROJECTED if within else Status.INFEASIBLE
-
-
-_Answer = tuple[Array, Array]
-"""Of the program: the control, shape (m,), and multipliers of the box (below 0: of lower bounds) and the rows."""
-
-
-def _by_daqp(p: _Problem, sense: int = 0) -> _Answer:
-    """By an active set; with `_SOFTENED` rows the least violation, and of that what is closest to the nominal."""
-    senses = np.zeros(len(p.upper), np.int32)
-    senses[p.u.size :] = sense
-    bounds = p.normals, p.upper, p.lower, senses
-    tolerance = _SOFT if sense else _ROUNDING
-    x, _, flag, info = daqp.solve(
-        _identity(p.u.size), -p.target, *bounds, primal_tol=tolerance, rho_soft=_SOFT
-    )
-    return np.asarray(x) if flag > 0 else np.full(p.u.size, np.nan), np.asarray(info["lam"])
-
-
-def _by_least_distance(p: _Problem) -> _Answer:
-    """By non-negative least squares: its residual leads from the nominal to the answer, and vanishes without one."""
-    from scipy.optimize import nnls  # here: it takes a fifth of the time of `import safe_wrappers`
-
-    m, unit = p.u.size, _identity(p.u.size)
-    above, below = np.flatnonzero(p.upper[:m] < _UNBOUNDED), np.flatnonzero(p.lower[:m] > -_UNBOUNDED)
-    normals = np.vstack([unit[above], -unit[below], p.normals])
-    limits = np.concatenate([p.upper[above], -p.lower[below], p.upper[m:]])
-    columns = -np.vstack([normals.T, limits - normals @ p.target])
-    multipliers = np.zeros(len(p.upper))
-    try:
-        y, _ = nnls(columns, np.append(np.zeros(m), 1.0))
-    except (RuntimeError, ValueError):  # too many steps; numbers that are not finite
-        return np.full(m, np.nan), multipliers
-    rest = columns @ y
-    scale = 1.0 - rest[-1] if rest[-1] < 1.0 else np.finfo(np.float64).eps
-    y /= scale
-    np.add.at(multipliers, above, y[: len(above)])
-    np.subtract.at(multipliers, below, y[len(above) : len(above) + len(below)])
-    multipliers[m:] = y[len(above) + len(below) :]
-    return p.target + rest[:-1] / scale, multipliers
-
-
-def _polished(p: _Problem, x: Array, multipliers: Array) -> _Answer:
-    """What rounding leaves of the rows that hold, taken out."""
-    m = p.u.size
-    holds, free = multipliers[m:] > 0.0, multipliers[:m] == 0.0
-    if not bool(holds.any() and np.isfinite(x).all()):
-        return x, multipliers
-    x = np.where(free, x, np.where(multipliers[:m] > 0.0, p.upper[:m], p.lower[:m]))
-    left, part = p.upper[m:][holds] - p.normals[holds] @ x, p.normals[holds][:, free]
-    x[free] += np.linalg.lstsq(part, left, rcond=None)[0]
-    multipliers[m:][holds] = np.linalg.lstsq(part.T, (p.target - x)[free], rcond=None)[0]
-    return x, multipliers
-
-
-def _prove_that_none_exists(p: _Problem, multipliers: Array) -> bool:
-    """Whether the multiples of rows and bounds contradict each other in the box (Farkas)."""
-    m = p.u.size
-    box, weights = multipliers[:m], np.maximum(multipliers[m:], 0.0)
-    with np.errstate(all="ignore"):
-        away = np.where(box > 0.0, p.upper[:m], p.lower[:m]) - p.target
-        missed = -float(weights @ (p.upper[m:] - p.normals @ p.target) + box[box != 0.0] @ away[box != 0.0])
-        left = float(np.linalg.norm(weights @ p.normals + box))
-        reach = np.maximum(np.abs(p.upper[:m] - p.target), np.abs(p.lower[:m] - p.target))
-    return missed > left * min(float(np.linalg.norm(reach)), _FAR)
+        upper[j], lower[j] = min(hi[j], _UNBOUNDED * unit), max(lo[j], -_UNBOUNDED * unit)
+    for i in range(m + k):
+        upper[i], lower[i] = min(upper[i] / unit, _UNBOUNDED), max(lower[i] / unit, -_UNBOUNDED)
+    return -u / unit, normals, upper, lower, unit
 
 
 @functools.cache
@@ -364,19 +195,14 @@ def _identity(n: int) -> Array:
 @functools.cache
 def load_solvers() -> None:
     """Load what a projection needs, or compile it (seconds, once per machine), so that no control step waits."""
-    one, rows = np.ones(1), (np.array([[1.0], [-1.0]]), np.array([0.5, 0.5]))
-    project_unchecked(one, *rows, -one, one)
-    _by_least_distance(_Problem.of(one, *rows, -one, one))
+    one = np.ones(1)
+    project_unchecked(one, np.array([[1.0], [-1.0]]), np.array([0.5, 0.5]), -one, one)
 
 
 def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upper: Array) -> bool:
     """Whether a control satisfies every row as closely as `project` asks of its answers."""
-    p = _Problem.of(control, normals, offsets, lower, upper)
-    asking, unit = _prepare(p)
-    if asking < 0:
-        return asking == _ADMITTED
-    anywhere = p._replace(lo=np.full(p.u.size, -math.inf), hi=np.full(p.u.size, math.inf))
-    return _judge(anywhere, unit, p.target, np.zeros(len(p.upper)))[1]
+    control, normals, offsets, lower, upper = _plain(control, normals, offsets, lower, upper)
+    return _missed(control, control, normals, offsets, lower, upper)[0] <= _ALLOWANCE
 
 
 def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
@@ -388,11 +214,7 @@ def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
     unit = float(np.abs(clipped).max()) or 1.0
     bounds = np.minimum(upper / unit, _UNBOUNDED), np.maximum(lower / unit, -_UNBOUNDED)
     x, _, flag, _ = daqp.solve(hessian, linear / unit, np.zeros((0, n)), *bounds, np.zeros(n, np.int32))
-    found = np.clip(np.asarray(x) * unit, lower, upper)
-    downhill = np.clip(found - (hessian @ found + linear) / np.diag(hessian), lower, upper)
-    if flag > 0 and bool((np.abs(downhill - found) <= _DOWNHILL * unit).all()):
-        return np.asarray(found)
-    return np.asarray(clipped)  # without rows the problem cannot be infeasible: a numerical failure
+    return np.clip(np.asarray(x) * unit, lower, upper) if flag > 0 else clipped
 
 
 def cast_inside(control: Array, dtype: Any, normals: Array, offsets: Array, low: Array, high: Array) -> Any:

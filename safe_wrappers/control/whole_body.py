@@ -5,12 +5,11 @@
 with every f_k in its friction cone, u in the actuators' box, and the contacts' points moving as wanted. A solution
 says that such forces exist at this instant, not that the same holds a control step later.
 
-The wanted accelerations `J qacc` determine f up to inner forces, which cause no motion (two feet pressing against
-each other through a rigid ground). So the unknowns are y = (u, inner forces):
+The equation of motion gives qacc, so that the unknowns of the program are y = (u, f):
 
-    minimise 1/2 y' H y + q' y    so that    G y <= g,  lower <= y <= upper,  c_i + C_i y in {(t, x): |x| <= t},
+    minimise |u - nominal|^2 + weight |f|^2 so that E y = e,  G y <= g,  C_i y in {(t, x): |x| <= t},
 
-by daqp, or by clarabel where there are cones. Every answer is checked by the residuals of the problem.
+by clarabel. Every answer is checked by the residuals of the problem.
 
 Source: appendix "Floating-base equations of motion" and "Hierarchical whole-body control quadratic program".
 """
@@ -19,18 +18,15 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import clarabel
-import daqp
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.contact import cone_excess, friction_pyramid, tangents
 from safe_wrappers.control.projection import Status
-from safe_wrappers.errors import Array, ConfigurationError, finite_array
+from safe_wrappers.errors import Array, ConfigurationError
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""
-_UNBOUNDED = 1e30
-"""daqp's infinity."""
 _ACCURACY = 1e-10
 """Tolerance for clarabel; answers of slightly lower accuracy are accepted, since they are checked."""
 _FOUND = (
@@ -57,36 +53,23 @@ class WholeBodyProblem:
     lower: Array  #: smallest control, shape (nu,)
     upper: Array  #: largest control, shape (nu,)
     nominal: Array  #: the control whose distance is minimised, shape (nu,)
-    contact_acceleration: Array | None = (
-        None  #: wanted at the contact points, shape (k, 3), m/s^2; None is zero
-    )
+    contact_acceleration: Array | float = 0.0  #: wanted at the contact points, shape (k, 3), m/s^2
     force_weight: float = 1e-8  #: of the squared forces, per N^2: it chooses among forces of equal effect
     breaking: NDArray[np.bool_] | None = None
     """Contacts that are to open, shape (k,): force 0, normal acceleration at least the wanted; None: none."""
-    first_tangents: Array | None = (
-        None  #: direction of each pyramid's first edge, shape (k, 3); None: a default
-    )
-    accelerations: tuple[Array, Array] | None = (
-        None  #: rows `G qacc <= g`, shapes (m, nv) and (m,); None: none
-    )
     stance: NDArray[np.intp] = field(init=False)  #: indices of the contacts that are to stay
     opening: NDArray[np.intp] = field(init=False)  #: indices of the contacts that are to open
-    wanted: Array = field(init=False)
-    """Wanted `J qacc`: `contact_acceleration`, or zeros, minus the drift, shape (k, 3)."""
+    wanted: Array = field(
+        init=False
+    )  #: wanted `J qacc`, `contact_acceleration` minus the drift, shape (k, 3)
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray) and name not in ("lower", "upper"):
-                finite_array(name, value)
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
-        if not (self.friction >= 0.0).all():
-            raise ConfigurationError(f"friction must be 0 or more, got {self.friction}")
         opens = np.zeros(len(self.normals), bool) if self.breaking is None else self.breaking
-        acceleration = 0.0 if self.contact_acceleration is None else self.contact_acceleration
         object.__setattr__(self, "stance", np.flatnonzero(~opens))
         object.__setattr__(self, "opening", np.flatnonzero(opens))
-        object.__setattr__(self, "wanted", acceleration - self.drift)
+        object.__setattr__(self, "wanted", self.contact_acceleration - self.drift)
 
 
 class WholeBodySolution(NamedTuple):
@@ -104,15 +87,13 @@ class WholeBodySolution(NamedTuple):
 
 
 def solve_pyramid(problem: WholeBodyProblem, edges: int = 4) -> WholeBodySolution:
-    """Solve with friction pyramids of so many edges, at least 3: a quadratic program, conservative, by daqp."""
+    """Solve with friction pyramids of so many edges, at least 3: a quadratic program, conservative."""
     grips = problem.stance[problem.friction[problem.stance] > 0.0]
-    first = None if problem.first_tangents is None else problem.first_tangents[grips]
-    pyramids = friction_pyramid(problem.normals[grips], problem.friction[grips], edges, first)
-    return _solve(problem, pyramids[:, :-1])  # the sides imply that nothing pulls
+    return _solve(problem, friction_pyramid(problem.normals[grips], problem.friction[grips], edges))
 
 
 def solve_cone(problem: WholeBodyProblem) -> WholeBodySolution:
-    """Solve with the exact friction cones: a second-order cone program, by clarabel."""
+    """Solve with the exact friction cones: a second-order cone program."""
     return _solve(problem, None)
 
 
@@ -122,8 +103,8 @@ def rigid_forces(problem: WholeBodyProblem, control: Array) -> Array:
     Shape (k, 3), N, the smallest ones where they are not unique and 0 at contacts that are to open. Contradictory
     accelerations are met as closely as possible.
     """
-    rigid = _eliminate(problem)
-    return rigid.forces(problem, np.concatenate([control, np.zeros(rigid.matrix.shape[1] - len(control))]))
+    motion = _Motion(problem)
+    return motion.spread(motion.forces(control, np.zeros(motion.axes.shape[1])))
 
 
 def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
@@ -138,117 +119,78 @@ def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
     return np.asarray(attainable)
 
 
-class _Rigid(NamedTuple):
-    """While contacts move as wanted: `f = offset + matrix @ y` of those that stay, and `qacc = start + slope @ y`."""
-
-    offset: Array  # (3 s,), N
-    matrix: Array  # (3 s, n)
-    start: Array  # (nv,)
-    slope: Array  # (nv, n)
-    contradiction: float  # largest part of the wanted accelerations that no motion gives, m/s^2
-
-    def forces(self, problem: WholeBodyProblem, y: Array) -> Array:
-        """At all contacts, shape (k, 3)."""
-        forces = np.zeros(problem.normals.shape)
-        forces[problem.stance] = (self.offset + self.matrix @ y).reshape(-1, 3)
-        return forces
-
-
 def _held(problem: WholeBodyProblem) -> tuple[Array, Array, Array]:
     """Directions in which contacts that stay give force, (3 s, r), the Jacobian along them, the wanted `J qacc`."""
-    normals, friction = problem.normals[problem.stance], problem.friction[problem.stance]
-    axes = np.eye(normals.size)
-    if not (friction > 0.0).all():  # without friction the normal alone
-        from scipy.linalg import block_diag  # here: SciPy takes a while to import
-
-        both = zip(normals, friction, strict=True)
-        axes = block_diag(*(np.eye(3) if mu > 0.0 else n[:, None] for n, mu in both))
-    stacked = problem.jacobians[problem.stance].reshape(-1, len(problem.bias))
-    return axes, axes.T @ stacked, axes.T @ problem.wanted[problem.stance].reshape(-1)
+    stays = problem.stance
+    each = zip(problem.normals[stays], problem.friction[stays], strict=True)
+    axes = _blocks(
+        [np.eye(3) if mu > 0.0 else n[:, None] for n, mu in each]
+    )  # without friction the normal alone
+    stacked = problem.jacobians[stays].reshape(-1, len(problem.bias))
+    return axes, axes.T @ stacked, axes.T @ problem.wanted[stays].reshape(-1)
 
 
-def _eliminate(problem: WholeBodyProblem) -> _Rigid:
-    nu = len(problem.nominal)
-    axes, held, wanted = _held(problem)
-    stacked = problem.jacobians[problem.stance].reshape(-1, len(problem.bias))
-    right = np.concatenate([problem.actuation, stacked.T, problem.bias[:, None]], axis=1)
-    solved = np.linalg.solve(problem.inertia, right)
-    by_control, by_force, free = solved[:, :nu], solved[:, nu:-1], -solved[:, -1]
-    missing = wanted - held @ free
-    compliance = held @ (by_force @ axes)
-    values, vectors = np.linalg.eigh(0.5 * (compliance + compliance.T))
-    counts = values > _RANK * values.max(initial=np.finfo(np.float64).tiny)
-    moving, inner = vectors[:, counts], vectors[:, ~counts]
-    inverse = moving / values[counts] @ moving.T
-    matrix = axes @ np.concatenate([-inverse @ (held @ by_control), inner], axis=1)
-    offset = axes @ (inverse @ missing)
-    slope = by_force @ matrix
-    slope[:, :nu] += by_control
-    # Inner forces cause no acceleration, so no control meets a wanted acceleration along them.
-    contradiction = float(np.abs(inner @ (inner.T @ missing)).max(initial=0.0))
-    return _Rigid(offset, matrix, free + by_force @ offset, slope, contradiction)
+def _blocks(parts: list[Array]) -> Array:
+    """The matrix with these on its diagonal; shape (0, 0) without any."""
+    from scipy.linalg import block_diag  # here: SciPy takes a while to import
+
+    return np.asarray(block_diag(*parts)) if parts else np.zeros((0, 0))
 
 
-class Program(NamedTuple):
-    """The program above; H is positive definite."""
+class _Motion:
+    """`qacc = response @ (u, f) + free`, f in the directions `axes`; and the f that lets contacts move as wanted."""
 
-    hessian: Array  # (n, n)
-    linear: Array  # (n,)
-    rows: Array  # (k, n): of accelerations, then sides of pyramids
-    limits: Array  # (k,)
-    lower: Array  # (n,), -inf is no bound
-    upper: Array  # (n,), inf is no bound
-    cones: Array  # C_i, (m, 3, n)
-    cone_offsets: Array  # c_i, (m, 3)
+    def __init__(self, problem: WholeBodyProblem) -> None:
+        self._problem, nu = problem, len(problem.nominal)
+        self.axes, self.held, self._wanted = _held(problem)
+        right = np.concatenate([problem.actuation, self.held.T, -problem.bias[:, None]], axis=1)
+        solved = np.linalg.solve(problem.inertia, right)
+        self.response, self.free = solved[:, :-1], solved[:, -1]
+        self.moved, self.missing = self.held @ self.response, self._wanted - self.held @ self.free
+        self._by_control, self._by_force = self.moved[:, :nu], self.moved[:, nu:]
+        self._inverse = np.linalg.pinv(self._by_force, rcond=_RANK, hermitian=True)
+
+    def forces(self, control: Array, near: Array) -> Array:
+        """Those with which contacts move as wanted under a control (nu,), the ones closest to given ones, (r,)."""
+        missing = self.missing - self._by_control @ control - self._by_force @ near
+        return np.asarray(near + self._inverse @ missing)
+
+    def spread(self, forces: Array) -> Array:
+        """At all contacts, shape (k, 3)."""
+        every = np.zeros(self._problem.normals.shape)
+        every[self._problem.stance] = (self.axes @ forces).reshape(-1, 3)
+        return every
 
 
 def _solve(problem: WholeBodyProblem, sides: Array | None) -> WholeBodySolution:
     """With the sides of pyramids, shape (k, edges, 3), for the contacts that stay and have friction; None: cones."""
-    rigid, nominal, nu = _eliminate(problem), problem.nominal, len(problem.nominal)
-    status, found = Status.INFEASIBLE, None
-    if rigid.contradiction <= _tolerance(problem.wanted):
-        program = _program(problem, rigid, sides)
-        nothing = np.zeros(len(program.linear) - nu)
-        found = _checked(problem, rigid, program, nominal, nothing, Status.INACTIVE)
-        y = None if found else _optimum(program)
-        if isinstance(y, Status):
-            status = y
-        elif y is not None:
-            status = Status.FAILED
-            found = _checked(problem, rigid, program, nominal, y[nu:], Status.INACTIVE)
-            found = found or _checked(problem, rigid, program, y[:nu], y[nu:], Status.PROJECTED)
+    motion, nominal, nu = _Motion(problem), problem.nominal, len(problem.nominal)
+    inside = bool(((nominal >= problem.lower) & (nominal <= problem.upper)).all())
+    boxed = np.clip(nominal, problem.lower, problem.upper)
+    facing = _facing(problem, sides)
+
+    def checked(control: Array, near: Array, status: Status) -> WholeBodySolution | None:
+        """The answer of a control and of forces close to given ones, or None if its residuals are too large."""
+        forces = motion.spread(motion.forces(control, near))
+        answer = _answer(problem, control, forces, status)
+        pull = facing @ forces[problem.stance].reshape(-1)
+        within = max(answer.cone_error, float(pull.max(initial=0.0))) <= _tolerance(forces)
+        return answer if within and answer.contact_error <= _tolerance(problem.wanted) else None
+
+    none = np.zeros(motion.axes.shape[1])
+    found = checked(nominal, none, Status.INACTIVE) if inside else None
     if found is not None:
         return found
-    # Nothing passed: the nominal control clipped to its box, contacts without force.
-    control = np.clip(nominal, problem.lower, problem.upper)
-    return _answer(problem, control, np.zeros(problem.normals.shape), status)
+    y = by_clarabel(_program(problem, motion, facing, sides is None))
+    if isinstance(y, Status):
+        return _answer(problem, boxed, motion.spread(none), y)
+    found = checked(nominal, y[nu:], Status.INACTIVE) if inside else None
+    found = found or checked(np.clip(y[:nu], problem.lower, problem.upper), y[nu:], Status.PROJECTED)
+    return found or _answer(problem, boxed, motion.spread(none), Status.FAILED)
 
 
 def _tolerance(sizes: Array) -> float:
     return TOLERANCE * (1.0 + float(np.abs(sizes).max(initial=0.0)))
-
-
-def _checked(
-    problem: WholeBodyProblem, rigid: _Rigid, program: Program, control: Array, inner: Array, status: Status
-) -> WholeBodySolution | None:
-    """The answer of a control and inner forces, or None if it is outside the box or its residuals are too large."""
-    inside = np.clip(control, problem.lower, problem.upper)
-    allowed = TOLERANCE if status is Status.PROJECTED else 0.0  # a solver's round-off at the box
-    if not float(np.abs(control - inside).max(initial=0.0)) <= allowed:
-        return None
-    y = np.concatenate([inside, inner])
-    executed = inside if status is Status.PROJECTED else control
-    answer = _answer(problem, executed, rigid.forces(problem, y), status)
-    soft = len(_acceleration_rows(problem)[1])
-    over, force = program.rows @ y - program.limits, _tolerance(answer.forces)
-    size = np.abs(program.rows[:soft]) @ np.abs(y)
-    fine = (
-        answer.cone_error <= force
-        and bool((over[soft:] <= force).all())
-        and bool((over[:soft] <= TOLERANCE * (1.0 + size)).all())
-        and answer.contact_error <= _tolerance(problem.wanted)
-    )
-    return answer if fine else None
 
 
 def _answer(problem: WholeBodyProblem, control: Array, forces: Array, status: Status) -> WholeBodySolution:
@@ -266,126 +208,61 @@ def _answer(problem: WholeBodyProblem, control: Array, forces: Array, status: St
     return WholeBodySolution(control, acceleration, forces, status, error, cone)
 
 
-def _acceleration_rows(problem: WholeBodyProblem) -> tuple[Array, Array]:
-    """G and g of `G qacc <= g`, those of contacts that open included."""
-    normals = problem.normals[problem.opening]
-    away = np.einsum("ki,kiv->kv", normals, problem.jacobians[problem.opening])
-    least = np.einsum("ki,ki->k", normals, problem.wanted[problem.opening])
-    if problem.accelerations is None:
-        return -away, -least
-    rows, limits = problem.accelerations
-    return np.concatenate([rows, -away]), np.concatenate([limits, -least])
+def _facing(problem: WholeBodyProblem, sides: Array | None) -> Array:
+    """Half-spaces `facing @ f <= 0` of the forces at contacts that stay, (n, 3 s): sides, or that nothing pulls."""
+    each = iter(() if sides is None else sides)
+    contacts = zip(problem.normals[problem.stance], problem.friction[problem.stance], strict=True)
+    return _blocks([-n[None] if sides is None or mu == 0.0 else next(each) for n, mu in contacts])
 
 
-def _program(problem: WholeBodyProblem, rigid: _Rigid, sides: Array | None) -> Program:
-    nu, n = len(problem.nominal), rigid.matrix.shape[1]
-    weighted = problem.force_weight * rigid.matrix
-    hessian, linear = weighted.T @ rigid.matrix, weighted.T @ rigid.offset
-    hessian[np.arange(nu), np.arange(nu)] += 1.0
-    linear[:nu] -= problem.nominal
-    accelerations, most = _acceleration_rows(problem)
-    rows, limits = [accelerations @ rigid.slope], [most - accelerations @ rigid.start]
-    normals, friction = problem.normals[problem.stance], problem.friction[problem.stance]
-    by_contact, force = rigid.matrix.reshape(-1, 3, n), rigid.offset.reshape(-1, 3, 1)
-    grips = friction > 0.0
-    # Without friction a contact can only push.
-    for some, facing in ((~grips, -normals[~grips, None]), (grips, sides)):
-        if facing is not None:
-            rows.append((facing @ by_contact[some]).reshape(-1, n))
-            limits.append(-(facing @ force[some]).reshape(-1))
-    exact = grips & (sides is None)
-    pressure = friction[exact, None, None] * normals[exact, None]
-    frame = np.concatenate([pressure, tangents(normals[exact])], axis=1)
-    free = np.full(n - nu, np.inf)
-    box = np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free])
-    cones = frame @ by_contact[exact], (frame @ force[exact])[:, :, 0]
-    return Program(hessian, linear, np.concatenate(rows), np.concatenate(limits), *box, *cones)
+class Program(NamedTuple):
+    """The program above, with `1/2 y' diag(weights) y + linear' y`."""
+
+    weights: Array  # (n,), positive
+    linear: Array  # (n,)
+    equal: Array  # E, (e, n)
+    values: Array  # e, (e,)
+    rows: Array  # G, (k, n)
+    limits: Array  # g, (k,); infinite ones are no limit
+    cones: Array  # C_i, (m, 3, n)
 
 
-def _optimum(program: Program) -> Array | Status:
-    """By daqp where there are no cones; by clarabel as well before infeasibility is accepted."""
-    scale = 1.0 / np.sqrt(program.hessian.diagonal())  # to unit curvature along each unknown
-    scaled = program._replace(
-        hessian=program.hessian * scale * scale[:, None],
-        linear=program.linear * scale,
-        rows=program.rows * scale,
-        lower=program.lower / scale,
-        upper=program.upper / scale,
-        cones=program.cones * scale,
+def _program(problem: WholeBodyProblem, motion: _Motion, facing: Array, exact: bool) -> Program:
+    nu, r = len(problem.nominal), motion.axes.shape[1]
+    weights = np.concatenate([np.ones(nu), np.full(r, problem.force_weight)])
+    linear = np.concatenate([-problem.nominal, np.zeros(r)])
+    opening = problem.normals[problem.opening]  # these move away
+    rows = -np.einsum("ki,kiv->kv", opening, problem.jacobians[problem.opening])
+    limits = -np.einsum("ki,ki->k", opening, problem.wanted[problem.opening])
+    box = np.eye(nu, nu + r)
+    by_force = np.concatenate([np.zeros((motion.axes.shape[0], nu)), motion.axes], axis=1)
+    every = rows @ motion.response, facing @ by_force, box, -box
+    most = limits - rows @ motion.free, np.zeros(len(facing)), problem.upper, -problem.lower
+    grips = np.flatnonzero(problem.friction[problem.stance] > 0.0) if exact else np.zeros(0, int)
+    normals, friction = problem.normals[problem.stance[grips]], problem.friction[problem.stance[grips]]
+    frame = np.concatenate([(friction[:, None] * normals)[:, None], tangents(normals)], axis=1)
+    cones = frame @ by_force.reshape(-1, 3, nu + r)[grips]
+    return Program(
+        weights, linear, motion.moved, motion.missing, np.concatenate(every), np.concatenate(most), cones
     )
-    y = Status.FAILED if len(program.cones) else by_daqp(scaled)
-    if isinstance(y, Status):
-        y = by_clarabel(scaled)
-    return y if isinstance(y, Status) else y * scale
-
-
-def by_daqp(p: Program) -> Array | Status:
-    """The y of a program without cones, shape (n,), by an active set; or why there is none."""
-    n, k = p.linear.size, p.limits.size
-    most = np.minimum(np.concatenate((p.upper, p.limits)), _UNBOUNDED)
-    least = np.concatenate((np.maximum(p.lower, -_UNBOUNDED), np.full(k, -_UNBOUNDED)))
-    y, _, flag, _ = daqp.solve(
-        p.hessian, p.linear, np.ascontiguousarray(p.rows), most, least, np.zeros(n + k, np.int32)
-    )
-    if flag == -1:
-        return Status.INFEASIBLE
-    return np.asarray(y) if flag > 0 and np.isfinite(y).all() else Status.FAILED
 
 
 def by_clarabel(p: Program) -> Array | Status:
-    """The y of a program, shape (n,), by an interior point method; or why there is none."""
+    """The y of a program, shape (n,), or why there is none."""
     from scipy import sparse  # here: SciPy takes a while to import
 
-    at_most, at_least, unit = np.isfinite(p.upper), np.isfinite(p.lower), np.eye(p.linear.size)
-    matrix = np.concatenate([p.rows, unit[at_most], -unit[at_least], -p.cones.reshape(-1, p.linear.size)])
-    right = np.concatenate([p.limits, p.upper[at_most], -p.lower[at_least], p.cone_offsets.reshape(-1)])
-    flat = len(right) - p.cone_offsets.size
-    kinds = [clarabel.NonnegativeConeT(flat)] if flat else []
+    there = np.isfinite(p.limits)
+    matrix = np.concatenate([p.equal, p.rows[there], -p.cones.reshape(-1, len(p.linear))])
+    right = np.concatenate([p.values, p.limits[there], np.zeros(3 * len(p.cones))])
+    kinds = [clarabel.ZeroConeT(len(p.values)), clarabel.NonnegativeConeT(int(there.sum()))]
     kinds += [clarabel.SecondOrderConeT(3)] * len(p.cones)
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = _ACCURACY
-    hessian = sparse.csc_matrix(np.triu(p.hessian))
+    hessian = sparse.csc_matrix(np.diag(p.weights))
     solver = clarabel.DefaultSolver(hessian, p.linear, sparse.csc_matrix(matrix), right, kinds, settings)
     solution = solver.solve()
     if solution.status in _NONE_EXISTS:
         return Status.INFEASIBLE
     y = np.asarray(solution.x)
     return y if solution.status in _FOUND and np.isfinite(y).all() else Status.FAILED
-
-
-def largest_acceleration(distance: Array, speed: Array, horizon_s: float) -> Array:
-    """The largest constant acceleration that stays within a limit until a horizon > 0, shape (...).
-
-    The distance to the limit is in m or rad, the speed towards it in m/s or rad/s. From beyond the limit (a negative
-    distance): the largest that returns to it by the end of the horizon.
-    """
-    at_end = 2.0 * (distance - horizon_s * speed) / horizon_s**2
-    # Where the top of the parabola is before the end, the top may just reach the limit.
-    top_is_inside = (distance > 0.0) & (2.0 * distance < horizon_s * speed)
-    with np.errstate(over="ignore"):  # very close to the limit: the largest finite number
-        at_top = -(speed * speed) / (2.0 * np.where(distance > 0.0, distance, 1.0))
-    return np.asarray(np.where(top_is_inside, np.maximum(at_top, -np.finfo(np.float64).max), at_end))
-
-
-def predicted_position_rows(
-    dofs: NDArray[np.intp],
-    positions: Array,
-    velocities: Array,
-    lower: Array,
-    upper: Array,
-    horizon_s: float,
-    nv: int,
-) -> tuple[Array, Array]:
-    """Rows `G qacc <= g`, shapes (m, nv) and (m,), that keep joints in range until the horizon, upper limits first.
-
-    A bound at the present position does not cover the motion between samples. The acceleration is constant; there is
-    one row for each finite limit. Slides and hinges are given by their degrees of freedom among the model's nv, their
-    positions, velocities and ranges, shape (n,), m or rad; the horizon is a control step, or the time that stopping
-    takes if that is longer.
-    """
-    above, below, units = np.isfinite(upper), np.isfinite(lower), np.eye(nv)[dofs]
-    rows = np.concatenate([units[above], 0.0 - units[below]])  # 0 - x: no negative zeros
-    upwards = largest_acceleration((upper - positions)[above], velocities[above], horizon_s)
-    downwards = largest_acceleration((positions - lower)[below], -velocities[below], horizon_s)
-    return rows, np.concatenate([upwards, downwards])

@@ -18,11 +18,11 @@ from safe_wrappers.diagnosis.recording import (
     random_driver,
     record,
 )
-from safe_wrappers.diagnosis.symptoms import SYMPTOMS, Evidence, Measured
+from safe_wrappers.diagnosis.symptoms import SYMPTOMS
 from safe_wrappers.errors import SafeWrappersError, UnknownNameError, UnsupportedEnvError, whole_number
 from safe_wrappers.plants.env_checks import name_of
 
-__all__ = ["SYMPTOMS", "Diagnosis", "Evidence", "Finding", "diagnose"]
+__all__ = ["SYMPTOMS", "Diagnosis", "Finding", "diagnose"]
 
 POLICY: Final = "policy"
 
@@ -38,7 +38,6 @@ class Finding:
             where it could not be measured.
         threshold: From which on it is a symptom.
         unit: Of both.
-        evidence: Further numbers.
         code: Lines that put the wrapper that was tried around `env`; "" where none was.
         advice: What to do besides, or why no wrapper was tried.
         after: The figure in a second run with that wrapper, of the same driver; NaN where there was none.
@@ -50,7 +49,6 @@ class Finding:
     figure: float = math.nan
     threshold: float = math.nan
     unit: str = ""
-    evidence: Sequence[Evidence] = ()
     code: str = ""
     advice: str = ""
     after: float = math.nan
@@ -67,13 +65,12 @@ class Finding:
         return self.severity >= 1.0
 
     def lines(self) -> list[str]:
-        """For a terminal: the verdict, and of a symptom that is there the evidence and the lines to paste."""
+        """For a terminal: the verdict, and of a symptom that is there the lines to paste."""
         limit, figure = _amount(self.threshold, self.unit), _amount(self.figure, self.unit)
         words = self.missing or f"{self.title}: {figure} (a symptom from {limit} on)"
         verdict = "unknown" if self.missing else "FOUND" if self.present else "not found"
         lines = [f"  {verdict:9} {self.symptom:17} {words}"]
         if self.present:
-            lines += [f"      - {each.name}: {_amount(each.value, each.unit)}" for each in self.evidence]
             if self.code:
                 lines += [f"      {line}" for line in self.code.splitlines()]
                 lines.append(f"      with these lines: {_amount(self.after, self.unit)}")
@@ -124,8 +121,7 @@ class Diagnosis:
         """All of it; null for numbers that are not finite."""
         whole = asdict(self)
         for finding, plain in zip(self.findings, whole["findings"], strict=True):
-            evidence = [each._asdict() for each in finding.evidence]
-            plain.update(evidence=evidence, severity=finding.severity, present=finding.present)
+            plain.update(severity=finding.severity, present=finding.present)
         finite = json.loads(json.dumps(whole), parse_constant=lambda not_finite: None)
         return json.dumps(finite, indent=1) + "\n"
 
@@ -195,33 +191,31 @@ def diagnose(
 
 def _found(name: str, recordings: dict[str, Recording]) -> tuple[Finding, str]:
     """One symptom, and the driver by which it is judged."""
-    symptom, found, missing = SYMPTOMS[name], dict[str, Measured](), ""
-    if symptom.policies_only:
-        missing = "" if POLICY in recordings else "other drivers say nothing of it: give a policy"
-        recordings = {driver: one for driver, one in recordings.items() if driver == POLICY}
-    for driver, recording in recordings.items():
+    symptom, figures, missing = SYMPTOMS[name], dict[str, float](), ""
+    drivers = [POLICY] if symptom.policies_only else list(recordings)
+    for driver in drivers:
         try:
-            found[driver] = symptom.measure(recording)
+            figures[driver] = symptom.measure(recordings[driver])
+        except KeyError:
+            missing = "other drivers say nothing of it: give a policy"
         except NotMeasuredError as error:
-            missing = missing or str(error)
-    if not found:
+            missing = str(error)
+    if not figures:
         return Finding(name, symptom.title, missing=missing), ""
-    judged = POLICY if POLICY in found else max(found, key=lambda driver: found[driver][0])
-    figure, evidence = found[judged]
-    return Finding(name, symptom.title, figure, symptom.threshold, symptom.unit, evidence), judged
+    judged = POLICY if POLICY in figures else max(figures, key=figures.__getitem__)
+    return Finding(name, symptom.title, figures[judged], symptom.threshold, symptom.unit), judged
 
 
 def _treated(finding: Finding, recording: Recording, driver: Driver, seed: int) -> Finding:
     """The finding with the figure that its wrapper leaves; one that is refused is told, and why."""
     symptom = SYMPTOMS[finding.symptom]
-    treatment = symptom.treatment(recording)
-    told = replace(finding, advice=treatment.advice)
-    if treatment.wrap is None:
-        return told
     try:
+        treatment = symptom.treatment(recording)
+        finding = replace(finding, advice=treatment.advice)
+        if treatment.wrap is None:
+            return finding
         tried = treatment.wrap(recording.env)
-        after, _ = symptom.measure(record(tried, driver, len(recording.infos), seed))
-        return replace(told, code=treatment.code, after=after)
+        after = symptom.measure(record(tried, driver, len(recording.infos), seed))
+        return replace(finding, code=treatment.code, after=after)
     except (SafeWrappersError, NotMeasuredError) as error:
-        tool = treatment.code.partition("(")[0].rpartition(".")[2]
-        return replace(told, advice=f"{treatment.advice} {tool} was refused: {error}".strip())
+        return replace(finding, advice=f"{finding.advice} What treats it was refused: {error}".strip())

@@ -1,5 +1,6 @@
 """Recordings: what an env did under a driver, step by step."""
 
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError, finite_action
-from safe_wrappers.plants.env_checks import check_timing, wrappers_of
+from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 
 Env = gym.Env[Any, Any]
@@ -34,15 +35,9 @@ def random_driver(env: Env, seed: int) -> Driver:
 def attacking_driver(env: Env, seed: int) -> Driver:
     """Random corners of the action space, each held for 15 steps."""
     rng, (low, high) = np.random.default_rng(seed), box(env)
-
-    def actions() -> Iterator[Any]:
-        while True:
-            corner = np.where(rng.random(low.shape) < 0.5, low, high)
-            for _ in range(15):
-                yield corner.astype(env.action_space.dtype)
-
-    drawn = actions()
-    return lambda observation: next(drawn)
+    corners = (np.where(rng.random(low.shape) < 0.5, low, high) for _ in itertools.count())
+    actions = (corner.astype(env.action_space.dtype) for corner in corners for _ in range(15))
+    return lambda observation: next(actions)
 
 
 def policy_driver(policy: Any) -> Driver:
@@ -67,22 +62,13 @@ def box(env: Env) -> tuple[Array, Array]:
     return np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
 
 
-def _physics(env: Env) -> tuple[mujoco.MjModel, mujoco.MjData] | tuple[None, None]:
-    raw: Any = env.unwrapped
-    model, data = getattr(raw, "model", None), getattr(raw, "data", None)
-    known = isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData)
-    return (model, data) if known else (None, None)
-
-
 @dataclass
 class Recording:
     """What one driver did in k control steps. What MuJoCo says is empty for an env without it."""
 
     env: Env
-    control_dt: float  # s; NaN where nothing says it
     infos: list[dict[str, Any]]  # with those of a contact and a balance monitor, where the env allows them
     struck: list[tuple[str, str] | None]  # bodies with the largest force
-    touching: list[set[tuple[int, int]]]  # pairs of geoms, ids, after each step
     first: np.ndarray  # steps of episodes, shape (k,)
     terminated: np.ndarray
     executed: Array  # actions that the unwrapped env was given, shape (k, m)
@@ -97,7 +83,8 @@ class Recording:
     @property
     def model(self) -> mujoco.MjModel | None:
         """MuJoCo's model of the env; None where it has none."""
-        return _physics(self.env)[0]
+        model = getattr(self.env.unwrapped, "model", None)
+        return model if isinstance(model, mujoco.MjModel) else None
 
     @property
     def needed_model(self) -> mujoco.MjModel:
@@ -150,16 +137,14 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
     Raises:
         ActionError: The driver gave an action of another shape, or one that is not finite; the env never gets it.
     """
-    data, size = _physics(env)[1], math.prod(env.action_space.shape or ())
-    monitored: Any = gym.Wrapper(env)
-    for monitor in (ContactMonitor, BalanceMonitor):
-        with suppress(ConfigurationError):  # no MuJoCo, nothing that stands, a wrapper whose step is many
-            monitored = monitor(monitored)
-    contacts = next((layer for layer in wrappers_of(monitored) if isinstance(layer, ContactMonitor)), None)
+    data, size = getattr(env.unwrapped, "data", None), math.prod(env.action_space.shape or ())
+    data = data if isinstance(data, mujoco.MjData) else None
+    contacts, monitored = None, gym.Wrapper(env)
+    with suppress(ConfigurationError):  # no MuJoCo, nothing that stands, a wrapper whose step is many
+        contacts = monitored = ContactMonitor(monitored)
+        monitored = BalanceMonitor(monitored)
     rows: list[tuple[Any, ...]] = []
-    observation, over, episode, control_dt = None, True, 0, math.nan
-    with suppress(ConfigurationError):
-        control_dt = check_timing(env, None)
+    observation, over, episode = None, True, 0
     with _spied(monitored) as spy, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         for _ in range(steps):
@@ -169,21 +154,16 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
                 getattr(driver, "reset", lambda: None)()
                 episode += 1
             action = finite_action(driver(observation), size)
-            before = (0.0, 0) if data is None else (data.time, _warnings(data))
+            before = _divergences(data)
             observation, _, terminated, truncated, info = monitored.step(action)
             over = bool(terminated or truncated)
             struck = None if contacts is None else contacts.peak_bodies
-            pairs, qpos, qvel, diverged = set(), np.empty(0), np.empty(0), False
-            if data is not None:
-                diverged = _warnings(data) > before[1]
-                control_dt = control_dt if diverged else data.time - before[0]
-                touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
-                pairs = {(int(a), int(b)) for a, b in touching}
-                qpos, qvel = data.qpos.copy(), data.qvel.copy()
-            rows.append((info, struck, pairs, first, terminated, spy.given, qpos, qvel, diverged))
-    infos, bodies, touched, *arrays = zip(*rows, strict=True)
-    return Recording(env, control_dt, list(infos), list(bodies), list(touched), *map(np.array, arrays))
+            diverged = _divergences(data) > before
+            state = (np.empty(0), np.empty(0)) if data is None else (data.qpos.copy(), data.qvel.copy())
+            rows.append((info, struck, first, terminated, spy.given, *state, diverged))
+    infos, bodies, *arrays = zip(*rows, strict=True)
+    return Recording(env, list(infos), list(bodies), *map(np.array, arrays))
 
 
-def _warnings(data: mujoco.MjData) -> int:
-    return int(sum(data.warning[kind].number for kind in _DIVERGED))
+def _divergences(data: mujoco.MjData | None) -> int:
+    return 0 if data is None else int(sum(data.warning[kind].number for kind in _DIVERGED))

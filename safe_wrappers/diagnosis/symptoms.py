@@ -5,15 +5,13 @@ from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.constraints import ImpactSpeedLimit, JointPositionLimit, PredictiveShield
 from safe_wrappers.constraints.joints import driven_joints
 from safe_wrappers.control.vehicle import slip_ratio
 from safe_wrappers.diagnosis.recording import Env, NotMeasuredError, Recording, box
 from safe_wrappers.errors import Array, ConfigurationError
-from safe_wrappers.plants import SimulatorPlant
-from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.plants.env_checks import check_timing, name_of
 from safe_wrappers.plants.mujoco.model import HINGE, fixed_bodies, weight_n
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
@@ -23,21 +21,7 @@ from safe_wrappers.wrappers.recipes import recipe_of
 
 PRESSED = 0.02
 """Share of a joint's range by which it is beyond its stop."""
-_PLANE, _FIELD, _SPHERE, _CYLINDER = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("PLANE", "HFIELD", "SPHERE", "CYLINDER")
-)
-
-
-class Evidence(NamedTuple):
-    """One measured number."""
-
-    name: str
-    value: float
-    unit: str
-
-
-Measured = tuple[float, list[Evidence]]
-"""A symptom's figure for one driver, in the symptom's unit, and further numbers."""
+_SPHERE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 
 
 class Treatment(NamedTuple):
@@ -54,7 +38,7 @@ class Symptom(NamedTuple):
     title: str
     threshold: float  # from which on it is a symptom, in `unit`
     unit: str  # "share" is one of control steps
-    measure: Callable[[Recording], Measured]  # or a `NotMeasuredError`
+    measure: Callable[[Recording], float]  # the figure of one driver, in `unit`; or a `NotMeasuredError`
     treatment: Callable[[Recording], Treatment]
     policies_only: bool = False  # random and attacking drivers have this symptom of themselves
 
@@ -69,33 +53,27 @@ def _wrapped(wrapper: Callable[..., Env], advice: str = "", **arguments: Any) ->
     return Treatment(code, lambda env: wrapper(env, **arguments), advice)
 
 
-def _filtered(
-    constraint: Callable[..., Any], advice: str = "", simulated: bool = False, **arguments: Any
-) -> Treatment:
+def _filtered(constraint: Callable[..., Any], advice: str = "", **arguments: Any) -> Treatment:
     """A filter with one constraint of `safe_wrappers.constraints`; arguments as of `_wrapped`."""
     limit = f"sw.constraints.{constraint.__name__}({', '.join(_typed(arguments))})"
-    plant = ", plant=sw.SimulatorPlant()" if simulated else ""
     return Treatment(
-        f"limit = {limit}\nenv = sw.CBFActionFilter(env, [limit]{plant})",
-        lambda env: CBFActionFilter(
-            env, [constraint(**arguments)], plant=SimulatorPlant() if simulated else None
-        ),
+        f"limit = {limit}\nenv = sw.CBFActionFilter(env, [limit])",
+        lambda env: CBFActionFilter(env, [constraint(**arguments)]),
         advice,
     )
 
 
-def _is_protected_by_recipe(env: Env) -> bool:
-    """Whether `protect` has a recipe for the env, and accepts what is around it."""
+def _recommended(env: Env) -> list[str]:
+    """Kinds of the constraints that `protect` has for the env; none where it refuses what is around it."""
     if env.spec is None or recipe_of(env.spec.id) is None:
-        return False
+        return []
     try:
-        protect(env)
+        return [type(constraint).__name__ for constraint in protect(env).constraints]
     except ConfigurationError:
-        return False
-    return True
+        return []
 
 
-# limits: declared costs, joints that press their stops, contacts with what is fixed
+# limits: declared costs, joints that press their stops
 
 
 def _beyond(recording: Recording) -> tuple[list[str], Array]:
@@ -109,47 +87,26 @@ def _beyond(recording: Recording) -> tuple[list[str], Array]:
     return [model.joint(j).name for j in joints], np.maximum(low - position, position - high) / (high - low)
 
 
-def _touches_fixed(recording: Recording) -> NDArray[np.bool_]:
-    """Whether the machine touches something fixed that is no ground, shape (k,)."""
-    model = recording.model
-    if model is None:
-        return np.zeros(len(recording.first), dtype=bool)
-    solid = fixed_bodies(model)[model.geom_bodyid] & ~np.isin(model.geom_type, (_PLANE, _FIELD))
-    roots = model.body_rootid[model.jnt_bodyid[driven_joints(model)]]
-    machine = np.isin(model.body_rootid[model.geom_bodyid], roots) & ~solid
-    hit = np.outer(solid, machine) | np.outer(machine, solid)
-    return np.array([any(hit[pair] for pair in pairs) for pairs in recording.touching])
-
-
-def _measure_limits(recording: Recording) -> Measured:
+def _measure_limits(recording: Recording) -> float:
+    """The share of steps with a cost, or with a driven joint beyond its stop."""
     cost = recording.of_info("cost")
-    judged = not np.isnan(cost).all()
-    if not judged and recording.model is None:
+    if np.isnan(cost).all() and recording.model is None:
         raise NotMeasuredError(
             "the env reports no cost in info, and has no MuJoCo model whose limits could be read"
         )
-    costs, hits = cost > 0.0, _touches_fixed(recording)
     pressed = (_beyond(recording)[1] > PRESSED).any(axis=1)
-    evidence = [
-        Evidence("steps with a cost", float(costs.mean()) if judged else np.nan, "share"),
-        Evidence("steps with a driven joint pressed beyond its stop", float(pressed.mean()), "share"),
-        Evidence("steps in contact with something fixed, not the ground", float(hits.mean()), "share"),
-    ]
-    return float((costs | pressed | hits).mean()), evidence
+    return float(((cost > 0.0) | pressed).mean())
 
 
 def _treat_limits(recording: Recording) -> Treatment:
-    if _is_protected_by_recipe(recording.env):
+    if _recommended(recording.env):
         return _wrapped(protect)
     names, beyond = _beyond(recording)
     if (beyond > PRESSED).any():
         pressed = [name for name, shares in zip(names, beyond.T, strict=True) if shares.max() > 0.0]
         return _filtered(JointPositionLimit, joints=pressed, margin=0.0, horizon=recording.braking_horizon)
-    if (recording.of_info("cost") > 0.0).any():
-        advice = "Choose a backup that stops your machine, and a horizon that is as long as it takes."
-        return _filtered(PredictiveShield, advice, simulated=True, h="cost", horizon=20, backup="zero")
-    advice = "Say where the fixed things are: Workspace(keep_out=[...]), Clearance or PredictiveShield."
-    return Treatment("", None, advice)
+    advice = "Choose a backup that stops your machine, and a horizon that is as long as it takes."
+    return _filtered(PredictiveShield, advice, h="cost", horizon=20, backup="zero")
 
 
 # command_steps: commands that spike
@@ -163,17 +120,15 @@ def command_steps(recording: Recording) -> Array:
     return np.asarray(np.where(recording.first, 0.0, steps))
 
 
-def _measure_steps(recording: Recording) -> Measured:
+def _measure_steps(recording: Recording) -> float:
     """The largest command steps, but for one in a hundred control steps."""
-    steps = command_steps(recording)
-    evidence = [Evidence("median command step", float(np.median(steps)), "of the range")]
-    return float(np.percentile(steps, 99.0)), evidence
+    return float(np.percentile(command_steps(recording), 99.0))
 
 
 def _treat_steps(recording: Recording) -> Treatment:
     """A handover of single actions that lets commands change by 5 % of their range in a control step."""
     low, high = box(recording.env)
-    rate = float(f"{0.05 * float((high - low).min()) / recording.control_dt:.4g}")
+    rate = float(f"{0.05 * float((high - low).min()) / check_timing(recording.env):.4g}")
     chunks = "If the policy gives chunks, pass them whole: ChunkHandover(env, chunk_size=..., execution_horizon=...)."
     return _wrapped(ChunkHandover, chunks, chunk_size=1, execution_horizon=1, rate_limit=rate)
 
@@ -181,32 +136,26 @@ def _treat_steps(recording: Recording) -> Treatment:
 # contact_forces: peak forces against the machine's weight
 
 
-def _measure_forces(recording: Recording) -> Measured:
+def _measure_forces(recording: Recording) -> float:
     """The largest force between two bodies above the usual one, in weights of all that moves."""
     weight = weight_n(recording.needed_model)
     forces = recording.of_info("contact/peak_force")
     if np.isnan(forces).all():
         raise NotMeasuredError("no ContactMonitor goes around this env: a step of its outer wrapper is many")
-    bad = recording.diverged | ~np.isfinite(np.column_stack([recording.qpos, recording.qvel])).all(axis=1)
-    if bad.any():
-        return np.inf, [Evidence("steps in which the simulation diverged", float(bad.sum()), "")]
+    finite = np.isfinite(recording.qpos).all() and np.isfinite(recording.qvel).all()
+    if recording.diverged.any() or not finite:
+        return np.inf
     recording.check_replays()
     # What presses all the time, maybe where it cannot move, is no impact.
-    peak = max(float(np.nanmax(forces) - np.nanmedian(forces)), 0.0)
-    evidence = [
-        Evidence("largest force between two bodies, above the usual one", peak, "N"),
-        Evidence("weight of what moves", weight, "N"),
-        Evidence("deepest penetration", float(np.nanmax(recording.of_info("contact/penetration"))), "m"),
-    ]
-    return peak / weight, evidence
+    return max(float(np.nanmax(forces) - np.nanmedian(forces)), 0.0) / weight
 
 
 def _treat_forces(recording: Recording) -> Treatment:
-    """`protect`, where it keeps the machine off what is fixed; else a limit of the pair that hit hardest."""
+    """`protect`, where it keeps the machine clear; else a limit of the pair that hit hardest."""
     if recording.diverged.any():
         advice = "The simulation diverged: a shorter timestep, softer contacts, or weaker actuators."
         return Treatment("", None, advice)
-    if _touches_fixed(recording).any() and _is_protected_by_recipe(recording.env):
+    if any(kind.endswith("Clearance") for kind in _recommended(recording.env)):
         return _wrapped(protect)
     forces = np.nan_to_num(recording.of_info("contact/peak_force"), nan=0.0)
     k = int(np.argmax(forces))
@@ -235,17 +184,15 @@ def wheels(model: mujoco.MjModel) -> dict[int, float]:
     found, data = {}, mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for j in driven_joints(model):
-        steep = abs(data.xaxis[j, 2]) >= 0.5
-        if model.jnt_type[j] != HINGE or model.jnt_limited[j] or steep or not model.joint(j).name:
-            continue
+        axle = data.xaxis[j]
+        turns = model.jnt_type[j] == HINGE and not model.jnt_limited[j] and abs(axle[2]) < 0.5
         for g in np.flatnonzero(model.geom_bodyid == model.jnt_bodyid[j]):
-            axis = np.zeros(3)
-            mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), model.geom_quat[g])
+            along = abs(data.geom_xmat[g].reshape(3, 3)[:, 2] @ axle) > 0.99
+            round_ = model.geom_type[g] == _SPHERE or (model.geom_type[g] == _CYLINDER and along)
             touches = model.geom_contype[g] or model.geom_conaffinity[g]
-            off_axle = np.linalg.norm(np.cross(model.geom_pos[g] - model.jnt_pos[j], model.jnt_axis[j]))
-            aligned = model.geom_type[g] == _CYLINDER and abs(axis @ model.jnt_axis[j]) > 0.99
+            off_axle = np.linalg.norm(np.cross(data.geom_xpos[g] - data.xanchor[j], axle))
             radius = float(model.geom_size[g, 0])
-            if touches and off_axle < 0.05 * radius and (aligned or model.geom_type[g] == _SPHERE):
+            if turns and round_ and touches and off_axle < 0.05 * radius and model.joint(j).name:
                 found[j] = radius
     return found
 
@@ -270,14 +217,9 @@ def slips(recording: Recording) -> Array:
     return ratio
 
 
-def _measure_slip(recording: Recording) -> Measured:
+def _measure_slip(recording: Recording) -> float:
     """The share of steps with a slip above 0.2, beyond the peak of traction on all usual grounds."""
-    worst = np.abs(slips(recording)).max(axis=1)
-    evidence = [
-        Evidence("95th percentile of the largest slip", float(np.percentile(worst, 95.0)), ""),
-        Evidence("largest slip", float(worst.max()), ""),
-    ]
-    return float((worst > 0.2).mean()), evidence
+    return float((np.abs(slips(recording)).max(axis=1) > 0.2).mean())
 
 
 def _treat_slip(recording: Recording) -> Treatment:
@@ -288,7 +230,7 @@ def _treat_slip(recording: Recording) -> Treatment:
 # balance: feet that slide or tip
 
 
-def _measure_balance(recording: Recording) -> Measured:
+def _measure_balance(recording: Recording) -> float:
     """The share of steps with a foot at the edge of its friction cone, or outside of the support polygon."""
     if recording.model is not None and wheels(recording.model):
         raise NotMeasuredError("it rolls: its wheels are judged by their slip")
@@ -300,13 +242,7 @@ def _measure_balance(recording: Recording) -> Measured:
     recording.check_replays()
     if not ((friction == 0.0).any() or recording.terminated.any()):
         raise NotMeasuredError(f"{name_of(recording.env)} never left the ground: it does not balance")
-    sliding, tipping = friction >= 1.0, zmp < 0.0
-    evidence = [
-        Evidence("steps with a contact at the edge of its friction cone", float(sliding.mean()), "share"),
-        Evidence("steps with the zero moment point outside the support", float(tipping.mean()), "share"),
-        Evidence("falls per 1,000 steps", 1e3 * float(recording.terminated.mean()), ""),
-    ]
-    return float((sliding | tipping).mean()), evidence
+    return float(((friction >= 1.0) | (zmp < 0.0)).mean())
 
 
 SYMPTOMS: Final = {

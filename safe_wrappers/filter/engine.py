@@ -80,17 +80,6 @@ class SafetyFilter:
                     c.slack(self.last)
             self._loaded = True
 
-    def take_over(self, before: "SafetyFilter") -> None:
-        """Go on in the episode of another filter of the same plant and the same kinds of constraints.
-
-        It is to be observed next. Before an episode there is nothing to go on with.
-        """
-        for new, old in zip(self.bound, before.bound, strict=True):
-            if old.max_decrease is None:  # it was broken
-                new.max_decrease = None
-        if hasattr(before, "memories"):
-            self.memories, self.last, self.margin = before.memories, before.last, before.margin
-
     def observe(self) -> None:
         """Take the env's present state, and `margin` from it."""
         plant = self.plant

@@ -59,8 +59,7 @@ class AnalyticPlant(Plant):
             self.control_dt = self._given_control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._env: Any = None
-        self._drift: Array | None = None
-        self._effect: Array | None = None
+        self._affine: tuple[Array, Array] | None = None
         self._pending: deque[Array] = deque()
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
@@ -77,7 +76,7 @@ class AnalyticPlant(Plant):
         x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
         if self.delay_s > 0.0:
             x = self._after_delay(x)
-        self.state, self._drift, self._effect = x, None, None
+        self.state, self._affine = x, None
 
     def executed(self, control: Array | None) -> None:
         if control is None:
@@ -128,25 +127,27 @@ class AnalyticPlant(Plant):
         return Trajectory(control, np.array([x + half * k3, end, x + hold * k1]))
 
     def _rate(self, x: Array, control: Array) -> Array:
-        return np.asarray(self._f(x), dtype=np.float64) + np.asarray(self._g(x), dtype=np.float64) @ control
+        return self.drift(x) + self.effect(x) @ control
+
+    def _at_state(self) -> tuple[Array, Array]:
+        """F and g at the state, checked."""
+        if self._affine is None:
+            self._affine = self.drift(self.state), self.effect(self.state)
+            n, found = self.state.size, tuple(part.shape for part in self._affine)
+            if found != ((n,), (n, self.lower.size)):
+                raise ConfigurationError(
+                    f"f and g must return the shapes (states,) and (states, controls) = {(n,)} and "
+                    f"{(n, self.lower.size)}, got {found[0]} and {found[1]}"
+                )
+        return self._affine
 
     @property
     def f(self) -> Array:
-        if self._drift is None:
-            self._drift, expected = self.drift(self.state), self.state.shape
-            if self._drift.shape != expected:
-                found = self._drift.shape
-                raise ConfigurationError(f"f must return the shape of the state {expected}, got {found}")
-        return self._drift
+        return self._at_state()[0]
 
     @property
     def g(self) -> Array:
-        if self._effect is None:
-            self._effect, expected = self.effect(self.state), (self.state.size, self.lower.size)
-            found = self._effect.shape
-            if found != expected:
-                raise ConfigurationError(f"g must return shape (states, controls) = {expected}, got {found}")
-        return self._effect
+        return self._at_state()[1]
 
     def drift(self, x: Array) -> Array:
         return np.asarray(self._f(x), dtype=np.float64)

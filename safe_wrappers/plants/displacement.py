@@ -8,7 +8,7 @@ import numpy as np
 
 from safe_wrappers.errors import Array, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import moves_by_displacement, welds
-from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Recorder
+from safe_wrappers.plants.mujoco.forecast import Recorder
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 # The envs add the turn to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum.
@@ -112,17 +112,6 @@ class DisplacementPlant(MujocoPlant):
     def _load_to_step(self) -> None:
         super()._load_to_step()
         self.data.xpos[self._body], self.data.xquat[self._body] = self._pose[:3], self._pose[3:]
-
-    def executed(self, control: Array | None) -> None:
-        super().executed(self._acting(control))
-
-    def rollout(self, control: Array | None, horizon: int = 1, euler: bool = False) -> MujocoTrajectory:
-        """A displacement, shape (4,), for one control interval, then none."""
-        return super().rollout(self._acting(control), horizon, euler)
-
-    def _acting(self, control: Array | None) -> Array | None:
-        """What of a control has an effect: of a blocked gripper the last entry has none."""
-        return np.append(control[:3], 0.0) if self.blocked and control is not None else control
 
     def _linearise(self) -> None:
         mujoco.mj_forward(self.model, self.data)

@@ -53,9 +53,7 @@ def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
             )
 
 
-def check_timing(
-    env: gym.Env[Any, Any], control_dt: float | None, remedy: str = "pass control_dt, in seconds"
-) -> float:
+def check_timing(env: gym.Env[Any, Any], control_dt: float | None = None) -> float:
     """How long one action is held, s: the env's `dt`, or `control_dt` where the env has none; both must agree."""
     given = None if control_dt is None else positive("control_dt", control_dt, "s")
     try:
@@ -63,7 +61,8 @@ def check_timing(
     except (AttributeError, TypeError, ValueError):
         if given is None:
             raise ConfigurationError(
-                f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): {remedy}"
+                f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass control_dt, in "
+                "seconds, to the plant, or give the env one, such as env.unwrapped.dt = 0.05"
             ) from None
         return given
     hold = positive("the env's dt", dt, "s") if given is None else given

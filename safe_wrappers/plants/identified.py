@@ -6,7 +6,6 @@ prediction); the finite-sample rank as in Lei et al., *Distribution-Free Predict
 """
 
 import copy
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -20,7 +19,7 @@ from safe_wrappers.errors import (
     Array,
     ConfigurationError,
     UnsupportedEnvError,
-    float_array,
+    finite_array,
     positive,
     whole_number,
 )
@@ -84,41 +83,38 @@ def checked_episodes(given: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[Episo
     Raises:
         ConfigurationError: Other shapes, or numbers that are not finite; the message says in which episode.
     """
-    if isinstance(given, str | dict | np.ndarray) or not isinstance(given, Sequence) or not given:
+    if not isinstance(given, list | tuple) or not given:
         raise ConfigurationError(
             f"episodes is a list of (observations, actions), as log_steps returns it; got {given!r}"
         )
     found: list[Episode] = []
     for index, one in enumerate(given):
-        if not isinstance(one, Sequence) or isinstance(one, str) or len(one) != 2:
+        if not isinstance(one, list | tuple) or len(one) != 2:
             raise ConfigurationError(f"episode {index} is no pair (observations, actions): {one!r}")
-        observations = float_array(f"observations of episode {index}", one[0])
-        actions = float_array(f"actions of episode {index}", one[1])
-        episode = Episode(observations, actions[:, None] if actions.ndim == 1 else actions)
-        widths, shapes = [[part.shape[1:] for part in one] for one in ((found or [episode])[0], episode)]
-        if not (
-            shapes == widths
-            and all(len(w) == 1 for w in widths)
-            and len(observations) == len(actions) + 1 > 1
-        ):
+        names = (f"{part} of episode {index}" for part in Episode._fields)
+        episode = Episode(*map(finite_array, names, one))
+        found.append(episode)
+        widths, wanted = ([part.shape[1:] for part in some] for some in (episode, found[0]))
+        steps = len(episode.actions)
+        plain = all(part.ndim == 2 for part in episode) and widths == wanted
+        if not plain or len(episode.observations) != steps + 1 or not steps:
             raise ConfigurationError(
                 f"episode {index}: expected observations of shape (T + 1, n) and actions of shape (T, m) with T of at"
-                f" least 1, and n and m as in episode 0, got {observations.shape} and {episode.actions.shape}"
+                f" least 1, and n and m as in episode 0, got {episode.observations.shape} and {episode.actions.shape}"
             )
-        if not all(np.isfinite(part).all() for part in episode):
-            raise ConfigurationError(f"episode {index} has numbers that are not finite; end it before them")
-        found.append(episode)
     return found
 
 
-Model = Callable[[Array, Array], Array]
-"""The states after a step, shape (..., n), from states, shape (..., n), and controls, shape (..., m)."""
-
-
-def linear_model(weights: Array, states: Array, controls: Array) -> Array:
-    """`x + [x, u, 1] @ weights`, affine in state and control, with weights of shape (n + m + 1, n)."""
-    n = states.shape[-1]
-    return np.asarray(states + states @ weights[:n] + controls @ weights[n:-1] + weights[-1])
+def fitted(episodes: Sequence[Episode]) -> Array:
+    """Weights W, shape (n + m + 1, n), of `x+ = x + [x, u, 1] @ W`, by least squares; the smallest that fit best."""
+    inputs = np.concatenate([np.hstack([o[:-1], a, np.ones((len(a), 1))]) for o, a in episodes])
+    if len(inputs) < inputs.shape[1]:
+        raise ConfigurationError(
+            f"{len(inputs)} steps are left for the fit of {inputs.shape[1]} numbers per observation: give more "
+            "episodes"
+        )
+    changes = np.concatenate([np.diff(one.observations, axis=0) for one in episodes])
+    return np.asarray(np.linalg.lstsq(inputs, changes, rcond=None)[0], dtype=np.float64)
 
 
 def allowed_misses(scores: int, miss_rate: float) -> int:
@@ -162,7 +158,6 @@ class IdentifiedPlant(RolloutPlant):
     Info, at every step: ``plant/coverage``.
 
     Attributes:
-        model: The fitted one, affine: a function of states, shape (..., n), and controls, shape (..., m).
         fit_episodes: Those that it was fitted to.
         held_out_episodes: Those that margins come from.
 
@@ -205,19 +200,16 @@ class IdentifiedPlant(RolloutPlant):
         self.fit_episodes = [every[i] for i in order[calibrating:]]
         # One window per episode: windows of one episode are alike, and no further independent scores.
         self._places, self._scale_places = places[:calibrating], places[calibrating:]
-        inputs = np.concatenate([np.hstack([o[:-1], a, np.ones((len(a), 1))]) for o, a in self.fit_episodes])
-        changes = np.concatenate([np.diff(one.observations, axis=0) for one in self.fit_episodes])
-        if len(inputs) < inputs.shape[1]:
-            raise ConfigurationError(
-                f"{len(inputs)} steps are left for the fit of {inputs.shape[1]} numbers per observation: give more "
-                "episodes"
-            )
-        # Of many weights that fit equally well, the smallest.
-        weights = np.asarray(np.linalg.lstsq(inputs, changes, rcond=None)[0], dtype=np.float64)
-        self.model: Model = functools.partial(linear_model, weights)
+        self._weights = fitted(self.fit_episodes)
         self._watched: Measure | None = None
         self._judged = self._missed = 0
         self._least: float | None = None  # of the watched measure after the step under way
+
+    def model(self, states: Array, controls: Array) -> Array:
+        """The fitted states after a step, shape (..., n), from states, (..., n), and controls, (..., m)."""
+        n = states.shape[-1]
+        weights = self._weights
+        return np.asarray(states + states @ weights[:n] + controls @ weights[n:-1] + weights[-1])
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         refuse_changed_actions(env)

@@ -46,6 +46,9 @@ class Plant(Model):
             predicted over it with the commands in flight.
         observation_id: Number of observations so far.
         model_version: Number of changes of the model, after each of which a filter binds its constraints anew.
+        has_acceleration: Whether a control acts as a force, so that `f` and `g` are known.
+        can_brake: Whether it knows which states are velocities, as a braking fallback needs.
+        simulates: Whether it rolls out actions and policies, as `RolloutPlant` does.
     """
 
     control_dt: float
@@ -53,11 +56,8 @@ class Plant(Model):
     observation_id: int = 0
     model_version: int = 0
     has_acceleration: ClassVar[bool] = True
-    """Whether a control acts as a force, so that `f` and `g` are known."""
     can_brake: ClassVar[bool] = False
-    """Whether it knows which states are velocities, as a braking fallback needs."""
     simulates: ClassVar[bool] = False
-    """Whether it rolls out actions and policies, as `RolloutPlant` does."""
 
     @property
     @abstractmethod

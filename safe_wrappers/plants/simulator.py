@@ -72,27 +72,30 @@ class Rollout:
 
 
 class RolloutPlant(Plant):
-    """A plant that predicts by rollouts alone; it has neither f nor g."""
+    """A plant that predicts by rollouts alone; it has neither f nor g.
+
+    Attributes:
+        simulates_env: Whether a `View` of a rollout has the env and its info; else only the observation.
+        exact: Whether rollouts were checked to be what the env does, its noise included.
+        substeps: Physics substeps of a control step that are known of.
+        discrete: Whether actions are whole numbers.
+        judges_substeps: Whether rollouts can be measured at each of them, by a measure of the env alone.
+        view: What was returned last by the env's reset or step.
+    """
 
     has_acceleration: ClassVar[bool] = False
     simulates: ClassVar[bool] = True
     simulates_env: ClassVar[bool] = True
-    """Whether a `View` of a rollout has the env and its info; else only the observation."""
     exact: bool = False
-    """Whether rollouts were checked to be what the env does, its noise included."""
     substeps: int = 1
-    """Physics substeps of a control step that are known of."""
     discrete: bool = False
-    """Whether actions are whole numbers."""
     judges_substeps: bool = False
-    """Whether rollouts can be measured at each of them, by a measure of the env alone."""
     lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
     upper: Array = np.zeros(0)
     delay_s = 0.0
+    view: View
     _env: gym.Env[Any, Any]
     _control_dt: float | None = None
-    view: View
-    """What was returned last by the env's reset or step."""
 
     def __init__(self, control_dt: float | None) -> None:
         self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")

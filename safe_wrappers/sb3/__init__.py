@@ -6,11 +6,7 @@ except ImportError as missing:
     needs = "safe_wrappers.sb3 needs stable_baselines3 and torch: pip install 'safe-wrappers[train]'"
     raise ImportError(needs) from missing
 
-from safe_wrappers.sb3.callbacks import (
-    InterventionCallback,
-    LagrangianMultiplier,
-    MarginCurriculum,
-)
+from safe_wrappers.sb3.callbacks import InterventionCallback, LagrangianMultiplier
 from safe_wrappers.sb3.replay_buffers import (
     ExecutedActionDictReplayBuffer,
     ExecutedActionHerReplayBuffer,
@@ -23,5 +19,4 @@ __all__ = [
     "ExecutedActionReplayBuffer",
     "InterventionCallback",
     "LagrangianMultiplier",
-    "MarginCurriculum",
 ]

@@ -1,10 +1,7 @@
-"""Callbacks: what the filter did in the log, a price on cost, a margin that changes."""
-
-from typing import Any
+"""Callbacks: what the filter did in the log, and a price on cost."""
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from safe_wrappers import info as keys
@@ -64,8 +61,8 @@ class LagrangianMultiplier(BaseCallback):
 
     Raises:
         ConfigurationError: Numbers outside these ranges; in training: an env that reports no cost or one that is
-            not finite, hindsight replay, `ExecutedActionReplayBuffer(mode="both")`, or an off-policy learner behind a
-            VecNormalize: they replay the env's own rewards.
+            not finite, hindsight replay, or an off-policy learner behind a VecNormalize: they replay the env's own
+            rewards.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -86,16 +83,12 @@ class LagrangianMultiplier(BaseCallback):
         return float(getattr(self.model, "lagrangian_multiplier", 0.0))
 
     def _on_training_start(self) -> None:
-        if isinstance(self.model, OffPolicyAlgorithm) and self.model.get_vec_normalize_env() is not None:
+        replays = getattr(self.model, "replay_buffer", None)
+        scaled = replays is not None and self.model.get_vec_normalize_env() is not None
+        if scaled or isinstance(replays, HerReplayBuffer):
             raise ConfigurationError(
-                "LagrangianMultiplier: an off-policy learner behind a VecNormalize stores the env's own rewards,"
-                " without a price on cost; leave VecNormalize out, or use an on-policy learner"
-            )
-        buffer: Any = getattr(self.model, "replay_buffer", None)
-        if isinstance(buffer, HerReplayBuffer) or getattr(buffer, "mode", "") == "both":
-            raise ConfigurationError(
-                "LagrangianMultiplier: hindsight replay and mode 'both' have rewards without a price on cost; use"
-                " another replay buffer"
+                "LagrangianMultiplier: off-policy learners with hindsight replay or a VecNormalize learn from"
+                " the env's own rewards, without a price on cost; leave that out, or use an on-policy learner"
             )
         self._episode_cost = np.zeros(self.training_env.num_envs)
 
@@ -119,63 +112,4 @@ class LagrangianMultiplier(BaseCallback):
             self._episode_cost[i] = 0.0
         self.model.lagrangian_multiplier = float(multiplier)  # type: ignore[attr-defined]
         self.logger.record("interventions/lagrangian_multiplier", multiplier)
-        return True
-
-
-class MarginCurriculum(BaseCallback):
-    """Sets the margin that a `CBFActionFilter` adds to those of its constraints, between rollouts.
-
-    Linear in the share of the training's steps, in hundredths, until the share `until`; constant from there. The
-    share is that of the model's own step count: a training that was saved and goes on has the margin of the place
-    where it stands. Evaluation envs keep theirs.
-
-    Args:
-        start: At the first step, in the constraints' own unit (m, rad/s, ...), at least 0: constraints keep at least
-            their own margins.
-        end: From `until` on, likewise.
-        until: Share of the training's steps, above 0 and at most 1.
-
-    Raises:
-        ConfigurationError: Numbers outside these ranges; at the training's start: an env without such a filter.
-
-    Example:
-        >>> import gymnasium as gym, safe_wrappers as sw
-        >>> from stable_baselines3 import PPO
-        >>> from safe_wrappers.sb3 import MarginCurriculum
-        >>> env = sw.protect(gym.make("Reacher-v5"))
-        >>> model = PPO("MlpPolicy", env, n_steps=64, n_epochs=1, device="cpu")
-        >>> _ = model.learn(256, callback=MarginCurriculum(start=1.0, end=0.0, until=0.5))
-    """
-
-    def __init__(self, start: float, end: float = 0.0, until: float = 1.0) -> None:
-        super().__init__()
-        self.start = non_negative("start", start, "the constraints' own units")
-        self.end = non_negative("end", end, "the constraints' own units")
-        self.until = positive("until", until, "a share of the training's steps")
-        if self.until > 1.0:
-            raise ConfigurationError(f"until is a share of the training's steps, at most 1, got {until}")
-        self._margin: float | None = None
-
-    def margin(self, share: float) -> float:
-        """The added margin when this share of the training's steps is done."""
-        # In a hundred steps: each binds the constraints anew.
-        done = min(int(100 * share / self.until + 1e-9), 100) / 100
-        return (1.0 - done) * self.start + done * self.end
-
-    def _on_training_start(self) -> None:
-        self._margin = None
-        if not self.training_env.has_attr("added_margin"):
-            raise ConfigurationError(
-                "MarginCurriculum needs envs in a CBFActionFilter, such as sw.protect(env)"
-            )
-
-    def _on_rollout_start(self) -> None:
-        # SB3's total is that of the whole training, of one that goes on, too.
-        margin = self.margin(self.model.num_timesteps / self.model._total_timesteps)
-        if margin != self._margin:
-            self.training_env.env_method("set_margin", margin)
-            self._margin = margin
-        self.logger.record("interventions/added_margin", margin)
-
-    def _on_step(self) -> bool:
         return True

@@ -20,7 +20,7 @@ from safe_wrappers.plants import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, action_array
-from safe_wrappers.wrappers.serialize import constraint_from, plain_data
+from safe_wrappers.wrappers.serialize import constraint_from
 from safe_wrappers.wrappers.stack import Layer
 
 SAFE_TOLERANCE = 1e-6
@@ -56,7 +56,6 @@ class CBFActionFilter(LayerWrapper):
 
     Attributes:
         filter: The `SafetyFilter` that decides; `filter.bound` are the constraints on the plant.
-        added_margin: Added to every constraint's own; `set_margin` changes it.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         warned: What has been warned of: "nonfinite", "clipped", "mismatch", and "unsafe" until the next reset.
         started: Whether there is an episode: the last reset has not failed.
@@ -85,21 +84,19 @@ class CBFActionFilter(LayerWrapper):
         fallback: str | FallbackFunction = "brake",
         margin: float = 0.0,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)
         self._take_action_space(env)
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
         own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
-        self.added_margin = margin = non_negative("margin", margin, "the constraints' own units")
-        self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
-        self._own = own
+        if margin := non_negative("margin", margin, "the constraints' own units"):
+            own = [c.widened(margin) for c in own]
         self.constraint_names = _unique([type(c).__name__ for c in own])
         self.plant: Plant = plant if plant is not None else default_plant(env, own)
         self.plant.bind(env)
-        self._fallback = fallback
-        self.filter = self._filter(margin)
+        of_actions = self._low, self._high, self._dtype, self._search
+        self.filter = SafetyFilter(self.plant, own, fallback, *of_actions)
         self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
         self._deciding = threading.RLock()
@@ -126,76 +123,41 @@ class CBFActionFilter(LayerWrapper):
             vars(given).update({k: v for k, v in vars(bound.spec).items() if k in ("promise", "validated")})
         return list(self.filter.constraints)
 
-    def _filter(self, margin: float) -> SafetyFilter:
-        of_actions = self._low, self._high, self._dtype, self._search
-        widened = [c.widened(margin) for c in self._own] if margin else self._own
-        return SafetyFilter(self.plant, widened, self._fallback, *of_actions)
-
-    def set_margin(self, margin: float) -> None:
-        """Add this to every constraint's own margin from the next decision on, in place of `margin`.
-
-        What constraints remember of the episode stays. From a state that a wider margin finds too near, constraints
-        lead back, as from every such state. Not for the filters inside a `VectorCBFActionFilter`, which decides for
-        them.
-
-        Args:
-            margin: At least 0, in each constraint's own unit.
-
-        Raises:
-            ConfigurationError: It is negative, or leaves nothing of some limit; the margin stays as it was.
-        """
-        margin = non_negative("margin", margin, "the constraints' own units")
-        before = self.filter
-        self.filter = self._filter(margin)
-        self.added_margin = margin
-        self.filter.take_over(before)
-        self._observed = False
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning.
 
         Another thread's step is waited for, as another reset.
         """
         with self._deciding:
-            self.started = False
+            self.warned.discard("unsafe")
+            self.started = self._observed = False
             observation, info = self.env.reset(seed=seed, options=options)
             self.plant.received(observation, info)
-            return observation, info | self.start_report()
-
-    def start_report(self) -> dict[str, Any]:
-        """Take the state that a reset has left: the info keys of a new episode."""
-        self.warned.discard("unsafe")
-        self.started = self._observed = False
-        self.filter.start()
-        margin, unsafe = self._margin()
-        report = self._quiet_report()
-        report[keys.CBF_MARGIN] = margin
-        report[keys.CBF_UNSAFE] = unsafe
-        # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
-        report[keys.PROPOSED_ACTION] = np.zeros(self._shape)
-        report[keys.EXECUTED_ACTION] = np.zeros(self._shape)
-        report |= self.filter.info()
-        self.started = True
-        return report
-
-    def _quiet_report(self) -> dict[str, Any]:
-        """The info keys of a step that changes nothing, but for margin and actions."""
-        report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
-        report[keys.CBF_REFUSED] = np.zeros(len(self._own), dtype=bool)
-        report[keys.CBF_STAGE] = int(Stage.PROPOSAL)
-        return report
+            self.filter.start()
+            info |= dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
+            info[keys.CBF_MARGIN], info[keys.CBF_UNSAFE] = self._margin()
+            info[keys.CBF_REFUSED] = np.zeros(len(self.filter.bound), dtype=bool)
+            info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
+            # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
+            info[keys.PROPOSED_ACTION], info[keys.EXECUTED_ACTION] = np.zeros((2, *self._shape))
+            info |= self.filter.info()
+            self.started = True
+            return observation, info
 
     def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed; another thread waits meanwhile."""
         with self._deciding:  # the env makes the step that was judged, from the state in which it was
             started = time.perf_counter()
-            sent, report = self.judge(action)
+            sent, report = self._judge(action)
             self.filter_seconds += time.perf_counter() - started
             self.filter_calls += 1
             observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
             self.plant.received(observation, info)
             info |= report
-            info[keys.CBF_MISMATCH] = self.deviates()
+            if deviation := self.plant.deviation():
+                message = f"{deviation}; what the filter guarantees does not hold (cbf/mismatch)"
+                self._warn_once("mismatch", message)
+                info[keys.CBF_MISMATCH] = True
             info |= self.filter.info()
         return observation, reward, terminated, truncated, info
 
@@ -217,11 +179,8 @@ class CBFActionFilter(LayerWrapper):
         self.plant.observation_id = count
         return self.filter.bound if self.filter.margin == self.filter.margin else ()
 
-    def judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
-        """What to send for a proposed action in the env's present state, and the step's info keys.
-
-        The env must be stepped with it next. The constraints' own keys are not among these.
-        """
+    def _judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
+        """What to send for a proposed action in the env's present state, and the step's info keys."""
         self._refuse_without_reset()
         proposed: Array = action_array(action, self._shape, np.float64)
         if not self._observed:
@@ -265,20 +224,13 @@ class CBFActionFilter(LayerWrapper):
             keys.CBF_NONFINITE: not finite,
             keys.CBF_UNSAFE: unsafe,
             keys.CBF_MISMATCH: False,
-            keys.CBF_REFUSED: np.zeros(len(self._own), dtype=bool) if refused is None else refused,
+            keys.CBF_REFUSED: np.zeros(len(self.filter.bound), dtype=bool) if refused is None else refused,
             keys.CBF_CORRECTION: correction,
             keys.CBF_MARGIN: margin,
             keys.PROPOSED_ACTION: proposed,
             keys.EXECUTED_ACTION: executed.copy(),
             keys.CBF_STAGE: int(decision.stage),
         }
-
-    def deviates(self) -> bool:
-        """`cbf/mismatch` of the step that the env has just made: whether it was not the one that was judged."""
-        found = self.plant.deviation()
-        if found:
-            self._warn_once("mismatch", f"{found}; what the filter guarantees does not hold (cbf/mismatch)")
-        return bool(found)
 
     def _margin(self) -> tuple[float, bool]:
         """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""

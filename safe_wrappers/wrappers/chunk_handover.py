@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -22,15 +22,12 @@ from safe_wrappers.control.handover import (
     smoothstep,
 )
 from safe_wrappers.errors import (
-    OF_NUMBERS,
-    ActionError,
     Array,
     ConfigurationError,
     UnknownNameError,
     numbers_of,
     positive,
     settings_from,
-    shown,
     whole_number,
 )
 from safe_wrappers.filter.fallback import FallbackFunction
@@ -46,10 +43,10 @@ from safe_wrappers.wrappers.layer import (
     LayerWrapper,
     Step,
     WrapperRng,
+    action_array,
     receiver_inside,
     whole_steps,
 )
-from safe_wrappers.wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.stopping import FallbackController, bound_plant
 
@@ -96,7 +93,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         rate_limit: Bound on |u[k+1] - u[k]| / control interval, for all components or one each, action units per s.
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
-        control_dt: Control interval, s; None reads the env's `dt`.
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
         limits: Of the machine, which every "quintic" keeps between its ends, too: it is stretched until it does, or
             its chunk is refused.
@@ -130,11 +126,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         rate_limit: float | Sequence[float] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        control_dt: float | None = None,
         steps_per_entry: int = 1,
         limits: SeamLimits | Mapping[str, Any] | None = None,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)  # first: with a handover inside the actions are no vector either
         space = check_actions(env)
         plant = own_plant(plant)
@@ -142,26 +136,16 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         if blend not in BLENDS:
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join(BLENDS)}")
         limits = None if limits is None else settings_from(SeamLimits, limits, "limits")
-        plain: dict[str, Any] = {"blend_time": blend_time, "rate_limit": rate_limit, "control_dt": control_dt}
-        plain = {name: plain_numbers(value) for name, value in plain.items()}
-        delays = delay[0] if delay[0] == delay[1] else list(delay)
-        plain |= {
-            "chunk_size": H,
-            "execution_horizon": s,
-            "inference_delay": delays,
-            "steps_per_entry": apart,
-        }
-        self._record(arguments, plant=plant, limits=plain_data(limits), **plain)
         self.chunk_size, self.execution_horizon, self.blend = H, s, blend
-        self.control_dt = check_timing(env, plain["control_dt"])
+        self.control_dt = check_timing(env)
         self._delay, self._apart, self._controls = delay, apart, space.shape[0]
         low, high = (np.repeat(end[None], H, axis=0) for end in (space.low, space.high))
         self.action_space = gym.spaces.Box(low, high, dtype=space.dtype)
         self._fallback = FallbackController(env, fallback, bound_plant(env, plant, fallback))
         if limits is not None and blend != "quintic":
             raise ConfigurationError(f'limits are kept by blend="quintic", whose ends match; got {blend!r}')
-        rates = _rate_limits(rate_limit, space, self.control_dt)
-        fewest = self._fewest(plain["blend_time"], rate_limit is not None or limits is not None)
+        rates = _rate_limits(rate_limit, self._controls)
+        fewest = self._fewest(blend_time, rate_limit is not None or limits is not None)
         self._check = None if limits is None else self._bound_check(limits)
         self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rates, self._check)
         self._inside = receiver_inside(env)
@@ -172,8 +156,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback.reset()
         self._queue.reset()
         self._executed: list[Array] = []
+        self._commands: list[Command] = []
         self._observed_s, self._clipped, self._refused = 0.0, 0.0, False
-        self._starved = self._limited = 0
         info.update(self._measured())
         return observation
 
@@ -190,9 +174,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     def _control_step(self) -> Step:
         command = self._queue.next(self._admits, self._fallback.command)
-        self._refused |= command.refused
-        self._starved += command.starved
-        self._limited += command.limited
+        self._commands.append(command)
         if self._inside is not None:
             observed_s = None if command.observed < 0 else command.observed * self.control_dt
             self._inside.set_observation_time(observed_s)
@@ -208,22 +190,18 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         return self._queue.now * self.control_dt
 
     def _fewest(self, blend_time: float | None, limited: bool) -> int:
-        """The fewest control steps of a blend."""
-        size = (self.chunk_size - 1) * self._apart + 1
-        available = size - self._delay[1]
+        """The fewest control steps of a blend: without a time or a limit, as many as are left over at a seam."""
+        if blend_time is None and limited:
+            return 0
+        rest = (self.chunk_size - 1) * self._apart + 1 - self._delay[1]
+        fewest = rest - self.execution_horizon
         if blend_time is not None:
             fewest = max(whole_steps(positive("blend_time", blend_time, "s"), self.control_dt) - 1, 1)
-            if fewest >= available and size > 1:
-                left = f"{available} control steps of {self.control_dt} s"
-                longer = f"blend_time = {blend_time} s is longer than a chunk's rest, {left}"
-                raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
-            return fewest
-        if limited:
-            return 0
-        fewest = available - self.execution_horizon  # the least left-over
-        if fewest == 0:
-            has = f"chunk_size {size}, execution_horizon {self.execution_horizon}, inference_delay {self._delay[1]}"
-            raise ConfigurationError(f"{has}: no left-over to blend with: pass rate_limit or blend_time")
+        if fewest < 1 or (fewest >= rest and self.chunk_size > 1):
+            raise ConfigurationError(
+                f"a blend of {fewest} control steps does not fit into what is left of a chunk when it takes over, "
+                f"{rest} control steps: choose a longer chunk_size, a shorter blend_time, or pass rate_limit"
+            )
         return fewest
 
     def _bound_check(self, limits: SeamLimits) -> SeamCheck:
@@ -237,16 +215,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         return SeamCheck(limits, self._controls, self.control_dt, dynamics.torques, dynamics.inertia)
 
     def _checked(self, action: Any) -> Array:
-        expected = f"expected a chunk of shape {self.action_space.shape}"
-        given = numbers_of(action)
-        if given is None:
-            raise ActionError(f"{expected}, {OF_NUMBERS}, got {shown(action)}")
-        chunk = given.astype(np.float64)
-        if self.chunk_size == 1 and chunk.shape == (self._controls,):
-            return chunk[None]  # an ordinary policy's action
-        if chunk.shape != self.action_space.shape:
-            raise ActionError(f"{expected} (chunk_size, controls), got {chunk.shape}")
-        return chunk
+        given, shape = numbers_of(action), (self.chunk_size, self._controls)
+        one = given is not None and self.chunk_size == 1 and given.ndim == 1  # an ordinary policy's action
+        return action_array(action, shape[1:] if one else shape, np.float64).reshape(shape)
 
     def _admits(self, commands: Array) -> bool:
         return self._inside is None or self._inside.admits(commands[-1], len(commands))
@@ -279,17 +250,21 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         """The info of the control steps since the last call."""
         executed = np.array(self._executed).reshape(-1, self._controls)
         peak = float(np.abs(np.diff(executed, axis=0)).max(initial=0.0)) / self.control_dt
-        if self._limited:
+        starved, limited, refused = (
+            sum(getattr(command, what) for command in self._commands)
+            for what in ("starved", "limited", "refused")
+        )
+        if limited:
             message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
             self._warn_once("limited", message)
         report = {
             keys.HANDOVER_PEAK_JERK: peak,
-            keys.HANDOVER_STARVED: self._starved,
-            keys.HANDOVER_LIMITED: self._limited,
-            keys.HANDOVER_REFUSED: self._refused,
+            keys.HANDOVER_STARVED: starved,
+            keys.HANDOVER_LIMITED: limited,
+            keys.HANDOVER_REFUSED: self._refused or refused > 0,
             keys.ACTION_CLIPPED: self._clipped,
         }
-        self._executed, self._starved, self._limited = self._executed[-1:], 0, 0
+        self._executed, self._commands = self._executed[-1:], []
         return report
 
 
@@ -463,30 +438,15 @@ def _sizes(
     return entries, horizon, delay, apart
 
 
-def _rate_limits(rate_limit: Any, space: gym.spaces.Box, control_dt: float) -> Array:
+def _rate_limits(rate_limit: Any, controls: int) -> Array:
     """The rate limit of every component, shape (m,), infinite for none."""
-    controls = space.shape[0]
     if rate_limit is None:
         return np.full(controls, np.inf)
-    each = rate_limit if isinstance(rate_limit, list | tuple | np.ndarray) else [rate_limit] * controls
-    if len(each) != controls:
+    each = [positive("rate_limit", one, "action units per second") for one in np.ravel(rate_limit)]
+    if len(each) not in (1, controls):
         wanted = f"one number, or one for each of the {controls} action components"
         raise ConfigurationError(f"rate_limit is {wanted}; got {rate_limit!r}")
-    rates = np.array([positive("rate_limit", one, "action units per second") for one in each])
-    # Rounding to the actions' dtype may add so much to the difference of two commands in the box.
-    ends = np.abs(np.concatenate([space.low, space.high]).astype(np.float64))
-    dtype: Any = space.dtype
-    resolution = 2.0 * float(np.finfo(dtype).eps) * float(ends[np.isfinite(ends)].max(initial=1.0))
-    if (rates * control_dt <= resolution).any():
-        least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
-        raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
-    return rates
-
-
-@lru_cache(maxsize=16)
-def _spline_weights(entries: int, steps: int) -> Array:
-    """The spline is linear in the entries: one matrix for all chunks."""
-    return np.asarray(hermite_spline(np.eye(entries), float(steps))(np.arange((entries - 1) * steps + 1.0)))
+    return np.array(np.broadcast_to(each, controls))
 
 
 def upsampled(chunk: Array, steps: int) -> Array:
@@ -496,6 +456,6 @@ def upsampled(chunk: Array, steps: int) -> Array:
     """
     if steps == 1:
         return chunk
-    commands = _spline_weights(len(chunk), steps) @ chunk
+    commands = hermite_spline(chunk, float(steps))(np.arange((len(chunk) - 1) * steps + 1.0))
     commands[::steps] = chunk
-    return commands
+    return np.asarray(commands)

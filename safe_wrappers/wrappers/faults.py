@@ -51,7 +51,6 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     Args:
         env: With a Box action space; it must say how long a step lasts (`dt`) if nothing inside counts the time.
-        arguments: Of the fault itself, for the spec.
 
     Raises:
         ConfigurationError: Another action space, or no control interval.
@@ -63,14 +62,12 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     _last: Any
 
-    def __init__(self, env: Env, **arguments: Any) -> None:
-        self._record(arguments)
+    def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
-        remedy = "give it one, in seconds, such as env.unwrapped.dt = 0.05"
-        self.control_dt = 0.0 if self._inside is not None else check_timing(env, None, remedy)
+        self.control_dt = 0.0 if self._inside is not None else check_timing(env)
         self._passes_numbers = not any(
             getattr(inner, "layer", None) in _DECIDING for inner in wrappers_of(env)
         )
@@ -143,7 +140,7 @@ class RepeatedCommands(Fault):
 
     def __init__(self, env: Env, share: float) -> None:
         self._share = probability("share", share)
-        super().__init__(env, share=self._share)
+        super().__init__(env)
 
     def begin(self) -> None:
         self._before: Carried | None = None
@@ -164,7 +161,7 @@ class Jitter(Fault):
 
     def __init__(self, env: Env, longest_s: float) -> None:
         self._longest_s = positive("longest_s", longest_s, "s")
-        super().__init__(env, longest_s=self._longest_s)
+        super().__init__(env)
 
     def begin(self) -> None:
         self._coming: list[tuple[float, Carried]] = []
@@ -205,7 +202,7 @@ class Outages(Fault):
 
     def __init__(self, env: Env, mean_between_s: float, mean_length_s: float) -> None:
         self._process = OnOffProcess(mean_between_s, mean_length_s)
-        super().__init__(env, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
+        super().__init__(env)
 
     def begin(self) -> None:
         self._process.begin(self.random)

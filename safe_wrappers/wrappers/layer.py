@@ -2,10 +2,11 @@
 
 import inspect
 import math
+import os
 import warnings
 import zlib
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Final, SupportsFloat
+from typing import Any, ClassVar, Final, Self, SupportsFloat
 
 import gymnasium as gym
 import mujoco
@@ -22,9 +23,9 @@ from safe_wrappers.errors import (
     numbers_of,
     shown,
 )
-from safe_wrappers.plants import PlantTemplate
+from safe_wrappers.plants import Plant, PlantTemplate
 from safe_wrappers.plants.env_checks import wrappers_of
-from safe_wrappers.wrappers.serialize import recorded
+from safe_wrappers.wrappers.serialize import plain_data
 from safe_wrappers.wrappers.stack import Layer, refuse_order
 
 Env = gym.Env[Any, Any]
@@ -43,6 +44,16 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
     layer: ClassVar[Layer]
     started: bool = False
     """Whether there is an episode, since the last reset has not failed."""
+
+    def __new__(cls, *arguments: Any, **named: Any) -> Self:
+        """A wrapper whose constructor's arguments are recorded as they were given, as plain data."""
+        made = super().__new__(cls)
+        if arguments or named:  # a copy is made without any, and gets the recorded ones with its state
+            given = inspect.signature(cls.__init__).bind(made, *arguments, **named)
+            given.apply_defaults()
+            own = list(given.arguments.items())[2:]  # without self and env
+            gym.utils.RecordConstructorArgs.__init__(made, **{name: _plain(value) for name, value in own})
+        return made
 
     def __init__(self, env: Env) -> None:
         refuse_vector_env(env, type(self).__name__)
@@ -140,11 +151,21 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         entries = observation if inside else {"observation": observation}
         return {**entries, name: numbers.astype(space[name].dtype)}
 
-    def _record(self, arguments: Mapping[str, Any], **plain: Any) -> None:
-        """Record the constructor's arguments (its `locals()`), some as plain data; a plant as a template."""
-        if plain.get("plant") is not None:
-            plain["plant"] = PlantTemplate(plain["plant"])
-        gym.utils.RecordConstructorArgs.__init__(self, **recorded(arguments, **plain))
+
+def _plain(given: Any) -> Any:
+    """An argument as plain data, where it is any; a plant as a template."""
+    if isinstance(given, Plant):
+        return PlantTemplate(given)
+    if isinstance(given, Mapping):
+        return {name: _plain(value) for name, value in given.items()}
+    if isinstance(given, list | tuple):
+        return [_plain(one) for one in given]
+    if isinstance(given, np.ndarray | np.generic):
+        return given.tolist()
+    if isinstance(given, os.PathLike):
+        return os.fspath(given)
+    plain = plain_data(given)
+    return _plain(plain) if isinstance(plain, dict) else plain
 
 
 def refuse_vector_env(env: Any, name: str) -> None:

@@ -12,8 +12,7 @@ from safe_wrappers.errors import Array, ConfigurationError, non_negative, positi
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
-from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step, WrapperRng, action_array
-from safe_wrappers.wrappers.serialize import plain_data
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, action_array
 from safe_wrappers.wrappers.stack import Layer
 
 
@@ -42,7 +41,6 @@ class ActionRepeat(LayerWrapper):
     def __init__(self, env: Env, repeat: int) -> None:
         LayerWrapper.__init__(self, env)
         self.repeat = whole_number("repeat", repeat, least=1)
-        self._record({"repeat": self.repeat})
 
     def step(self, action: Any) -> Step:
         """Step the env with the same action until `repeat` control steps are made or the episode ends."""
@@ -89,7 +87,6 @@ class AdaptionPenalty(LayerWrapper):
             raise ConfigurationError(
                 "AdaptionPenalty: give penalty (per step), per_correction (per unit of cbf/correction), or both"
             )
-        self._record({"penalty": self.penalty, "per_correction": self.per_correction})
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         info[keys.ADAPTION_PENALTY] = 0.0
@@ -148,7 +145,6 @@ class StuckEscape(LayerWrapper):
         progress: float = 0.0,
         escape_s: float = 1.0,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)
         self._inside = needed_filter(env, "StuckEscape(sw.protect(env))")
         if not (isinstance(progress, int | float | np.number) and np.isfinite(progress)):
@@ -156,7 +152,6 @@ class StuckEscape(LayerWrapper):
         control_dt = self._inside.plant.control_dt
         self._window = max(1, round(positive("after_s", after_s, "s") / control_dt))
         self._escape = round(non_negative("escape_s", escape_s, "s") / control_dt)
-        self._record(arguments)
         self.progress = float(progress)
         self._rng = WrapperRng("StuckEscape")
 
@@ -235,38 +230,27 @@ class FilterObservation(LayerWrapper):
         plant: Plant | None = None,
         neighbours: int = 4,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)
         inside = filter_inside(env)
-        if inside is None and constraints is None:
-            wanted = (
-                "FilterObservation(sw.protect(env)), or constraints=[...] to observe them without a filter"
-            )
-            raise ConfigurationError(f"FilterObservation needs a filter inside or constraints: {wanted}")
-        if inside is not None and (constraints is not None or plant is not None):
+        if (inside is None) == (constraints is None) or (inside is not None and plant is not None):
             raise ConfigurationError(
-                "FilterObservation shows what the filter inside decides by; leave constraints and plant out"
+                "FilterObservation(sw.protect(env)) shows what the filter inside decides by; without one give it "
+                "constraints=[...], which then observe alone"
             )
         self.neighbours = whole_number("neighbours", neighbours, least=0)
-        if constraints is not None:
-            observer = CBFActionFilter(env, constraints, plant)
-            arguments["constraints"] = [plain_data(c) for c in observer.constraints]
-        self._record(arguments, plant=plant)
         self._acts = inside is not None
-        self._observer = inside if inside is not None else observer
-        low, high = np.ravel(self._observer.action_space.low), np.ravel(self._observer.action_space.high)  # type: ignore[attr-defined]
-        self._low, self._high = low.astype(np.float64), high.astype(np.float64)
+        self._observer = CBFActionFilter(env, constraints or (), plant) if inside is None else inside
+        space: Any = self._observer.action_space
+        self._low, self._high = (np.ravel(end).astype(np.float64) for end in (space.low, space.high))
         self._counts = [c.feature_count(self.neighbours) for c in self._observer.filter.bound]
-        count = sum(self._counts) + low.size
+        count = sum(self._counts) + self._low.size
         self._widen_observation(KEY, spaces.Box(-1.0, 1.0, (count,), np.float32))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; no correction yet."""
-        observation, info = self.env.reset(seed=seed, options=options)
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         if not self._acts:
             self._observer.plant.received(observation, info)
             self._observer.filter.start()
-        return self._with_features(observation, np.zeros(self._low.size)), info
+        return self._with_features(observation, np.zeros(self._low.size))
 
     def step(self, action: Any) -> Step:
         """Step the env, and look at the state that it has reached as the filter will."""

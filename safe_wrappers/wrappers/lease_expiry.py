@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -26,7 +27,6 @@ from safe_wrappers.plants.mujoco.binding import actions_are_controls
 from safe_wrappers.plants.mujoco.model import control_range
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.layer import Env, Step, action_array, whole_steps
-from safe_wrappers.wrappers.serialize import plain_data
 from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.stopping import (
     BoundBudget,
@@ -35,6 +35,19 @@ from safe_wrappers.wrappers.stopping import (
     StoppingBudget,
     bound_plant,
 )
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Of machines that follow setpoints: numbers, or one for each, and how a chunk may end: "moving" or at "rest"."""
+
+    max_acceleration: Any
+    max_speed: Any = math.inf
+    arrival: Literal["moving", "rest"] = "moving"
+
+    def __post_init__(self) -> None:
+        if self.arrival not in ("moving", "rest"):
+            raise ConfigurationError(f'arrival is "moving" or "rest", got {self.arrival!r}')
 
 
 class LeaseExpiry(CommandGate):
@@ -64,7 +77,6 @@ class LeaseExpiry(CommandGate):
             "max_speed": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
         fallback: "brake", "hold", "zero", or a function of the plant.
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
-        control_dt: Control interval, s; None reads the env's `dt`.
 
     Info, at every step: ``lease/remaining_s`` (float), ``lease/refused``, ``lease/braking`` (bool); without a filter
     inside ``executed_action`` and ``action/clipped`` (float).
@@ -104,14 +116,10 @@ class LeaseExpiry(CommandGate):
         motion_limits: Mapping[str, Any] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        control_dt: float | None = None,
     ) -> None:
-        arguments = dict(locals())
-        CommandGate.__init__(self, env, control_dt)
+        CommandGate.__init__(self, env)
         refuse_changed_actions(env)
         plant, budget = own_plant(plant), settings_from(StoppingBudget, budget, "budget")
-        limits = dict(motion_limits) if isinstance(motion_limits, Mapping) else motion_limits
-        self._record(arguments, budget=plain_data(budget), motion_limits=limits, plant=plant)
         self._max_lease_s = positive("max_lease_s", max_lease_s, "s")
         if self._max_lease_s < self.control_dt - self._same_s:
             step = f"one control step, {self.control_dt} s"
@@ -124,8 +132,8 @@ class LeaseExpiry(CommandGate):
             raise ConfigurationError(f"min_lease_s above 0 needs a CBFActionFilter inside: {example}")
         self._blend_steps = whole_steps(non_negative("blend_time", blend_time, "s"), self.control_dt)
         delays = {"detect_s": detect_s, "confirm_s": confirm_s, "age_s": age_s}
-        detect, confirm, age = (non_negative(name, value, "s") for name, value in delays.items())
-        self._delays_s = detect + confirm + age + self._same_s  # by which a step may outlast its lease
+        # What they are, and by how much a step may outlast its lease.
+        self._delays_s = sum(non_negative(name, value, "s") for name, value in delays.items()) + self._same_s
         plant = bound_plant(env, plant, fallback, budget.clearance)
         self._budget = BoundBudget(budget, env, plant)
         self._fallback = FallbackController(env, fallback, plant, self._budget.bound)
@@ -212,24 +220,21 @@ class Admission:
     """
 
     def __init__(self, env: Env, motion_limits: Any, controls: int) -> None:
-        model: Any = getattr(env.unwrapped, "model", None)
+        self._raw: Any = env.unwrapped
+        model: Any = getattr(self._raw, "model", None)
         if not isinstance(model, mujoco.MjModel):
             raise UnsupportedEnvError("motion_limits are for MuJoCo's actuators, whose lengths are read")
         if not actions_are_controls(env.action_space, *control_range(model)):
             units = "actions are in other units than the lengths of the actuators"
             raise ConfigurationError(f"motion_limits: {units}, so that these are no setpoints")
+        limits = settings_from(MotionLimits, motion_limits, "motion_limits")
         try:
-            acceleration, speed, self._rest = _limits(**motion_limits)
-            self._acceleration, self._speed = (np.broadcast_to(x, (controls,)) for x in (acceleration, speed))
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, ConfigurationError):
-                raise
-            wanted = f"each a number or one for each of the {controls} action components"
-            raise ConfigurationError(
-                'motion_limits is {"max_acceleration": ..., "max_speed": ..., "arrival": "moving" or "rest"}, '
-                f"{wanted}; got {motion_limits!r}"
-            ) from None
-        self._raw: Any = env.unwrapped
+            of_each = checked_limits(limits.max_acceleration, limits.max_speed)
+            self._acceleration, self._speed = (np.broadcast_to(limit, (controls,)) for limit in of_each)
+        except (TypeError, ValueError) as error:
+            wanted = f"numbers, or one for each of the {controls} action components"
+            raise ConfigurationError(f"motion_limits are {wanted}; got {motion_limits!r}: {error}") from None
+        self._rest = limits.arrival == "rest"
 
     def admits(self, end: Array, duration_s: float) -> bool:
         """Whether a chunk may be executed that ends with a command (m,) after so many seconds."""
@@ -238,10 +243,3 @@ class Admission:
             states = (position, velocity, 0.0), (end, 0.0, 0.0)
             return jerk_limited_time(*states, self._acceleration, self._speed) <= duration_s
         return bool(admits(end, position, velocity, duration_s, self._speed, self._acceleration).all())
-
-
-def _limits(
-    max_acceleration: Any, max_speed: Any = math.inf, arrival: str = "moving"
-) -> tuple[Array, Array, bool]:
-    """The limits, and whether the machine must be able to stand at the end."""
-    return *checked_limits(max_acceleration, max_speed), {"moving": False, "rest": True}[arrival]

@@ -14,12 +14,13 @@ from safe_wrappers.control.contact import complementarity_residuals, normal_and_
 from safe_wrappers.control.legged import support_distances
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.contacts import (
-    ContactForecast,
     ContactReader,
     Contacts,
     Replay,
+    between,
     can_touch_the_world,
     chosen_bodies,
+    on_the_world,
 )
 from safe_wrappers.plants.mujoco.dynamics import MomentumReader
 from safe_wrappers.plants.mujoco.model import fixed_bodies
@@ -52,7 +53,7 @@ class StepMonitor(LayerWrapper, ABC):
         answer = self._pass_on(action)
         raw = self._raw
         self._forget()
-        whole = self._replay.after(self._visit)
+        whole = self._replay.after(lambda data, _: self._visit(data))
         if not whole:
             message = (
                 f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
@@ -60,7 +61,7 @@ class StepMonitor(LayerWrapper, ABC):
             )
             self._warn_once("partial", message)
             self._forget()
-            self._visit(raw.data, float(raw.model.opt.timestep))
+            self._visit(raw.data)
         answer[4].update(self._figures(raw.data) | {self.partial: not whole})
         return answer
 
@@ -69,8 +70,8 @@ class StepMonitor(LayerWrapper, ABC):
         """Forget what was visited; the env may have made itself another model."""
 
     @abstractmethod
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
-        """Look at one evaluation of the physics, which acts for some time, s."""
+    def _visit(self, data: mujoco.MjData) -> None:
+        """Look at one evaluation of the physics."""
 
     @abstractmethod
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
@@ -119,10 +120,7 @@ class ContactMonitor(StepMonitor):
         against: Sequence[str] | None = None,
     ) -> None:
         StepMonitor.__init__(self, env)
-        self._contacts = Contacts(self._raw.model, bodies, against)
-        self.bodies = None if bodies is None else list(bodies)
-        self.against = None if against is None else list(against)
-        self._record({"bodies": self.bodies, "against": self.against})
+        self.bodies, self.against, self._model = bodies, against, None
         self._forget()
 
     @property
@@ -135,32 +133,33 @@ class ContactMonitor(StepMonitor):
         return first, second
 
     def _forget(self) -> None:
-        if self._contacts.model is not self._raw.model:
-            self._contacts = Contacts(self._raw.model, self.bodies, self.against)
-        self._gaps: list[float] = []
-        self._forces: list[float] = []
-        self._peak = 0.0
-        self._peak_bodies: tuple[int, int] | None = None
+        if self._model is not self._raw.model:
+            self._model = self._raw.model
+            self._contacts = ContactReader(self._model, between(self._model, self.bodies, self.against))
+        self._contacts.clear()
+        self._peak_bodies: Any = None
 
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
-        pairs: dict[tuple[int, int], float] = {}
-        for bodies, gap, force in self._contacts.read(data):
-            self._gaps.append(gap)
-            self._forces.append(force)
-            pairs[bodies] = pairs.get(bodies, 0.0) + force
-        for bodies, force in pairs.items():
-            if force > self._peak:
-                self._peak, self._peak_bodies = force, bodies
+    def _visit(self, data: mujoco.MjData) -> None:
+        self._contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
-        if not self._gaps:
+        found = self._contacts.found()
+        if not found.gap.size:
             return dict(self.nothing)
-        gaps, forces = np.array(self._gaps), np.array(self._forces)
-        if not (np.isfinite(gaps).all() and np.isfinite(forces).all()):
+        forces, _ = normal_and_tangential(found.force, found.normal)
+        if not (np.isfinite(found.gap).all() and np.isfinite(forces).all()):
             return dict.fromkeys(self.nothing, math.nan)
-        penetration, product = complementarity_residuals(gaps, forces)
+        penetration, product = complementarity_residuals(found.gap, forces)
+        pairs: dict[tuple[int, int, int], float] = {}
+        for step, (one, other), force in zip(
+            found.step.tolist(), found.bodies.tolist(), forces.tolist(), strict=True
+        ):
+            key = step, min(one, other), max(one, other)
+            pairs[key] = pairs.get(key, 0.0) + force
+        peak = max(pairs, key=pairs.__getitem__)
+        self._peak_bodies = peak[1:] if pairs[peak] > 0.0 else None
         return {
-            keys.CONTACT_PEAK_FORCE: self._peak,
+            keys.CONTACT_PEAK_FORCE: max(pairs[peak], 0.0),
             keys.CONTACT_PENETRATION: float(penetration.max()),
             keys.CONTACT_RESIDUAL: float(product.max()),
         }
@@ -212,7 +211,6 @@ class BalanceMonitor(StepMonitor):
         StepMonitor.__init__(self, env)
         self._take(bodies)
         self.bodies = None if bodies is None else list(bodies)
-        self._record({"bodies": self.bodies})
 
     def _take(self, bodies: Sequence[str] | None) -> None:
         """Find the robot in the env's model."""
@@ -227,14 +225,15 @@ class BalanceMonitor(StepMonitor):
         if not (can_touch_the_world(model) & own).any():
             raise UnsupportedEnvError(f"no body {which} can touch the fixed world with friction")
         self._own, self._massive = own, np.flatnonzero(moving)
-        self._contacts, self._momentum = ContactReader(model), MomentumReader(model, own)
+        self._contacts = ContactReader(model, on_the_world(model, own))
+        self._momentum = MomentumReader(model, own)
 
     def _forget(self) -> None:
         if self._model is not self._raw.model:
             self._take(self.bodies)
         self._contacts.clear()
 
-    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+    def _visit(self, data: mujoco.MjData) -> None:
         self._contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
@@ -243,14 +242,11 @@ class BalanceMonitor(StepMonitor):
         if momentum is not None:
             figures[keys.BALANCE_LINEAR_MOMENTUM] = momentum.linear
             figures[keys.BALANCE_ANGULAR_MOMENTUM] = momentum.angular
-        found = self._contacts.forecast(finite=True)
-        mine = self._own[found.body]
-        arrays = ("step", "body", "point", "normal", "force", "friction")
-        found = found._replace(**{name: getattr(found, name)[mine] for name in arrays})
+        found = self._contacts.found()
         finite = all(np.isfinite(array).all() for array in (found.point, found.normal, found.force))
         return figures | self._of_contacts(found) if finite and found.steps else figures
 
-    def _of_contacts(self, found: ContactForecast) -> dict[str, Any]:
+    def _of_contacts(self, found: Contacts) -> dict[str, Any]:
         """The figures of finite contacts."""
         normal, tangential = normal_and_tangential(found.force, found.normal)
         held = found.friction * normal

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any, ClassVar
 
@@ -25,17 +25,16 @@ from safe_wrappers.errors import (
     SafeWrappersError,
     UnknownNameError,
     check_fields,
+    finite_array,
     non_negative,
     positive,
     settings_from,
-    true_or_false,
 )
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import physics_steps
 from safe_wrappers.plants.mujoco.line_of_sight import LineOfSight
 from safe_wrappers.plants.mujoco.model import named
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, mujoco_env
-from safe_wrappers.wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.wrappers.stack import Layer
 
 __all__ = ["Imu", "Sensor", "Track"]
@@ -61,8 +60,6 @@ class Imu:
     fix_every_s: float | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.site, str):
-            raise ConfigurationError(f"site is the name of a site, got {self.site!r}")
         check_fields(self, non_negative, ["accelerometer_std"], "m/s^2")
         check_fields(self, non_negative, ["gyro_std"], "rad/s")
         check_fields(self, positive, ["fix_every_s"], "s")
@@ -158,14 +155,10 @@ class Sensor:
         if (self.camera is None) == (self.site is None):
             given = f"camera={self.camera!r}, site={self.site!r}"
             raise ConfigurationError(f"a sensor sits at a camera or at a site: name one of them; got {given}")
-        for name in ("camera", "site"):
-            if not isinstance(getattr(self, name), str | None):
-                raise ConfigurationError(f"{name} is a name, got {getattr(self, name)!r}")
-        check_fields(self, positive, ["view_deg"], "degrees")
-        check_fields(self, positive, ["range_m"], "m")
-        if self.position_std is not None:
-            self.position_std = positive("position_std", self.position_std, "m")
-        check_fields(self, positive, ["velocity_std"], "m/s")
+        units = {"view_deg": "degrees", "range_m": "m", "position_std": "m", "velocity_std": "m/s"}
+        for name, unit in units.items():
+            if (value := getattr(self, name)) is not None:
+                setattr(self, name, positive(name, value, unit))
         if self.position_std is None and self.velocity_std is None:
             raise ConfigurationError("the sensor measures nothing: give position_std, velocity_std or both")
         if self.imu is not None:
@@ -228,7 +221,7 @@ class Track:
 
     bodies: str | None = None
     published: str | None = None
-    acceleration_noise: Any = None
+    acceleration_noise: Any = field(kw_only=True)
     reversion_s: float | None = None
     mean_velocity: Sequence[float] | None = None
     start_position_std: Any = 0.1
@@ -240,45 +233,28 @@ class Track:
             raise ConfigurationError(
                 f"a track follows bodies by name or pattern, or published points; got {given}"
             )
-        name = self.published if self.bodies is None else self.bodies
-        if not isinstance(name, str):
-            raise ConfigurationError(f"bodies and published are names, got {name!r}")
-        if self.acceleration_noise is None:
-            noise = "the intensity of its white acceleration noise in m^2/s^3"
-            raise ConfigurationError(f"acceleration_noise is missing: {noise} (0: velocity stays)")
         check_fields(self, positive, ["reversion_s"], "s")
-        for name in ("acceleration_noise", "mean_velocity", "start_position_std", "start_velocity_std"):
-            setattr(self, name, plain_numbers(getattr(self, name)))
 
     def motion(self, coordinates: int) -> Motion:
         """The motion model for d coordinates."""
         mean = 0.0 if self.mean_velocity is None else self.mean_velocity
-        velocity = _each("mean_velocity", mean, coordinates, "m/s", signed=True)
         reversion_s = np.inf if self.reversion_s is None else self.reversion_s
-        noise = np.diag(_each("acceleration_noise", self.acceleration_noise, coordinates, "m^2/s^3"))
-        return Motion(noise, reversion_s, velocity)
+        noise = _each("acceleration_noise", self.acceleration_noise, coordinates)
+        return Motion(np.diag(noise), reversion_s, _each("mean_velocity", mean, coordinates, least=-np.inf))
 
     def start(self, coordinates: int) -> Array:
         """Standard deviations of position and velocity at a reset, shape (2d,)."""
-        position = _each("start_position_std", self.start_position_std, coordinates, "m")
-        return np.concatenate(
-            [position, _each("start_velocity_std", self.start_velocity_std, coordinates, "m/s")]
-        )
+        names = "start_position_std", "start_velocity_std"
+        return np.concatenate([_each(name, getattr(self, name), coordinates) for name in names])
 
 
-def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = False) -> Array:
-    """One number per coordinate."""
-    try:
-        values = np.asarray(given, dtype=np.float64)
-        values = np.array(np.broadcast_to(values, coordinates))
-    except (TypeError, ValueError):
-        wanted = f"a number or {coordinates} numbers (one per coordinate) in {unit}"
-        raise ConfigurationError(f"{name} is {wanted}, got {given!r}") from None
-    if not np.isfinite(values).all():
-        raise ConfigurationError(f"{name} must be finite, in {unit}, got {given!r}")
-    for value in () if signed else values:
-        non_negative(name, value, unit)
-    return values
+def _each(name: str, given: Any, coordinates: int, least: float = 0.0) -> Array:
+    """One finite number per coordinate, shape (coordinates,)."""
+    values = finite_array(name, given)
+    if values.shape not in ((), (1,), (coordinates,)) or (values < least).any():
+        wanted = f"a number, or {coordinates} numbers (one per coordinate)"
+        raise ConfigurationError(f"{name} is {wanted}, of at least {least:g}; got {given!r}")
+    return np.array(np.broadcast_to(values, coordinates))
 
 
 class OcclusionPenalty(LayerWrapper):
@@ -342,7 +318,6 @@ class OcclusionPenalty(LayerWrapper):
         axes: str = "xy",
         observe: bool = True,
     ) -> None:
-        arguments = dict(locals())
         LayerWrapper.__init__(self, env)
         raw = mujoco_env(env, "OcclusionPenalty")
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
@@ -357,10 +332,7 @@ class OcclusionPenalty(LayerWrapper):
         self.sigmas = positive("sigmas", sigmas, "standard deviations")
         if axes not in ("xy", "xyz"):
             raise ConfigurationError(f"axes is 'xy' or 'xyz', got {axes!r}")
-        self.observe = true_or_false("observe", observe)
-        plain = {name: getattr(self, name) for name in ("tolerance", "weight", "sigmas")}
-        parts = {"tracks": plain_data(self.tracks), "sensor": plain_data(self.sensor)}
-        self._record(arguments, **parts, **plain, observe=self.observe)
+        self.observe = observe
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
         self._control_dt = physics_steps(raw) * float(raw.model.opt.timestep)
         self._matrix, self._noise = self.sensor.matrices(self._d)
@@ -381,27 +353,21 @@ class OcclusionPenalty(LayerWrapper):
         range_m = math.inf if s.range_m is None else s.range_m
         self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m)
         self.ego_motion = EgoMotion(s.imu, self._sight) if isinstance(s.imu, Imu) else None
+        found = [(name, body, track) for track in self.tracks for name, body in self._followed(track, model)]
+        self._bodies = np.array([body for _, body, _ in found], dtype=np.intp)
+        self._owners = [track for *_, track in found]
+        return [name for name, *_ in found]
+
+    def _followed(self, track: Track, model: mujoco.MjModel) -> list[tuple[str, int]]:
+        """Names and ids of a track's bodies, or of its points, whose ids are -1."""
+        if track.bodies is None:
+            return [(f"{track.published}[{i}]", -1) for i in range(len(self._published(track)))]
         there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
-        names: list[str] = []
-        self._owners: list[Track] = []
-        bodies: list[int] = []  # -1 for a published point
-        for track in self.tracks:
-            if track.bodies is None:
-                found = {f"{track.published}[{i}]": -1 for i in range(len(self._published(track)))}
-            else:
-                found = {name: b for name, b in there.items() if fnmatchcase(name, track.bodies)}
-            if not found:
-                known = ", ".join(there) or "none"
-                raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {known}")
-            names += found
-            bodies += found.values()
-            self._owners += [track] * len(found)
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
-        self._bodies = np.array(bodies, dtype=np.intp)
-        self._in_model = self._bodies >= 0
-        return names
+        found = [(name, b) for name, b in there.items() if fnmatchcase(name, track.bodies)]
+        if not found:
+            known = ", ".join(there) or "none"
+            raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {known}")
+        return found
 
     def _published(self, track: Track) -> Array:
         points = np.asarray(read_attribute(self.env, track.published or ""), dtype=np.float64)
@@ -413,14 +379,10 @@ class OcclusionPenalty(LayerWrapper):
     def _truth(self) -> tuple[Array, Array | None]:
         """True positions, shape (n, 3), m, and velocities, (n, d), m/s, if the sensor measures them."""
         sight = self._sight
-        positions = np.empty((len(self.track_names), 3))
-        if self._in_model.any():
-            positions[self._in_model] = sight.data.xpos[self._bodies[self._in_model]]
+        positions = np.array(sight.data.xpos[self._bodies])
         velocities = None
-        if self.sensor.velocity_std is not None:
-            velocities = np.empty((len(positions), self._d))
-            for i in np.flatnonzero(self._in_model):
-                velocities[i] = sight.velocity(int(self._bodies[i]))[0][: self._d]
+        if self.sensor.velocity_std is not None:  # then all of them are bodies
+            velocities = np.stack([sight.velocity(int(body))[0][: self._d] for body in self._bodies])
         for track in self.tracks:
             if track.published is not None:
                 points = self._published(track)

@@ -7,13 +7,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.constraints.contact_feasibility import ContactFeasibility, Stance, SupportMargin
-from safe_wrappers.constraints.joints import JointPositionLimit, refuse_uncovered_stops, stops
+from safe_wrappers.constraints.contact_feasibility import ContactFeasibility, SupportMargin
+from safe_wrappers.constraints.joints import JointPositionLimit, stops
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.errors import (
     ActionError,
     ConfigurationError,
-    UnknownNameError,
     UnsupportedEnvError,
     non_negative,
     numbers_of,
@@ -66,30 +65,26 @@ class SlipLimiter(CBFActionFilter):
         friction: float | None = None,
     ) -> None:
         traction = Traction(wheels, max_slip, friction)
-        self._record({"wheels": list(wheels), "max_slip": max_slip, "friction": friction})
         CBFActionFilter.__init__(self, env, [traction])
 
 
 class WholeBodyFilter(CBFActionFilter):
     """Keeps a legged robot's contact forces inside their friction cones and its joints off their stops.
 
-    With ``contacts="forecast"`` the forces are those of the plant's simulation at every evaluation of the physics of
-    the control step (`ContactFeasibility`, `JointPositionLimit` and, if asked for, `SupportMargin`); with "pyramid"
-    or "cone" those with which the feet that stand now could stay (`Stance`).
+    It is `CBFActionFilter` with `ContactFeasibility`, `JointPositionLimit` and, if asked for, `SupportMargin`, which
+    read the forces of the plant's simulation at every evaluation of the physics of the control step.
 
-    **What it guarantees.** With forecasts and a plant that is right, a step that is not flagged infeasible or
-    fallback has its contact forces within cone and tolerance, and its joints in range, at every evaluation of the
-    physics. **What it does not.** All of these constraints are *best effort*. With "pyramid" and "cone" an unflagged
-    step can slide. It does not keep a robot on its feet.
+    **What it guarantees.** With a plant that is right, a step that is not flagged infeasible or fallback has its
+    contact forces within cone and tolerance, and its joints in range, at every evaluation of the physics. **What it
+    does not.** All of these constraints are *best effort*. It does not keep a robot on its feet.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.
-        contacts: "forecast", "pyramid" or "cone", see above.
         friction_share: Of the model's friction coefficient that may be counted on, in (0, 1].
         joint_tolerance: How far a joint may press its stop, rad or m. None leaves the joints alone.
         zmp_inset: Least distance of the zero moment point from the edge of the support polygon, m, wherever there is
-            a polygon, for forecasts. None sets no bound.
-        tolerance: By how much a forecast force may miss its cone, as a share of the robot's weight; None is 0.01.
+            a polygon. None sets no bound.
+        tolerance: By how much a force may miss its cone, as a share of the robot's weight.
 
     Info, at every step: that of `CBFActionFilter`, ``whole_body/cone_margin``, with a `zmp_inset`
     ``whole_body/zmp_margin``.
@@ -110,39 +105,26 @@ class WholeBodyFilter(CBFActionFilter):
     def __init__(
         self,
         env: Env,
-        contacts: str = "forecast",
         friction_share: float = 0.7,
         joint_tolerance: float | None = 0.1,
         zmp_inset: float | None = None,
-        tolerance: float | None = None,
+        tolerance: float = 0.01,
     ) -> None:
-        arguments = dict(locals())
         refuse_vector_env(env, type(self).__name__)
         model = mujoco_env(env, "WholeBodyFilter").model
+        constraints: list[Constraint] = [ContactFeasibility(friction_share, tolerance)]
+        if zmp_inset is not None:
+            constraints.append(SupportMargin(zmp_inset))
         if joint_tolerance is not None:
-            joint_tolerance = non_negative("joint_tolerance", joint_tolerance, "rad or m")
-            refuse_uncovered_stops(model)
-            if not stops(model)[0]:
+            wider = non_negative("joint_tolerance", joint_tolerance, "rad or m")
+            joints, low, high = stops(model)
+            if not joints:
                 raise UnsupportedEnvError("no driven joint has a range: pass joint_tolerance=None")
-        constraints: list[Constraint]
-        if contacts in ("pyramid", "cone"):
-            for name in ("zmp_inset", "tolerance"):
-                if arguments[name] is not None:
-                    raise ConfigurationError(f'{name} is for contacts="forecast", not for {contacts!r}')
-            cone: Any = "exact" if contacts == "cone" else "pyramid"
-            constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance)]
-        elif contacts == "forecast":
-            constraints = [ContactFeasibility(friction_share, 0.01 if tolerance is None else tolerance)]
-            if zmp_inset is not None:
-                constraints.append(SupportMargin(zmp_inset))
-            if joint_tolerance is not None:
-                joints, low, high = stops(model)
-                ranges = (low - joint_tolerance).tolist(), (high + joint_tolerance).tolist()
-                names = [model.joint(j).name for j in joints]
-                constraints.append(JointPositionLimit(*ranges, joints=names, horizon=3))
-        else:
-            raise UnknownNameError(f'contacts is "forecast", "pyramid" or "cone", got {contacts!r}')
-        self._record(arguments)
+            ranges, names = (
+                ((low - wider).tolist(), (high + wider).tolist()),
+                [model.joint(j).name for j in joints],
+            )
+            constraints.append(JointPositionLimit(*ranges, joints=names, horizon=3))
         CBFActionFilter.__init__(self, env, constraints)
 
 

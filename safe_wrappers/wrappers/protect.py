@@ -7,26 +7,19 @@ from typing import Any, Final, overload
 
 import gymnasium as gym
 
-from safe_wrappers.constraints import JointSpeedLimit, PredictiveShield
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.simulator import SimulatorPlant
+from safe_wrappers.errors import UnknownNameError, UnsupportedEnvError
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.presets import ActionShield
 from safe_wrappers.wrappers.recipes import EVERY, PLANTS, family_of, recipe_of
 from safe_wrappers.wrappers.stack import refuse_order
-from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, by_env, single_envs
+from safe_wrappers.wrappers.vector_cbf_action_filter import EACH, VectorCBFActionFilter, single_envs
 
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
-_LIMIT: Final = (
-    "These lines protect it",
-    "limit = sw.constraints.JointSpeedLimit(limit=4.0)  # rad/s, m/s; or another constraint",
-)
-_SHIELD: Final = (
-    "It can be simulated. Say by h(observation) what must stay positive, by backup(observation) which action keeps "
-    "it so, and by horizon how many steps to look ahead; then these lines protect it",
-    "shield = sw.constraints.PredictiveShield(h, horizon, backup)",
-)
+_BY_HAND: Final = {
+    "limit": "sw.constraints.JointSpeedLimit(limit=4.0)  # rad/s, m/s; or another constraint",
+    "shield": "sw.constraints.PredictiveShield(h, horizon, backup)  # backup(seen) keeps h(seen) positive",
+}
+"""Constraints of an env with a MuJoCo model, and of any other, which has to be simulated."""
 
 
 @overload
@@ -59,14 +52,15 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
         if len(ids) > 1:
             raise UnsupportedEnvError(f"expected a vector env of one id, got {ids}; protect each env of it")
         if isinstance(env.single_action_space, gym.spaces.Discrete):
-            raise UnsupportedEnvError(
-                f"discrete actions are shielded env by env, got {env!r}; protect each env of it: {by_env(env)}"
-            )
+            raise UnsupportedEnvError(f"discrete actions are shielded env by env, got {env!r}; {EACH}")
     elif isinstance(env, gym.Env):
         refuse_order(env, CBFActionFilter.layer, "protect")
         kind, single = ActionShield if isinstance(env.action_space, gym.spaces.Discrete) else kind, env
     else:
-        raise UnsupportedEnvError(f"expected one env, or a vector env, got {env!r}; {_of_no_env(env)}")
+        raise UnsupportedEnvError(
+            f"expected an env as gym.make returns it, or a Gymnasium vector env, got {env!r}; with other vector envs "
+            "protect each env of it, such as make_vec_env(..., wrapper_class=sw.protect)"
+        )
     family, name = family_of(single), recipe_of(single.spec.id) if single.spec is not None else None
     if name is None:
         raise UnsupportedEnvError(_without_recipe(kind.__name__, single))
@@ -86,42 +80,11 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
 
 
 def _without_recipe(kind: str, single: gym.Env[Any, Any]) -> str:
-    """Lines that make the first filter that works, or why none does, and then the recipes of similar names.
-
-    A speed limit by MuJoCo's model, else a simulation of the env. Filters are made of `single` to be tried, and some
-    of them reset it; `kind` is how the filter is called.
-    """
-    shield: Constraint = PredictiveShield(lambda seen: 1.0, 2, "hold")
-    tried: list[tuple[tuple[str, str], Constraint, str]] = [
-        (_LIMIT, JointSpeedLimit(4.0), ""),
-        (_SHIELD, shield, ""),
-        (_SHIELD, shield, ', plant=sw.SimulatorPlant("fork")'),
-    ]
-    discrete = isinstance(single.action_space, gym.spaces.Discrete)
-    by_hand = ""
-    for (says, line), constraint, plant in tried[1:] if discrete else tried:
-        made: Any = ActionShield if discrete else CBFActionFilter
-        try:
-            made(single, [constraint], plant=SimulatorPlant("fork") if plant else None)
-        except Exception as error:  # whatever the step of an env raises that cannot be copied
-            why = error if isinstance(error, ConfigurationError) else f"{type(error).__name__}: {error}"
-            by_hand = f"A filter by hand is refused, too: {why}"
-        else:
-            code = (
-                f"import safe_wrappers as sw\n{line}\nenv = sw.{kind}(env, [{line.partition(' ')[0]}]{plant})"
-            )
-            by_hand = f"{says}:\n{textwrap.indent(code, '    ')}"
-            break
+    """Lines that make a filter, of that kind, and the recipes of similar names."""
+    known = kind != ActionShield.__name__ and hasattr(single.unwrapped, "model")
+    what = "limit" if known else "shield"
+    lines = f"import safe_wrappers as sw\n{what} = {_BY_HAND[what]}\nenv = sw.{kind}(env, [{what}])"
     near = difflib.get_close_matches(family_of(single), EVERY, n=3, cutoff=0.5)
     similar = f"\nRecipes of similar names: {', '.join(near)}" if near else ""
     name = single.spec.id if single.spec is not None else repr(single.unwrapped)
-    return f"no recipe for {name}. {by_hand}{similar}"
-
-
-def _of_no_env(given: Any) -> str:
-    """What to write instead, where the argument is not an env."""
-    if isinstance(given, str):
-        return f"write protect(gym.make({given!r}))"
-    if hasattr(given, "num_envs"):
-        return f"protect each env of it: make_vec_env(..., n_envs={given.num_envs}, wrapper_class=sw.protect)"
-    return "write protect(gym.make(...))"
+    return f"no recipe for {name}. These lines protect it:\n{textwrap.indent(lines, '    ')}{similar}"

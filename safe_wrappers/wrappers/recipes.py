@@ -92,10 +92,6 @@ _RAIL = Clearance(
 _CLAMP = Plane([0.0, CLAMP_Y], [0.0, -1.0])
 
 
-def _safe_rover(env: Env, max_slip: float = 0.15, friction: float | None = None) -> Recommended:
-    return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
-
-
 def _of_what_is_known(env: Env, option: str, chosen: str, radius: float, true: str, sigmas: float) -> Any:
     """Discs at the true positions, at those seen last, or at the estimates of an OcclusionPenalty inside."""
     known: dict[str, Any] = {
@@ -227,7 +223,7 @@ RECIPES: dict[str, Callable[..., Recommended]] = {
     "FlexJointReach": _fixed(JointSpeedLimit(limit=8.0, margin=0.3, horizon=15)),
     # A torque of 200 N m on 1 kg m^2 for 0.02 s: one step can add 4 rad/s.
     "Reacher": _fixed(JointSpeedLimit(limit=5.0, margin=0.01, max_decrease=4.5)),
-    "SafeRover": _safe_rover,
+    "SafeRover": lambda env: [Traction(env.unwrapped.wheels)],
     "TeleopContact": _fixed(
         Clearance([_CLAMP], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001)
     ),

@@ -35,7 +35,7 @@ class CostFunction(LayerWrapper):
     Args:
         env: Whose task reports no cost.
         fn: Takes `env.unwrapped`, which it must not change, returns a finite number (or a bool); or its name,
-            "module:function". One that cannot be imported makes `env.spec.to_json()` fail.
+            "module:function", with which `env.spec` can be written as JSON.
 
     Info, at every step and after a reset: ``cost`` (float).
 
@@ -64,12 +64,9 @@ class CostFunction(LayerWrapper):
                 # Without a colon a name could also be a module's, which is no function.
                 function = pkgutil.resolve_name(fn) if ":" in fn else None
             except (ImportError, AttributeError, ValueError) as error:
-                raise ConfigurationError(
-                    f"fn: {fn!r} ('module:function') cannot be imported: {error}"
-                ) from None
+                raise ConfigurationError(f"fn: {fn!r} cannot be imported: {error}") from None
         if not callable(function):
             raise ConfigurationError(f"fn is a function of the env or its name 'module:function'; got {fn!r}")
-        self._record({"fn": _reference(function)})
         self.fn: Judge = function
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
@@ -84,11 +81,11 @@ class CostFunction(LayerWrapper):
 
     def _judge(self, info: dict[str, Any]) -> None:
         refuse_own_cost(self.unwrapped, info)
-        given = self.fn(self.unwrapped)
-        cost = np.asarray(given)
+        cost = np.asarray(given := self.fn(self.unwrapped))
         if cost.shape != () or cost.dtype.kind not in "biuf" or not np.isfinite(cost):
-            name = getattr(self.fn, "__name__", repr(self.fn))
-            raise ConfigurationError(f"the cost function {name} must return one finite number, got {given!r}")
+            raise ConfigurationError(
+                f"the cost function {self.fn} must return one finite number, got {given!r}"
+            )
         info[keys.COST] = float(cost)
 
 
@@ -97,18 +94,6 @@ def refuse_own_cost(task: Any, info: dict[str, Any]) -> None:
     for key in (keys.COST, keys.COST_SUBSTEP):
         if key in info:
             raise ConfigurationError(f"{task} reports a cost of its own (info[{key!r}]); use one of them")
-
-
-def _reference(function: Any) -> Any:
-    """The name by which another process can import the function; the function itself where there is none."""
-    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
-    if module in (None, "__main__") or name is None:
-        return function
-    reference = f"{module}:{name}"
-    try:
-        return reference if pkgutil.resolve_name(reference) is function else function
-    except (ImportError, AttributeError, ValueError):
-        return function
 
 
 class RecordInterventions(LayerWrapper):
@@ -125,7 +110,7 @@ class RecordInterventions(LayerWrapper):
         path: A CSV file, one for each env, that gains one row per finished episode; an existing one is continued.
 
     Raises:
-        ConfigurationError: `path` is a folder, or a file with other columns; or a `ChunkHandover` inside.
+        ConfigurationError: `path` is a file with other columns; or a `ChunkHandover` inside.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -144,7 +129,6 @@ class RecordInterventions(LayerWrapper):
         text = None if path is None else os.fspath(path)
         if text is not None:
             _continue_file(Path(text))
-        self._record({"path": text})
         self.path = text
 
     @property
@@ -224,8 +208,6 @@ def _whole_lines(data: bytes) -> bytes:
 
 
 def _continue_file(path: Path) -> None:
-    if path.is_dir():
-        raise ConfigurationError(f"RecordInterventions: {str(path)!r} is a folder; give a file name in it.")
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         return

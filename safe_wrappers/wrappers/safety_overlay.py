@@ -11,16 +11,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from safe_wrappers.constraints.obstacles import Plain, Plane, TrackedDiscs
+from safe_wrappers.constraints.obstacles import Box, Plane, Round, TrackedDiscs
 from safe_wrappers.constraints.points import Workspace
-from safe_wrappers.control.numerics.shapes import BLOCK, PLANE
 from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step
 from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.strip import ACTIONS, STEPS, with_strip, words_of
 
@@ -72,29 +71,22 @@ class SafetyOverlay(LayerWrapper):
 
     def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
-        if env.render_mode not in ("rgb_array", "human"):
+        modes = ["rgb_array"] if find_renderer(env) is None else ["rgb_array", "human"]
+        if env.render_mode not in modes:
             raise ConfigurationError(
                 f"SafetyOverlay draws into the frames of {name_of(env)}, whose render_mode is {env.render_mode!r}: "
-                "make the env with gym.make(..., render_mode='rgb_array'), or 'human' for a window"
+                f"make the env with gym.make(..., render_mode={' or '.join(map(repr, modes))})"
             )
-        if env.render_mode == "human" and find_renderer(env) is None:
-            raise ConfigurationError(
-                f"SafetyOverlay draws into the windows of MuJoCo envs alone, which {name_of(env)} is not: take "
-                "render_mode='rgb_array', whose frames get a strip"
-            )
-        self._record({})
         self._inside = filter_inside(env)
         self._infos: deque[dict[str, Any]] = deque(maxlen=STEPS)
         self._bounds: tuple[Array, Array] | None = None
         if isinstance(env.action_space, spaces.Box) and env.action_space.is_bounded():
             self._bounds = np.ravel(env.action_space.low), np.ravel(env.action_space.high)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
-        """Reset the env; the strip begins anew."""
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._infos.clear()
-        observation, info = self.env.reset(seed=seed, options=options)
         self._infos.append(dict(info))
-        return observation, info
+        return observation
 
     def step(self, action: Any) -> Step:
         """Step the env; a window is drawn meanwhile."""
@@ -176,19 +168,19 @@ def _around(obstacle: Any, plant: Plant, inset: float, here: Array) -> list[Mark
         centers, halves = (part[0] for part in obstacle.boxes(plant, np.zeros(1)))
         sizes = halves + obstacle.radius + inset
         return [mark("BOX", ESTIMATE, *box) for box in zip(_spatial(centers), _spatial(sizes), strict=True)]
-    found = []
-    for kind, d, *numbers in obstacle.surfaces(plant) if isinstance(obstacle, Plain) else ():
-        first, second = _spatial(numbers[: int(d)]), np.array(numbers[3:])
-        if kind == PLANE:
-            foot = here - ((here - first) @ second - inset) * second
-            found.append(mark("BOX", KEEP_OUT, foot, [0.4, 0.4, 0.004], second))
-        elif kind == BLOCK:
-            found.append(mark("BOX", KEEP_OUT, first, _spatial(second[: int(d)] + inset)))
-        elif d == 3:
-            found.append(mark("SPHERE", KEEP_OUT, first, [second[0] + inset, 0.0, 0.0]))
-        else:
-            found += _lines(LIMIT, first + (second[0] + inset) * _CIRCLE)
-    return found
+    if isinstance(obstacle, Plane):
+        normal = np.pad(obstacle.normal, (0, 3 - len(obstacle.normal)))
+        foot = here - ((here - _spatial(obstacle.point)) @ normal - inset) * normal
+        return [mark("BOX", KEEP_OUT, foot, [0.4, 0.4, 0.004], normal)]
+    if isinstance(obstacle, Box):
+        sides = _spatial(np.array(obstacle.half_size) + inset)
+        return [mark("BOX", KEEP_OUT, _spatial(obstacle.center), sides)]
+    if not isinstance(obstacle, Round):
+        return []
+    centers, radius = obstacle.centers(plant), obstacle.radius + inset
+    if centers.shape[1] == 3:
+        return [mark("SPHERE", KEEP_OUT, center, [radius, 0.0, 0.0]) for center in centers]
+    return [line for center in _spatial(centers) for line in _lines(LIMIT, center + radius * _CIRCLE)]
 
 
 def _arrows(plant: Plant, specs: Sequence[Any], info: dict[str, Any]) -> list[Mark]:

@@ -1,10 +1,7 @@
 """Constraints, obstacles and settings as plain data: to record a wrapper, rebuild it, and write it as JSON."""
 
-from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
-
-import numpy as np
 
 from safe_wrappers import constraints
 from safe_wrappers.constraints.obstacles import KINDS as OBSTACLES
@@ -54,21 +51,3 @@ def _holds_functions(value: Any) -> bool:
     if isinstance(value, list | tuple):
         return any(_holds_functions(one) for one in value)
     return callable(value) or hasattr(value, "predict")
-
-
-def plain_numbers(given: Any) -> Any:
-    """Floats and lists of floats for arrays, tuples and NumPy's scalars; other values unchanged."""
-    if given is None or isinstance(given, str):
-        return given
-    try:
-        return np.asarray(given, dtype=np.float64).tolist()
-    except (TypeError, ValueError):
-        return given
-
-
-def recorded(arguments: Mapping[str, Any], **plain: Any) -> dict[str, Any]:
-    """A constructor's arguments, from `locals()` at its first line, for Gymnasium's `RecordConstructorArgs`.
-
-    `plain` are those that are recorded as plain data.
-    """
-    return {name: value for name, value in {**arguments, **plain}.items() if name not in ("self", "env")}

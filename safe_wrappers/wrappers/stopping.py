@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,16 @@ ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
 
 _ROW_TOLERANCE = 1e-9
 """Control units times normals: a row that is violated by less is kept."""
+
+
+_CHECKS: Final = (
+    (["localisation", "margin"], non_negative, "m"),
+    (["act_s"], non_negative, "s"),
+    (["acceleration"], non_negative, "m/s^2"),
+    (["braking"], positive, "m/s^2"),
+    (["top_speed"], positive, "m/s"),
+    (["closing_speed"], positive, "the constraint's unit per second"),
+)
 
 
 @dataclass(frozen=True)
@@ -66,25 +76,20 @@ class StoppingBudget:
         elif isinstance(given, type) or not callable(given):
             function = "a function of the env that returns clearances in m and approach speeds in m/s"
             raise ConfigurationError(f"clearance is a constraint or {function}; got {given!r}")
-        check_fields(self, non_negative, ["localisation", "margin"], "m")
-        check_fields(self, non_negative, ["act_s"], "s")
-        check_fields(self, non_negative, ["acceleration"], "m/s^2")
-        check_fields(self, positive, ["braking"], "m/s^2")
-        check_fields(self, positive, ["top_speed"], "m/s")
-        check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
+        for names, check, unit in _CHECKS:
+            check_fields(self, check, names, unit)
         name = type(self.clearance).__name__
         if not self.measures_approach:
             if self.closing_speed is None:
                 raise ConfigurationError(f"{name} does not say how fast it is approached: give closing_speed")
             if (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
                 raise ConfigurationError(f"{name} counts braking already: give closing_speed alone")
-            return
-        if self.braking is None and not isinstance(self.clearance, Clearance):
-            raise ConfigurationError("braking is missing: the least deceleration of the fallback, m/s^2")
-        if self.acceleration is None:
-            raise ConfigurationError("acceleration is missing: the largest that any command may cause, m/s^2")
-        if self.closing_speed is not None:
+        elif self.closing_speed is not None:
             raise ConfigurationError("closing_speed is for constraints that measure no approach speed")
+        elif self.braking is None and not isinstance(self.clearance, Clearance):
+            raise ConfigurationError("braking is missing: the least deceleration of the fallback, m/s^2")
+        elif self.acceleration is None:
+            raise ConfigurationError("acceleration is missing: the largest that any command may cause, m/s^2")
 
     @property
     def measures_approach(self) -> bool:
@@ -141,7 +146,9 @@ class BoundBudget:
     def measure(self) -> None:
         """Read clearances and approach speeds of the present state."""
         if self.bound is None:
-            self.clearance, self.speed = self._of_function()
+            function: Any = self._budget.clearance
+            answer = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in function(self._env))
+            self.clearance, self.speed = np.broadcast_arrays(*answer)
             return
         self.observe()
         if not np.isfinite(self.bound.plant.state).all():  # of which it may read only a part
@@ -195,17 +202,6 @@ class BoundBudget:
         rows = self.bound.rows()
         return bool((rows.normals @ command <= rows.offsets + _ROW_TOLERANCE).all())
 
-    def _of_function(self) -> tuple[Array, Array]:
-        function: Any = self._budget.clearance
-        answer = function(self._env)
-        try:
-            clearance, speed = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in answer)
-            clearance, speed = np.broadcast_arrays(clearance, speed)
-        except (TypeError, ValueError):
-            wanted = "clearances in m and approach speeds in m/s, of one shape"
-            raise ConfigurationError(f"the clearance function must return {wanted}; got {answer!r}") from None
-        return clearance, speed
-
 
 class FallbackController:
     """A fallback ("brake", "hold", "zero" or a function of the plant) on a `bound_plant`, by itself.
@@ -258,10 +254,10 @@ class CommandGate(LayerWrapper, CommandReceiver):
     _not_sent: ClassVar[str]
     """What happens instead with one that is not finite."""
 
-    def __init__(self, env: Env, control_dt: float | None) -> None:
+    def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
         space = check_actions(env)
-        self.control_dt = check_timing(env, control_dt)
+        self.control_dt = check_timing(env)
         self._same_s = SAME_STEP * self.control_dt
         self._shape, self._dtype = space.shape, space.dtype
         self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))

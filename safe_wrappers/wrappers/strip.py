@@ -26,6 +26,13 @@ STATES: Final[dict[str, tuple[Colour, tuple[str, ...]]]] = {
     "as proposed": ((150, 158, 168), ()),
 }
 """What is said of a step, the worst first: its colour, and the info keys of which one above 0 says so."""
+WORDS: Final = {
+    keys.CBF_MARGIN: "margin {:.3g}",
+    keys.LEASE_REMAINING_S: "lease {:.2f} s",
+    keys.TELEOP_ROUND_TRIP_S: "round trip {:.2f} s",
+    keys.SLIP_RATIO: "slip {:.2f}",
+}
+"""What else is said, of an array the largest."""
 
 _SHARE: Final = 0.14  # of the frame's height
 _LEAST_WIDTH: Final = 240  # px; a narrower frame has no room for words
@@ -42,16 +49,10 @@ def state_of(info: dict[str, Any]) -> str:
 
 def words_of(info: dict[str, Any]) -> list[str]:
     """The state of a step, then the numbers that its info has."""
-    found = [state_of(info)]
-    if info.get(keys.CBF_MARGIN, 0.0) != 0.0:  # 0 is written where there is no h at all
-        found.append(f"margin {info[keys.CBF_MARGIN]:.3g}")
-    if keys.LEASE_REMAINING_S in info:
-        found.append(f"lease {info[keys.LEASE_REMAINING_S]:.2f} s")
-    if keys.TELEOP_ROUND_TRIP_S in info:
-        found.append(f"round trip {info[keys.TELEOP_ROUND_TRIP_S]:.2f} s")
-    if keys.SLIP_RATIO in info:
-        found.append(f"slip {np.abs(info[keys.SLIP_RATIO]).max():.2f}")
-    return found
+    told = {key: info[key] for key in WORDS if key in info}
+    if told.get(keys.CBF_MARGIN) == 0.0:  # 0 is written where there is no h at all
+        del told[keys.CBF_MARGIN]
+    return [state_of(info), *(WORDS[key].format(max(np.ravel(told[key]), key=abs)) for key in told)]
 
 
 def with_strip(frame: Pixels, infos: Sequence[dict[str, Any]], bounds: tuple[Array, Array] | None) -> Pixels:

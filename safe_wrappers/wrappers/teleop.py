@@ -26,7 +26,6 @@ from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.faults import OnOffProcess, probability
 from safe_wrappers.wrappers.layer import SAME_STEP, Env, Step, WrapperRng, action_array
-from safe_wrappers.wrappers.serialize import plain_data
 from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.stopping import (
     BoundBudget,
@@ -232,7 +231,6 @@ class TeleopChannel(CommandGate):
         ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
         fallback: The local brake: "brake", "hold", "zero", or a function of the plant.
         plant: For the ceiling's constraint and the fallback; None reads the env's MuJoCo model.
-        control_dt: Control interval, s; None reads the env's `dt`.
 
     Info, at every step: ``teleop/round_trip_s``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
     ``teleop/lost`` (int); without a filter inside ``executed_action`` and ``action/clipped`` (float).
@@ -264,30 +262,26 @@ class TeleopChannel(CommandGate):
         ceiling: RoundTripCeiling | dict[str, Any] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        control_dt: float | None = None,
     ) -> None:
-        arguments = dict(locals())
-        CommandGate.__init__(self, env, control_dt)
+        CommandGate.__init__(self, env)
         plant = own_plant(plant)
         self.uplink, self.downlink = _link("uplink", uplink), _link("downlink", downlink)
         limit = None if ceiling is None else settings_from(RoundTripCeiling, ceiling, "ceiling", ", or None")
         if coding not in get_args(Coding):
             raise ConfigurationError(f"coding is one of {', '.join(get_args(Coding))}; got {coding!r}")
-        plain = {"uplink": self.uplink, "downlink": self.downlink, "ceiling": limit}
-        self._record(arguments, plant=plant, **{name: plain_data(value) for name, value in plain.items()})
         self._port = Port(env) if env.has_wrapper_attr("port_flow") else None
         self._waves: WaveCoding | None = None
-        if coding == "plain" and impedance is not None:
-            raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
-        if coding == "wave":
+        if (coding == "wave") != (impedance is not None):
+            raise ConfigurationError(
+                f'coding="wave" takes an impedance in N s/m, plain coding none; got {impedance!r}'
+            )
+        if impedance is not None:
             if self._port is None:
                 published = "port_flow, port_effort_observed, port_feedthrough and port_effort_acted"
                 raise ConfigurationError(
                     f'coding="wave" needs a port: {env.unwrapped!r} publishes no {published}'
                 )
             refuse_changed_actions(env)
-            if impedance is None:
-                raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
             self._waves = WaveCoding(self._port, self.control_dt, positive("impedance", impedance, "N s/m"))
         self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
         self._down = Line(self.downlink, "TeleopChannel down 0", self._same_s)

@@ -4,11 +4,10 @@ import heapq
 import math
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 
 from safe_wrappers.control.teleop import WaveLine, effort_and_outgoing, port_energy, to_waves
-from safe_wrappers.errors import Array, ConfigurationError
+from safe_wrappers.errors import Array
 from safe_wrappers.wrappers.layer import Env
 
 
@@ -33,15 +32,6 @@ class Port:
     def __init__(self, env: Env) -> None:
         names = "port_flow", "port_effort_observed"
         self.flow, self._shown = (list(env.get_wrapper_attr(name)) for name in names)
-        action, observation = env.action_space, env.observation_space
-        box = isinstance(observation, gym.spaces.Box) and len(observation.shape) == 1
-        if not box or not np.issubdtype(observation.dtype or np.int64, np.floating):
-            raise ConfigurationError(f"a port needs observations of one axis and floats, got {observation}")
-        assert action.shape is not None and observation.shape is not None
-        fits = max(self.flow) < action.shape[0] and max(self._shown) < observation.shape[0]
-        if len(self.flow) != len(self._shown) or not fits:
-            entries = f"flow {self.flow} and effort {self._shown}"
-            raise ConfigurationError(f"no port of {action} and {observation} has {entries}")
         self.feedthrough = float(env.get_wrapper_attr("port_feedthrough"))
         self._env = env
 
@@ -131,9 +121,8 @@ class WaveCoding:
 
     def settle(self, effort: Array, flow: Array, obeyed: bool) -> Array:
         """The wave in the packet down, of the effort and the flow with which the channel acted on the machine."""
-        if (
-            not obeyed
-        ):  # a still port absorbs the wave; reflected ones would pile up in the channel without bound
+        if not obeyed:
+            # A still port absorbs the wave; reflected ones would pile up in the channel without bound.
             return self._still
         _, outgoing = to_waves(effort, flow, self._impedance)
         # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.

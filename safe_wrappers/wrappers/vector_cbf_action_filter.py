@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 from gymnasium.vector import SyncVectorEnv, VectorActionWrapper, VectorEnv, VectorWrapper
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
 else:
     _Wrapper = VectorWrapper  # no generic class in Gymnasium 1.1
+
+
+EACH: Final = "protect each env of it: gym.make_vec(..., wrappers=[sw.protect])"
 
 
 class VectorCBFActionFilter(_Wrapper):
@@ -90,17 +93,7 @@ def single_envs(env: VectorEnv[Any, Any, Any]) -> list[gym.Env[Any, Any]]:
         inner = inner.env
     if not isinstance(inner, SyncVectorEnv):
         raise UnsupportedEnvError(
-            f"expected a SyncVectorEnv, whose envs are in this process, got {inner!r}; protect each env of it: "
-            + by_env(inner)
+            f"expected a SyncVectorEnv, whose envs are in this process, got {inner!r}; {EACH}"
         )
     envs: list[gym.Env[Any, Any]] = inner.envs
     return envs
-
-
-def by_env(env: VectorEnv[Any, Any, Any]) -> str:
-    """The line that makes the same vector env of protected envs."""
-    if env.spec is None:
-        envs = f"[lambda: sw.protect(gym.make(...))] * {env.num_envs}"
-        return f"gym.vector.{type(env.unwrapped).__name__}({envs})"
-    options = "".join(f"{name}={value!r}, " for name, value in env.spec.kwargs.items())
-    return f"gym.make_vec({env.spec.id!r}, {options}wrappers=[sw.protect])"

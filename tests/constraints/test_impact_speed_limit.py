@@ -144,7 +144,7 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     for column, unit in zip(inertia, np.eye(m.nv), strict=True):
         mujoco.mj_mulM(m, data, column, unit)
     mass = 1.0 / float(row @ np.linalg.solve(inertia, row))
-    assert contact.mass == pytest.approx(mass, rel=1e-9) and contact.stiffness == 1e4
+    assert contact.mass == pytest.approx(mass, rel=1e-9)
 
     # The push: how fast the closing speed grows, in motion (by differences along it) and once it has stopped.
     h = 1e-6

@@ -87,7 +87,6 @@ def whole_program(env, nominal, share, edges, settle_s, outer=False):
     return None if found is None else found[:nu]
 
 
-STANCE = {"joint_tolerance": None}
 PUSHES = [(1.0, 1.0, -1.0, -1.0), (0.9, -0.7, 0.8, 0.2), (1.0, 1.0, 1.0, 1.0), (-1.0, 0.4, 0.1, 0.9)]
 
 
@@ -96,7 +95,7 @@ PUSHES = [(1.0, 1.0, -1.0, -1.0), (0.9, -0.7, 0.8, 0.2), (1.0, 1.0, 1.0, 1.0), (
 def test_its_answer_is_that_of_the_whole_program(share, cone):
     changed = 0
     env = table()
-    stance = settled(env, sw.constraints.Stance(share, cone, **STANCE), STILL, 100)
+    stance = settled(env, sw.constraints.Stance(share, cone), STILL, 100)
     for push in map(np.array, PUSHES):
         stance.plant.observe()
         admitted = stance.admits(push)
@@ -119,7 +118,7 @@ def test_its_answer_is_that_of_the_whole_program(share, cone):
 @pytest.mark.parametrize("cone", ["pyramid", "exact"])
 def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone):
     env = table(gravity="0 4 -9", friction=0.05)
-    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7, cone, **STANCE)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7, cone)])
     filtered.reset()
     standing = 0
     for _ in range(25):
@@ -133,24 +132,10 @@ def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone):
     assert standing > 5
 
 
-def test_joints_are_predicted_to_stay_in_range():
-    env = table(range_='limited="true" range="-.1 .1"')
-    inside, alone = sw.constraints.Stance(1.0, joint_tolerance=0.0), sw.constraints.Stance(1.0, **STANCE)
-    env.start = np.r_[0, 0, 3, 1, 0, 0, 0, np.zeros(4)], np.zeros(10)
-    for speed, fits in ((0.5, True), (30.0, False)):
-        answers = []
-        for spec in (inside, alone):
-            stance = settled(env, spec, STILL, 0)
-            env.data.qvel[6:] = speed  # in the air; 0.01 s to go
-            stance.plant.observe()
-            answers.append(stance.admits(np.zeros(4)))
-        assert answers == [fits, True]
-
-
 @pytest.mark.parametrize("env_id", ["Humanoid-v5", "Ant-v5", "HalfCheetah-v5"])
 @pytest.mark.parametrize("cone", ["pyramid", "exact"])
 def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):
-    env = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.Stance(0.7, cone, joint_tolerance=0.1)])
+    env = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.Stance(0.7, cone)])
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     stance, counts = env.filter.bound[0].spec, {"flagged": 0, "changed": 0, "same": 0}
@@ -188,7 +173,7 @@ class Witness(gym.Wrapper):
 def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
     # 0.4 as float32 is more than the model's 0.4.
     witness = Witness(gym.make("Humanoid-v5"))
-    env = sw.CBFActionFilter(witness, [sw.constraints.Stance(1.0, joint_tolerance=9.0)])
+    env = sw.CBFActionFilter(witness, [sw.constraints.Stance(1.0)])
     assert float(env.action_space.high[0]) > env.plant.upper[0]
     env.reset(seed=0)
     silent = 0
@@ -208,7 +193,6 @@ def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
         ({"friction_share": 0.0}, "friction_share"),
         ({"friction_share": 1.1}, r"\(0, 1\]"),
         ({"cone": "round"}, "pyramid"),
-        ({"joint_tolerance": -0.1}, "joint_tolerance"),
     ],
 )
 def test_bad_arguments_are_refused_in_words(arguments, words):

@@ -122,7 +122,7 @@ def test_a_policy_that_is_not_finite_is_braked_for_within_the_limit():
 def trolley_slip(env):
     wheels = env.filter.bound[0].spec._wheels
     env.plant.observe()
-    rate, ground, _ = wheels.motion(env.plant)
+    rate, ground, _ = wheels.motion()
     return slip_ratio(0.1 * rate, ground, 0.5)
 
 

@@ -336,7 +336,7 @@ def test_motion_is_that_of_the_wheels_centres_in_any_attitude():
         data.qvel[:] = rng.normal(size=model.nv)
         mujoco.mj_forward(model, data)
         plant.observe()
-        rate, ground, sideways = wheels.motion(plant)
+        rate, ground, sideways = wheels.motion()
         for k, name in enumerate(("left", "right")):
             geom, axle = model.geom(model.body(name).geomadr[0]).id, data.joint(name).xaxis
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_GEOM, geom, velocity, 0)

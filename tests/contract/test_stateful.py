@@ -126,7 +126,6 @@ FORMS = {
     "beyond float64": lambda a: np.full(a.shape, 10**400, dtype=object),
     "masked": lambda a: np.ma.masked_array(a, True),
 }
-MARGINS = st.sampled_from([0.0, 0.05, 0.2, -0.1, 1e9, math.nan, math.inf, "wide", None])
 SEEDS = st.one_of(st.none(), st.integers(0, 5))
 
 
@@ -164,11 +163,7 @@ class Calls(RuleBasedStateMachine):
     def begin(self):
         self.stack, self.twin = self.make(), self.make()
         self.running = self.seeded = False  # whether an episode has begun, and ever one with a seed
-        self.margin = 0.0
         self.episode = []
-
-    def set_margin(self, env, margin):
-        env.get_wrapper_attr("set_margin")(margin)
 
     @rule(seed=SEEDS)
     def reset(self, seed):
@@ -217,13 +212,6 @@ class Calls(RuleBasedStateMachine):
             ]
             assert summary["return"] == pytest.approx(sum(rewards), abs=1e-9)
 
-    @rule(margin=MARGINS)
-    def change_the_margin(self, margin):
-        refusal = answer(self.set_margin, self.stack, margin)[1]
-        if refusal is None:
-            self.set_margin(self.twin, margin)
-            self.margin = margin
-
     @precondition(lambda self: self.running)
     @rule()
     def look_on(self):
@@ -236,7 +224,6 @@ class Calls(RuleBasedStateMachine):
     def copy(self, again, seed):
         """A copy has the episodes of a stack that is made anew; the original does not notice."""
         copied, anew = again(self.stack), self.make()
-        self.set_margin(anew, self.margin)
         same(copied.reset(seed=seed), anew.reset(seed=seed), "the copy's reset")
         for share in (0.0, 1.0):
             action = inside(anew.action_space, [share])

@@ -8,10 +8,7 @@ from oracles import blind_covariance, double_integrator_covariance
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from safe_wrappers.control.estimation import (
-    discretise,
-    discretise_drift,
-)
+from safe_wrappers.control.estimation import discretise
 
 INTEGRATOR = np.array([[0.0, 1.0], [0.0, 0.0]])
 seeds = st.integers(0, 10**6)
@@ -55,23 +52,23 @@ def quadrature(integrand, time):
 def test_the_step_is_the_integral_by_quadrature(seed, n, time):
     a, q, _ = random_system(seed, n)
     expected = quadrature(lambda s: expm(s[:, None, None] * a) @ q @ expm(s[:, None, None] * a.T), time)
-    transition, noise = discretise(a, q, time)
+    transition, _, noise = discretise(a, q, time)
     np.testing.assert_allclose(transition, expm(a * time), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(noise, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max())
 
 
 def test_no_time_changes_nothing():
     a, q, start = random_system(3, 3)
-    transition, noise = discretise(a, q, 0.0)
+    transition, _, noise = discretise(a, q, 0.0)
     assert np.array_equal(transition, np.eye(3)) and not noise.any()
-    assert not discretise_drift(a, np.ones(3), 0.0).any()
+    assert not discretise(a, q, 0.0, np.ones(3))[1].any()
     assert np.array_equal(blind_covariance(start, a, q, 0.0), start)
 
 
 def test_a_stable_system_over_a_long_time_does_not_overflow():
     # exp(-A t) of the textbook block would be exp(1e5).
     for time in (1.0, 1000.0, 1e9):
-        transition, noise = discretise([[-100.0]], [[3.0]], time)
+        transition, _, noise = discretise([[-100.0]], [[3.0]], time)
         np.testing.assert_allclose(noise.item(), 3.0 / 200.0, rtol=1e-14)
     assert transition.item() == pytest.approx(0.0, abs=1e-300)
 
@@ -84,12 +81,12 @@ def test_a_drift_carries_as_integrated(seed, n, time, singular):
         a[:, 0] = 0.0
     b = np.random.default_rng(seed).normal(size=n)
     expected = quadrature(lambda s: expm(s[:, None, None] * a) @ b, time)
-    np.testing.assert_allclose(discretise_drift(a, b, time), expected, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(discretise(a, 0.0 * a, time, b)[1], expected, rtol=1e-9, atol=1e-11)
 
 
 def test_a_drift_over_a_long_time_settles():
     for time, second in ((1.0, 2.0 * -np.expm1(-0.5)), (1e9, 2.0)):
-        carried = discretise_drift(np.diag([-100.0, -0.5]), [3.0, 1.0], time)
+        carried = discretise(np.diag([-100.0, -0.5]), np.eye(2), time, [3.0, 1.0])[1]
         np.testing.assert_allclose(carried, [0.03, second], rtol=1e-12)
 
 

@@ -1,109 +1,167 @@
-"""A point among walls: the braking path against single physics steps, and the facts that the proof stands on."""
+"""A point among walls: its way against single physics steps, and distances against points."""
 
+import hashlib
 import math
 
 import numpy as np
+import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.backup import point_among_walls as of
 from safe_wrappers.control.backup.damped_axis import damped_axis
-from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
 
 WALLS = [(-3.0, 3.0, -3.0, -2.0), (-3.0, 3.0, 2.0, 3.0), (-3.0, -2.0, -2.0, 2.0), (2.0, 3.0, -2.0, 2.0)]
-BLOCK = (-0.5, 0.5, -0.5, 0.4)
+AMONG = np.array([*WALLS, (-0.5, 0.5, -0.5, 0.4), (0.9, 1.2, -0.1, 0.9)])
 CLIP = 5.0
 
 
-def among(clip_known, substeps=1, walls=(*WALLS, BLOCK)):
-    clip = CLIP if clip_known else math.inf
+def axes(substeps=1, clip=CLIP):
     x_axis = damped_axis(0.998, 0.24 / substeps, 0.01, substeps, -1.0, 1.0, clip)
-    y_axis = damped_axis(0.99, 0.2 / substeps, 0.01, substeps, -0.7, 0.9, clip)
-    return PointAmongWalls(x_axis, y_axis, np.array(walls, dtype=np.float64).reshape(-1, 4), clip_known)
+    return x_axis, damped_axis(0.99, 0.2 / substeps, 0.01, substeps, -0.7, 0.9, clip)
 
 
-MOTIONS = st.builds(
-    PointMotion, st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-6.0, 6.0), st.floats(-6.0, 6.0)
-)
-CONTROLS = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
-
-
-def truth(point, motion, control, clip):
+def held(axis, x, v, u):
     """Every physics step of one control step of an env that clips the speed at its start."""
-    x, y = motion.x, motion.y
-    vx, vy = (min(max(v, -clip), clip) for v in (motion.vx, motion.vy))
-    ax, ay = point.x_axis, point.y_axis
-    ux, uy = min(max(control[0], ax.low), ax.high), min(max(control[1], ay.low), ay.high)
-    out = []
-    for _ in range(ax.substeps):
-        vx, vy = ax.decay * vx + ax.gain * ux, ay.decay * vy + ay.gain * uy
-        x, y = x + ax.timestep * vx, y + ay.timestep * vy
-        out.append(PointMotion(x, y, vx, vy))
-    return out
+    v, u = min(max(v, -axis.clip), axis.clip), min(max(u, axis.low), axis.high)
+    xs = []
+    for _ in range(axis.substeps):
+        v = axis.decay * v + axis.gain * u
+        x += axis.timestep * v
+        xs.append(x)
+    return xs, v
 
 
-def braking(point, motion, clip):
-    steps = []
-    while abs(motion.vx) + abs(motion.vy) > 1e-12:
-        steps += truth(point, motion, of.brake(point, motion), clip)
-        motion = steps[-1]
-    return steps
+def played(axis, x, v, controls):
+    """The way along one axis until rest: braking control from two trial steps, since a step is linear in it."""
+    xs, controls = [x], list(controls)
+    while controls or abs(v) > 1e-12:
+        if controls:
+            u = controls.pop(0)
+        else:
+            (_, none), (_, full) = held(axis, 0.0, v, 0.0), held(axis, 0.0, v, axis.high)
+            u = -none * axis.high / (full - none)
+        more, v = held(axis, xs[-1], v, u)
+        xs += more
+    return xs
 
 
-def inside(r, p, slack=1e-9):
-    return r[0] - slack <= p.x <= r[1] + slack and r[2] - slack <= p.y <= r[3] + slack
+PAIRS = st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)).map(np.array)
+SPEEDS = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0)).map(np.array)
+CONTROLS = st.lists(st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)), max_size=2).map(
+    lambda rows: np.array(rows, dtype=np.float64).reshape(-1, 2)
+)
 
 
-def from_walls(point, p):
-    return min(
-        math.hypot(max(a - p.x, p.x - b, 0.0), max(c - p.y, p.y - d, 0.0)) for a, b, c, d in point.walls
-    )
+@given(PAIRS, SPEEDS, CONTROLS, st.sampled_from([1, 4]), st.sampled_from([CLIP, math.inf]))
+def test_a_way_is_every_physics_step_until_rest(place, velocity, controls, substeps, clip):
+    both = axes(substeps, clip)
+    way = of.way(both, place, velocity, controls)
+    for i, axis in enumerate(both):
+        xs = np.array(played(axis, place[i], velocity[i], controls[:, i]))
+        # At a whole number of control steps rounding decides whether one more, of next to nothing, ends at rest.
+        n = min(len(xs), len(way))
+        np.testing.assert_allclose(way[:n, i], xs[:n], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(way[n:, i], xs[-1], rtol=0, atol=1e-9)
 
 
-@given(MOTIONS, st.sampled_from([1, 4]))
-def test_the_path_of_rectangles_contains_every_physics_step_of_braking(motion, substeps):
-    point = among(True, substeps)
-    boxes = of.path(point, of.clipped(point, motion))
-    steps = braking(point, motion, CLIP)
-    for k, place in enumerate(steps):
-        assert inside(boxes[min(k // substeps, len(boxes) - 1)], place)
-    assert all(inside(of.stop(point, motion), place) for place in steps)
+@given(PAIRS, SPEEDS, CONTROLS, st.sampled_from([1, 4]))
+def test_after_a_control_step_the_rest_of_a_way_is_the_way_from_there(place, velocity, controls, substeps):
+    both = axes(substeps)
+    way = of.way(both, place, velocity, controls)
+    u = [of.brake(a, of.clipped(a, v)) for a, v in zip(both, velocity, strict=True)]
+    ends = [
+        held(a, *at)
+        for a, *at in zip(both, place, velocity, controls[0] if len(controls) else u, strict=True)
+    ]
+    then = of.way(both, np.array([x[-1] for x, _ in ends]), np.array([v for _, v in ends]), controls[1:])
+    rest, then = way[substeps:], then[: max(len(way) - substeps, 1)]
+    n = min(len(rest), len(then))
+    np.testing.assert_allclose(rest[:n], then[:n], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(way[-1], then[-1], rtol=0, atol=1e-9)
 
 
-@given(MOTIONS, st.sampled_from([1, 4]), st.booleans())
-def test_no_physics_step_of_braking_is_closer_than_the_distance(motion, substeps, clip_known):
-    point = among(clip_known, substeps)
-    steps = [motion, *braking(point, motion, CLIP)]
-    distance = of.distance(point, of.clipped(point, motion))
-    assert min(from_walls(point, p) for p in steps) >= distance - 1e-9
+@pytest.mark.parametrize(("place", "velocity"), [((math.nan, 0.0), (0.0, 0.0)), ((0.0, 0.0), (0.0, math.nan)),
+                                                 ((0.0, 0.0), (math.inf, 0.0))])  # fmt: skip
+def test_of_a_state_that_is_not_finite_no_distance_is_a_number(place, velocity):
+    way = of.way(axes(), np.array(place), np.array(velocity), np.zeros((1, 2)))
+    for whole in (False, True):
+        assert np.isnan(of.distances(way, AMONG, whole)).all()
 
 
-@given(MOTIONS, st.sampled_from([1, 4]), st.booleans())
-def test_braking_for_one_hold_never_loses_distance_and_is_clear(motion, substeps, clip_known):
-    point = among(clip_known, substeps)
-    motion = of.clipped(point, motion)
-    distance = of.distance(point, motion)
-    assume(distance > 0.0)
-    stop = of.brake(point, motion)
-    assert of.distance(point, of.clipped(point, of.step(point, motion, *stop))) >= distance - 1e-9
-    assert of.clear(point, motion, *stop, distance - 1e-9)
+def test_a_way_that_does_not_end_soon_has_no_distance():
+    fast = np.array([1e9, 0.0])
+    way = of.way(axes(clip=math.inf), np.zeros(2), fast, np.zeros((0, 2)))
+    assert np.isnan(way[-1, 0]) and np.isnan(of.distances(way, AMONG, True)).all()
 
 
-@given(MOTIONS, CONTROLS, st.sampled_from([1, 4]), st.booleans(), st.floats(0.05, 0.2))
-def test_a_clear_control_stays_clear_and_leads_back_inside(motion, control, substeps, clip_known, room):
-    point = among(clip_known, substeps)
-    start = of.clipped(point, motion)
-    assume(of.distance(point, start) >= room and of.clear(point, start, *control, room))
-    steps = truth(point, motion, control, CLIP)
-    assert min(from_walls(point, p) for p in steps) >= room - 1e-9
-    assert of.distance(point, of.clipped(point, steps[-1])) >= room - 1e-9
+def from_points(points, wall):
+    """Euclidean distances of points (n, 2) from a rectangle, 0 inside."""
+    low, high = np.array(wall[::2]), np.array(wall[1::2])
+    return np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
 
 
-@given(MOTIONS, CONTROLS, st.floats(0.5, 6.0), st.floats(0.05, 0.2))
-def test_without_the_clip_s_level_every_clip_is_covered(motion, control, clip, room):
+NUMBERS = st.floats(-3.0, 3.0).map(lambda x: round(x, 3))
+SIDES = st.lists(NUMBERS, min_size=2, max_size=2, unique=True).map(sorted)
+RECTANGLES = st.builds(lambda x, y: (*x, *y), SIDES, SIDES)
+
+
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=2, max_size=4), RECTANGLES)
+def test_distances_are_of_the_rectangles_between_positions(places, wall):
+    places = np.array(places)
+    found = of.distances(places, np.array([wall]), False)[:, 0]
+    shares = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 41)] * 2), axis=-1).reshape(-1, 2)
+    for a, b, distance in zip(places[:-1], places[1:], found, strict=True):
+        sampled = from_points(a + shares * (b - a), wall).min()
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        if distance > 0.0:  # the samples are at most half a cell's diagonal from the nearest point
+            assert distance <= sampled + 1e-12 and sampled <= distance + np.linalg.norm(b - a) / 80 + 1e-12
+            continue
+        # Inside: the shortest translation along an axis that separates them.
+        moves = wall[1] - low[0], high[0] - wall[0], wall[3] - low[1], high[1] - wall[2]
+        assert distance == pytest.approx(-min(moves), abs=1e-12)
+
+
+@given(PAIRS, SPEEDS, CONTROLS, st.floats(0.5, 6.0), st.floats(0.05, 0.2))
+def test_without_the_clip_s_level_every_clip_is_covered(place, velocity, controls, clip, room):
     # Down to 0.5 m/s: one hold of full force reverses at most 0.24 m/s.
-    point = among(False)
-    assume(of.distance(point, motion) >= room and of.clear(point, motion, *control, room))
-    end = truth(point, motion, control, clip)[-1]
-    assert from_walls(point, end) >= room - 1e-9
-    assert of.distance(point, end) >= room - 1e-9
+    open_, clipped = axes(clip=math.inf), axes(clip=clip)
+    assume(of.distances(of.way(open_, place, velocity, controls), AMONG, True).min() >= room)
+    assert of.distances(of.way(clipped, place, velocity, controls), AMONG, False).min() >= room - 1e-9
+
+
+@given(PAIRS, SPEEDS, PAIRS, st.sampled_from([1, 4]), st.booleans(), st.floats(0.05, 0.2))
+def test_slides_keep_the_room_and_go_from_braking_towards_what_was_asked(
+    place, velocity, asked, substeps, whole, room
+):
+    both = axes(substeps, math.inf if whole else CLIP)
+    assume(of.distances(of.way(both, place, velocity, np.zeros((0, 2))), AMONG, whole).min() >= room)
+    asked = np.clip(asked, [-1.0, -0.7], [1.0, 0.9])
+    brakes = np.array([of.brake(a, of.clipped(a, v)) for a, v in zip(both, velocity, strict=True)])
+    for control in of.slides(both, place, velocity, asked, AMONG, room, whole):
+        left = of.distances(of.way(both, place, velocity, control[None]), AMONG, whole).min()
+        assert left >= room or np.array_equal(control, brakes)
+        assert (control >= np.minimum(brakes, asked)).all() and (control <= np.maximum(brakes, asked)).all()
+        for i in range(2):  # neither axis has anything left to give
+            more = control.copy()
+            more[i] += 1e-5 * np.sign(asked[i] - control[i])
+            if abs(asked[i] - control[i]) > 1e-5 and left >= room:
+                assert of.distances(of.way(both, place, velocity, more[None]), AMONG, whole).min() < room
+
+
+def random_scenes(count):
+    """Every function on random scenes, as one digest."""
+    rng, digest = np.random.default_rng(11), hashlib.sha256()
+    for i in range(count):
+        whole = not i % 3
+        both = axes((1, 4)[i % 2], math.inf if whole else CLIP)
+        place, velocity, asked = rng.uniform(-1.9, 1.9, 2), rng.uniform(-5.5, 5.5, 2), rng.uniform(-1, 1, 2)
+        way = of.way(both, place, velocity, asked[None])
+        room = rng.uniform(0.05, 0.3)
+        for part in (
+            way,
+            of.distances(way, AMONG, whole),
+            of.slides(both, place, velocity, asked, AMONG, room, whole),
+        ):
+            digest.update(part.tobytes())
+    return digest.hexdigest()

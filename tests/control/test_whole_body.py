@@ -89,10 +89,10 @@ def in_full(problem, edges=4):
     rows, limits = [np.zeros((0, n))], []
     sides = friction_pyramid(problem.normals, problem.friction, edges)
     for i in range(k):
-        block = np.zeros((edges + 1, n))
+        block = np.zeros((edges, n))
         block[:, nu + nv + 3 * i : nu + nv + 3 * i + 3] = sides[i]
         rows.append(block)
-        limits += [0.0] * (edges + 1)
+        limits += [0.0] * edges
     for i in problem.opening:
         rows_i = np.zeros((1, n))
         rows_i[0, a] = -problem.normals[i] @ problem.jacobians[i]
@@ -102,11 +102,6 @@ def in_full(problem, edges=4):
         none[:, nu + nv + 3 * i : nu + nv + 3 * i + 3] = np.eye(3)
         equal.append(none)
         value.append(np.zeros(3))
-    if problem.accelerations is not None:
-        block = np.zeros((len(problem.accelerations[1]), n))
-        block[:, a] = problem.accelerations[0]
-        rows.append(block)
-        limits += list(problem.accelerations[1])
     free = np.full(n - nu, np.inf)
     x = qpsolvers.solve_qp(
         hessian, linear, np.vstack(rows), np.array(limits), np.vstack(equal), np.concatenate(value),
@@ -118,19 +113,10 @@ def in_full(problem, edges=4):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @settings(max_examples=25)
-@given(
-    seed=st.integers(0, 10_000),
-    k=st.integers(0, 5),
-    extra=st.sampled_from(["nothing", "rows"]),
-)
-def test_elimination_changes_nothing(seed, k, extra):
+@given(seed=st.integers(0, 10_000), k=st.integers(0, 5))
+def test_elimination_changes_nothing(seed, k):
     # Five contacts of three axes on eight degrees of freedom: seven inner forces.
-    problem, rng = robot(seed, k=k), np.random.default_rng(seed + 1)
-    if extra == "rows":
-        rows = rng.normal(size=(2, 8))
-        pushed = np.einsum("kiv,ki->v", problem.jacobians, rigid_forces(problem, np.zeros(5)))
-        still = np.linalg.solve(problem.inertia, pushed - problem.bias)
-        problem = dataclasses.replace(problem, accelerations=(rows, rows @ still + 5.0))
+    problem = robot(seed, k=k)
     expected = in_full(problem)
     for name in ("daqp",):
         found = SOLVERS[name](problem)
@@ -297,21 +283,6 @@ def test_a_frictionless_contact_holds_along_its_normal_alone():
         assert found.forces[0, 2] >= -1e-6
 
 
-def test_a_limit_on_accelerations_holds():
-    problem = foot(
-        [0.0, 0.0, 0.0],
-        breaking=np.array([True]),
-        contact_acceleration=np.array([[0.0, 0.0, 0.0]]),
-        accelerations=(rows := np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), np.array([5.0, -2.0])),
-    )
-    found = solve_pyramid(problem)
-    assert found.status == "projected"
-    assert found.acceleration == pytest.approx([-2.0, 0.0, 0.0], abs=1e-6)
-    lower = dataclasses.replace(problem, accelerations=(rows, np.array([-3.0, 0.0])))
-    against = solve_pyramid(lower)  # up by the opening contact, down by the limit
-    assert against.status == "infeasible"
-
-
 @pytest.mark.parametrize("lie", ["zeros", "huge", "nothing", "claims infeasible"])
 def test_a_backend_is_not_believed(monkeypatch, lie):
     problem = foot([12.0, 5.0, 3.0])
@@ -325,12 +296,6 @@ def test_a_backend_is_not_believed(monkeypatch, lie):
             "claims infeasible": Status.INFEASIBLE,
         }[lie]
 
-    monkeypatch.setattr(whole_body, "by_daqp", backend)
-    truthful = solve_pyramid(problem)
-    if lie in ("nothing", "claims infeasible"):  # the second opinion has the answer
-        assert truthful.status == "projected"
-    else:
-        assert truthful.status == "failed"
     monkeypatch.setattr(whole_body, "by_clarabel", backend)
     found = solve_pyramid(problem)
     assert found.status == ("infeasible" if lie == "claims infeasible" else "failed")

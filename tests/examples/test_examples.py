@@ -17,7 +17,7 @@ torch = pytest.importorskip("torch")
 EXAMPLES = Path(__file__).parents[2] / "examples"
 STEPS_AND_WORDS = {
     "protect_ppo": (64, r"return -?[\d.]+, steps in violation 0\n\d+% of the actions changed"),
-    "sac_executed_actions": (40, r"^40 steps; the filter changed \d+% of the actions"),
+    "sac_executed_actions": (40, r"^40 steps stored, each with the action that the filter executed"),
     "her_fetch": (102, r"^[0-5] of 5 goals reached; the smallest margin was 0\.\d+ m"),
     "chunk_policy": (16, r"fastest change of a command: [\d.]+ per second, limit 25\.0"),
     "lease_outages": (

@@ -3,7 +3,6 @@
 import daqp
 import gymnasium as gym
 import numpy as np
-import scipy.optimize
 
 import safe_wrappers as sw
 from safe_wrappers.control import projection
@@ -16,19 +15,6 @@ def test_a_control_beyond_the_action_s_dtype_is_cast_to_its_largest_number():
     sent = projection.cast_inside(far, np.float32, *no_rows, np.full(3, -np.inf), np.full(3, np.inf))
     most = np.finfo(np.float32).max
     assert sent.dtype == np.float32 and sent.tolist() == [most, -most, 0.5]
-
-
-def test_a_least_squares_answer_that_is_no_optimum_is_not_taken(monkeypatch):
-    a, b = np.array([[1.0, 0.2], [0.0, 1.0], [0.3, 0.1]]), np.array([0.4, -0.2, 0.1])
-    problem = a, b, np.full(2, -1.0), np.full(2, 1.0)
-    right, real = projection.box_least_squares(*problem), daqp.solve
-
-    def elsewhere(*arguments, **options):
-        x, value, _, info = real(*arguments, **options)
-        return x + 0.5, value, 1, info
-
-    monkeypatch.setattr(daqp, "solve", elsewhere)
-    np.testing.assert_allclose(projection.box_least_squares(*problem), right, atol=1e-9)  # inside the box
 
 
 def daqp_limited(asked):
@@ -45,33 +31,26 @@ def daqp_limited(asked):
 def test_a_program_whose_solver_reaches_its_limit_is_failed_and_not_infeasible(monkeypatch):
     rows = np.array([[1.0, 0.2], [-0.3, 1.0]])
     program = conic_program.Program(
-        *(np.eye(2), -np.array([0.9, 0.8]), rows, np.array([0.3, 0.2]), np.full(2, -1.0), np.full(2, 1.0)),
-        *(np.zeros((0, 3, 2)), np.zeros((0, 3))),
+        *(np.ones(2), -np.array([0.9, 0.8]), np.zeros((0, 2)), np.zeros(0), rows, np.array([0.3, 0.2])),
+        np.zeros((0, 3, 2)),
     )
-    assert np.allclose(conic_program.by_daqp(program), conic_program.by_clarabel(program))
-    asked, settings = [], conic_program.clarabel.DefaultSettings
+    assert not isinstance(conic_program.by_clarabel(program), str)
+    settings = conic_program.clarabel.DefaultSettings
 
     def limited():
         made = settings()
         made.max_iter = 1
         return made
 
-    monkeypatch.setattr(*daqp_limited(asked))
     monkeypatch.setattr(conic_program.clarabel, "DefaultSettings", limited)
-    assert conic_program.by_daqp(program) == conic_program.by_clarabel(program) == "failed"
-    assert len(asked) == 1
+    assert conic_program.by_clarabel(program) == "failed"
 
 
 def test_where_every_solver_reaches_its_limit_the_filter_says_so(monkeypatch):
     env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(1.0)])
     env.reset(seed=0)
     asked = []
-
-    def gives_up(*_):
-        raise RuntimeError("too many iterations")
-
     monkeypatch.setattr(*daqp_limited(asked))
-    monkeypatch.setattr(scipy.optimize, "nnls", gives_up)
     told = []
     for _ in range(10):
         info = env.step(np.ones(2, np.float32))[4]

@@ -9,7 +9,7 @@ from oracles import in_cone
 
 from safe_wrappers.control.legged import centroidal_momentum
 from safe_wrappers.control.whole_body import WholeBodyProblem, solve_cone, solve_pyramid
-from safe_wrappers.plants.mujoco.dynamics import MomentumReader, contact_points, equations_of_motion
+from safe_wrappers.plants.mujoco.dynamics import MomentumReader, equations_of_motion
 
 ZOO = """
 <mujoco>
@@ -63,8 +63,7 @@ def walker(request):
 
 
 def pushed(terms):
-    contacts = terms.contacts
-    return np.einsum("kiv,ki->v", contacts.jacobians, contacts.forces)
+    return np.einsum("kiv,ki->v", terms.jacobians, terms.contacts.force)
 
 
 def test_the_equations_of_motion_hold_with_mujocos_own_accelerations_and_forces(walker):
@@ -74,7 +73,7 @@ def test_the_equations_of_motion_hold_with_mujocos_own_accelerations_and_forces(
         left = terms.inertia @ data.qacc + terms.bias
         right = terms.actuation @ data.ctrl + pushed(terms)
         assert left == pytest.approx(right, abs=1e-9 * (1.0 + np.abs(right).max()))
-        touched += len(terms.contacts.points)
+        touched += len(terms.contacts.point)
     assert touched > 20
 
 
@@ -92,7 +91,7 @@ def test_they_hold_for_servos_limits_equalities_dry_friction_and_pushes_from_out
     terms = equations_of_motion(model, data)
     right = terms.actuation @ [1.0, 0.3] + pushed(terms)
     assert terms.inertia @ data.qacc + terms.bias == pytest.approx(right, abs=1e-8)
-    assert terms.contacts.forces.any()
+    assert terms.contacts.force.any()
     if condim == 1:
         assert not terms.contacts.friction.any()
 
@@ -129,9 +128,9 @@ def test_over_small_steps_the_momentum_changes_as_the_wrenches_say():
     compared = 0
     for _ in range(300):
         mujoco.mj_forward(model, data)
-        before, contacts = momentum(model, data), contact_points(model, data)
-        world = contacts.pushed_by == 0  # what the robot does to itself changes nothing
-        arms, forces = contacts.points[world] - before.com, contacts.forces[world]
+        before, contacts = momentum(model, data), equations_of_motion(model, data).contacts
+        world = contacts.bodies[:, 0] == 0  # what the robot does to itself changes nothing
+        arms, forces = contacts.point[world] - before.com, contacts.force[world]
         linear = forces.sum(axis=0) + before.mass * model.opt.gravity
         expected = np.concatenate([linear, np.cross(arms, forces).sum(axis=0)])
         mujoco.mj_step(model, data)
@@ -149,20 +148,20 @@ def test_every_answer_on_a_struggling_robot_is_inside_its_cones_whatever_its_sta
     for plant in walker(120):
         terms = equations_of_motion(plant.model, plant.forward(), plant.actuators)
         c = terms.contacts
-        if not len(c.points):
+        if not len(c.point):
             continue
         problem = WholeBodyProblem(
-            terms.inertia, terms.bias, terms.actuation, c.jacobians, c.drift, c.normals, 0.7 * c.friction,
+            terms.inertia, terms.bias, terms.actuation, terms.jacobians, terms.drift, c.normal, 0.7 * c.friction,
             plant.lower, plant.upper, plant.upper * np.sin(np.arange(len(plant.upper)) + plant.time),
-            contact_acceleration=-(c.jacobians @ plant.qvel) / 0.05,
+            contact_acceleration=-(terms.jacobians @ plant.qvel) / 0.05,
         )  # fmt: skip
         for found in (solve_pyramid(problem, 8), solve_cone(problem)):
             seen.add(str(found.status))
             size = 1.0 + np.abs(found.forces).max()
             assert found.status != "failed"
-            assert in_cone(found.forces, c.normals, 0.7 * c.friction, 2e-6 * size).all()
+            assert in_cone(found.forces, c.normal, 0.7 * c.friction, 2e-6 * size).all()
             assert ((found.control >= plant.lower) & (found.control <= plant.upper)).all()
-            pushed = np.einsum("kiv,ki->v", c.jacobians, found.forces)
+            pushed = np.einsum("kiv,ki->v", terms.jacobians, found.forces)
             missed = (
                 terms.inertia @ found.acceleration + terms.bias - terms.actuation @ found.control - pushed
             )

@@ -50,7 +50,7 @@ def test_the_point_is_found():
     plant = bound(xml())
     point = planar_point(plant, clip=4.0)
     assert plant.model.body(point.body).name == "point"
-    assert (point.joints, point.actuators, point.origin) == ((0, 1), (0, 1), (0.5, -0.25))
+    assert (point.joints, point.actuators, point.origin.tolist()) == ([0, 1], [0, 1], [0.5, -0.25])
     mass = plant.model.body_mass[point.body]
     for axis, gear, low, high in zip(point.axes, (10, 5), (-1, -3), (2, 1), strict=True):
         # MuJoCo's semi-implicit Euler step with implicit joint damping 1.

@@ -9,12 +9,6 @@ from stable_baselines3.common.monitor import Monitor
 import safe_wrappers as sw
 
 HOLD, WALL = 0.1, -0.3
-PENALTIES = {"penalty": 5.0, "per_correction": 0.5}
-
-
-def cost(correction):
-    """What a changed step costs, by those penalties."""
-    return 5.0 + 0.5 * correction
 
 
 class Line(gym.Env):
@@ -84,13 +78,5 @@ def filtered(wall=WALL):
     return Monitor(sw.RecordInterventions(sw.CBFActionFilter(Line(), [BehindTheWall(wall)], plant=plant)))
 
 
-def penalised(wall=WALL):
-    return sw.AdaptionPenalty(filtered(wall), **PENALTIES)
-
-
 def filtered_dict():
     return AsDict(filtered())
-
-
-def penalised_dict():
-    return AsDict(penalised())

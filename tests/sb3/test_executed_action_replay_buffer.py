@@ -1,4 +1,4 @@
-"""Each mode against a record that the env and a callback keep, not the buffer."""
+"""The buffer against a record that the env and a callback keep, not the buffer."""
 
 import functools
 import pickle
@@ -8,8 +8,8 @@ import line_world
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict, Discrete
-from line_world import HOLD, WALL, cost, filtered, penalised
+from gymnasium.spaces import Box, Discrete
+from line_world import HOLD, WALL, filtered
 from scipy import stats
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -22,9 +22,6 @@ from safe_wrappers import info as keys
 from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer, ExecutedActionReplayBuffer
 
 torch.set_num_threads(1)
-BUFFERS = {"safe_action": filtered, "both": penalised}
-"""Mode -> the env that it is for."""
-both_modes = pytest.mark.parametrize("mode", BUFFERS)
 
 
 class Record(BaseCallback):
@@ -55,9 +52,9 @@ class Record(BaseCallback):
         return np.stack([step[key] for step in self.steps])
 
 
-def learn(mode, n_envs=1, steps=120, algorithm=SAC, vec_env=DummyVecEnv, make=None, **settings):
+def learn(n_envs=1, steps=120, algorithm=SAC, vec_env=DummyVecEnv, make=filtered, **settings):
     """A trained model with the buffer under test, and the record of its steps."""
-    envs = vec_env([make or BUFFERS[mode]] * n_envs)
+    envs = vec_env([make] * n_envs)
     noise = None if algorithm is SAC else NormalActionNoise(np.zeros(1), 0.6 * np.ones(1))
     settings = {
         "buffer_size": 1000,
@@ -65,7 +62,6 @@ def learn(mode, n_envs=1, steps=120, algorithm=SAC, vec_env=DummyVecEnv, make=No
         "batch_size": 16,
         "action_noise": noise,
         "replay_buffer_class": ExecutedActionReplayBuffer,
-        "replay_buffer_kwargs": {"mode": mode},
         "policy_kwargs": {"net_arch": [8]},
         "policy": "MlpPolicy",
         "seed": 0,
@@ -79,7 +75,7 @@ def learn(mode, n_envs=1, steps=120, algorithm=SAC, vec_env=DummyVecEnv, make=No
     return model, record
 
 
-def check(model, record, mode):
+def check(model, record):
     """The buffer, slot by slot, is what the record and the closed-form filter say; returns its transitions."""
     buffer, n = model.replay_buffer, len(record.steps)
     assert buffer.size() == n
@@ -92,35 +88,20 @@ def check(model, record, mode):
     stored, task = record["stored"], record["paid"].astype(np.float32)
     # As SB3 scales them, in float32; what was not changed is what SB3 would have stored, bit for bit.
     executed = model.policy.scale_action(given.astype(np.float32)[..., None])
-    executed = np.where(changed[..., None], executed, stored)
-    charged = task - cost(sent - given) * changed
     same = {
         "observations": record["observed"],
+        "actions": np.where(changed[..., None], executed, stored),
+        "rewards": task,
         "next_observations": record["after"],  # the env's last observation, not the next episode's first
         "dones": record["done"],
         "timeouts": record["cut"],
     }
-    if mode == "safe_action":
-        same |= {"actions": executed, "rewards": task}
-        np.testing.assert_array_equal(record["reward"], task)
-    else:
-        same |= {"actions": stored, "rewards": record["reward"]}
-        same |= {"executed_actions": executed, "changed": changed}
-        np.testing.assert_allclose(record["reward"], charged, atol=1e-4)
-        np.testing.assert_allclose(buffer.task_rewards[:n], task, atol=1e-6)  # rounded to float32 twice
-        task = buffer.task_rewards[:n]
+    np.testing.assert_array_equal(record["reward"], task)
     for name, expected in same.items():
         np.testing.assert_array_equal(getattr(buffer, name)[:n], expected, err_msg=name)
-
-    def transitions(actions, rewards, where):
-        ends = (record["done"] & ~record["cut"]).astype(np.float32)
-        columns = (record["observed"], actions, record["after"], ends[..., None], rewards[..., None])
-        return np.concatenate(columns, axis=-1, dtype=np.float32)[where]
-
-    if mode == "safe_action":
-        return transitions(executed, task, np.ones_like(changed))
-    first = transitions(stored, record["reward"], np.ones_like(changed))
-    return np.concatenate([first, transitions(executed, task, changed)])
+    ends = (record["done"] & ~record["cut"]).astype(np.float32)
+    columns = (record["observed"], same["actions"], record["after"], ends[..., None], task[..., None])
+    return np.concatenate(columns, axis=-1, dtype=np.float32).reshape(-1, 7)
 
 
 def rows(samples):
@@ -128,19 +109,17 @@ def rows(samples):
     return np.concatenate([part.numpy() for part in samples[:5]], axis=1)
 
 
-@both_modes
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_sac_stores_what_the_mode_says(mode, n_envs):
-    model, record = learn(mode, n_envs)
-    check(model, record, mode)
+def test_sac_stores_what_was_executed(n_envs):
+    model, record = learn(n_envs)
+    check(model, record)
     assert all(torch.isfinite(p).all() for p in model.policy.parameters())
 
 
-@both_modes
-def test_batches_are_drawn_uniformly_from_all_transitions(mode):
-    model, record = learn(mode, n_envs=2, steps=120)
+def test_batches_are_drawn_uniformly_from_all_transitions():
+    model, record = learn(n_envs=2, steps=120)
     # Two steps along the wall can be the same transition.
-    known, times = np.unique(check(model, record, mode), axis=0, return_counts=True)
+    known, times = np.unique(check(model, record), axis=0, return_counts=True)
     np.random.seed(0)
     drawn = rows(model.replay_buffer.sample(100 * len(known)))
     # Every draw is one of the record's transitions, whole.
@@ -149,14 +128,13 @@ def test_batches_are_drawn_uniformly_from_all_transitions(mode):
     assert stats.chisquare(counts, times * len(drawn) / times.sum()).pvalue > 1e-3
 
 
-@both_modes
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_a_full_buffer_forgets_its_oldest_steps_and_only_those(mode, n_envs):
-    model, record = learn(mode, n_envs, steps=240, buffer_size=60, learning_starts=1000)
+def test_a_full_buffer_forgets_its_oldest_steps_and_only_those(n_envs):
+    model, record = learn(n_envs, steps=240, buffer_size=60, learning_starts=1000)
     buffer, kept = model.replay_buffer, 60 // n_envs
     assert buffer.full and buffer.size() == kept
-    fresh, tail = learn(mode, n_envs, steps=240, learning_starts=1000)
-    for name in ("actions", "rewards", "observations", *vars(buffer).keys() & {"changed", "task_rewards"}):
+    fresh, tail = learn(n_envs, steps=240, learning_starts=1000)
+    for name in ("actions", "rewards", "observations"):
         theirs = getattr(fresh.replay_buffer, name)[: len(tail.steps)][-kept:]
         mine = np.roll(getattr(buffer, name), -buffer.pos, axis=0)
         np.testing.assert_array_equal(mine, theirs, err_msg=name)
@@ -166,9 +144,9 @@ def test_a_full_buffer_forgets_its_oldest_steps_and_only_those(mode, n_envs):
 
 def test_an_inactive_filter_changes_nothing_of_the_learning():
     far = functools.partial(filtered, wall=100.0)
-    ours, record = learn("safe_action", make=far)
+    ours, record = learn(make=far)
     assert (record["given"] == record["sent"][..., 0]).all()
-    theirs, _ = learn("safe_action", make=far, replay_buffer_class=None, replay_buffer_kwargs=None)
+    theirs, _ = learn(make=far, replay_buffer_class=None)
     assert type(theirs.replay_buffer) is ReplayBuffer
     for mine, other in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
         assert torch.equal(mine, other)
@@ -176,15 +154,14 @@ def test_an_inactive_filter_changes_nothing_of_the_learning():
     np.testing.assert_array_equal(ours.replay_buffer.actions[:n], theirs.replay_buffer.actions[:n])
 
 
-@both_modes
-def test_saving_and_loading(mode, tmp_path):
-    model, record = learn(mode, n_envs=2)
+def test_saving_and_loading(tmp_path):
+    model, record = learn(n_envs=2)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
-    again = SAC.load(tmp_path / "model", env=DummyVecEnv([BUFFERS[mode]] * 2), device="cpu")
+    again = SAC.load(tmp_path / "model", env=DummyVecEnv([filtered] * 2), device="cpu")
     assert type(again.replay_buffer) is ExecutedActionReplayBuffer and again.replay_buffer.size() == 0
     again.load_replay_buffer(tmp_path / "buffer")
-    check(again, record, mode)
+    check(again, record)
     copy = pickle.loads(pickle.dumps(model.replay_buffer))
     np.random.seed(3)
     first = rows(again.replay_buffer.sample(64))
@@ -195,27 +172,18 @@ def test_saving_and_loading(mode, tmp_path):
     assert again.replay_buffer.size() == before + 10
 
 
-@both_modes
-def test_dict_observations(mode):
-    make = {"safe_action": line_world.filtered_dict, "both": line_world.penalised_dict}[mode]
+def test_dict_observations():
     model, record = learn(
-        mode,
         n_envs=2,
-        make=make,
+        make=line_world.filtered_dict,
         policy="MultiInputPolicy",
         replay_buffer_class=ExecutedActionDictReplayBuffer,
     )
-    flat, same = learn(mode, n_envs=2)
+    flat, same = learn(n_envs=2)
     n = 60 // 2  # from there on the networks differ
     buffer, plain = model.replay_buffer, flat.replay_buffer
     np.testing.assert_array_equal(record["paid"][:n], same["paid"][:n])
-    for name in (
-        "actions",
-        "rewards",
-        "dones",
-        "timeouts",
-        *vars(plain).keys() & {"changed", "task_rewards"},
-    ):
+    for name in ("actions", "rewards", "dones", "timeouts"):
         np.testing.assert_array_equal(getattr(buffer, name)[:n], getattr(plain, name)[:n], err_msg=name)
     for part, at in (("x", 0), ("steps", 1)):
         np.testing.assert_array_equal(buffer.observations[part][:n, :, 0], plain.observations[:n, :, at])
@@ -228,24 +196,21 @@ def test_dict_observations(mode):
     assert batch.actions.shape == batch.rewards.shape == batch.dones.shape == (32, 1)
 
 
-@both_modes
-def test_what_is_stored_is_raw_and_what_is_drawn_is_normalised(mode):
-    envs = VecNormalize(DummyVecEnv([BUFFERS[mode]] * 2))
+def test_what_is_stored_is_raw_and_what_is_drawn_is_normalised():
+    envs = VecNormalize(DummyVecEnv([filtered] * 2))
     model = SAC(
         "MlpPolicy",
         envs,
         buffer_size=400,
         learning_starts=1000,
         replay_buffer_class=ExecutedActionReplayBuffer,
-        replay_buffer_kwargs={"mode": mode},
         seed=0,
         device="cpu",
     )
     record = Record()
     model.learn(120, callback=record)
     n = len(record.steps)
-    task = model.replay_buffer.rewards if mode == "safe_action" else model.replay_buffer.task_rewards
-    np.testing.assert_allclose(task[:n], record["paid"].astype(np.float32), atol=1e-6)
+    np.testing.assert_allclose(model.replay_buffer.rewards[:n], record["paid"].astype(np.float32), atol=1e-6)
     np.random.seed(1)
     raw = model.replay_buffer.sample(200)
     np.random.seed(1)
@@ -262,45 +227,27 @@ def test_what_is_stored_is_raw_and_what_is_drawn_is_normalised(mode):
 SPACE = Box(np.array([-2.0, 0.0], np.float32), np.array([3.0, 10.0], np.float32))
 
 
-def buffer(mode="safe_action", **more):
-    return ExecutedActionReplayBuffer(8, Box(-1.0, 1.0, (1,)), SPACE, device="cpu", mode=mode, **more)
-
-
-def info(proposed, executed, penalty=None):
-    wrote = {
+def info(proposed, executed):
+    return {
         keys.PROPOSED_ACTION: np.array(proposed, np.float64),
         keys.EXECUTED_ACTION: np.array(executed, np.float64),
         keys.CBF_INTERVENED: proposed != executed,
     }
-    if penalty is not None:
-        wrote[keys.ADAPTION_PENALTY] = penalty
-    return wrote
-
-
-def add(to, action, reward, infos):
-    n = to.n_envs
-    to.add(
-        np.zeros((n, 1)), np.ones((n, 1)), np.array(action, np.float32), np.array(reward), np.zeros(n), infos
-    )
 
 
 def test_an_action_that_is_not_finite_is_never_stored():
     # The first two are not; for the second one the filter chose just what stands for it in the infos.
     chosen = [[np.nan, 0.0], [0.0, np.inf], [0.0, 0.0]]
-    wrote = [
-        ([0.0, 5.0], [1.0, 2.5], 0.5),
-        ([0.5, 0.0], [0.5, 0.0], 0.5),
-        ([0.5, 5.0], [0.5, 5.0], 0.0),
+    infos = [
+        info([0.0, 5.0], [1.0, 2.5]),
+        info([0.5, 0.0], [0.5, 0.0]),
+        info([0.5, 5.0], [0.5, 5.0]),
     ]
-    safe, both = buffer(n_envs=3), buffer("both", n_envs=3)
-    add(safe, chosen, [4.0, 5.0, 6.0], [info(*each[:2]) for each in wrote])
-    add(both, chosen, [3.5, 4.5, 6.0], [info(*each) for each in wrote])
-    for stored in (safe.actions, both.actions, both.executed_actions):
-        np.testing.assert_allclose(stored[0], [[0.2, -0.5], [0.0, -1.0], [0.0, 0.0]], atol=1e-6)
-    # The one transition that is left is the safe one.
-    np.testing.assert_array_equal(both.rewards[0], [4.0, 5.0, 6.0])
-    assert not both.changed.any()
-    assert torch.isfinite(both.sample(50).actions).all()
+    buffer = ExecutedActionReplayBuffer(8, Box(-1.0, 1.0, (1,)), SPACE, device="cpu", n_envs=3)
+    one = np.ones((3, 1))
+    buffer.add(0.0 * one, one, np.array(chosen, np.float32), np.array([4.0, 5.0, 6.0]), np.zeros(3), infos)
+    np.testing.assert_allclose(buffer.actions[0], [[0.2, -0.5], [0.0, -1.0], [0.0, 0.0]], atol=1e-6)
+    np.testing.assert_array_equal(buffer.rewards[0], [4.0, 5.0, 6.0])
 
 
 def test_what_an_escape_executed_is_stored_in_place_of_the_policys_action():
@@ -324,11 +271,8 @@ def test_what_an_escape_executed_is_stored_in_place_of_the_policys_action():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"mode": "naive"}, "expected 'safe_action' or 'both', got 'naive'; the naive learner"),
         ({"action_space": Discrete(3)}, "expected a bounded Box of actions, got Discrete"),
         ({"action_space": Box(-np.inf, 1.0, (1,))}, "expected a bounded Box of actions"),
-        ({"observation_space": Dict({"x": Box(-1, 1, (1,))})}, "use ExecutedActionDictReplayBuffer for Dict"),
-        ({"mode": "both", "optimize_memory_usage": True}, "does not work with optimize_memory_usage"),
     ],
 )
 def test_what_it_refuses(arguments, message):

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.sb3 import ExecutedActionReplayBuffer, LagrangianMultiplier
+from safe_wrappers.sb3 import LagrangianMultiplier
 
 LENGTH = 5
 
@@ -153,11 +153,6 @@ def test_an_env_without_cost_and_rewards_that_are_stored_elsewhere_are_refused()
     )
     with pytest.raises(ConfigurationError, match="hindsight"):
         goals.learn(20, callback=LagrangianMultiplier(1.0))
-    kind = {"replay_buffer_class": ExecutedActionReplayBuffer, "replay_buffer_kwargs": {"mode": "both"}}
-    with pytest.raises(ConfigurationError, match="mode 'both'"):
-        SAC("MlpPolicy", Toll(), buffer_size=100, device="cpu", **kind).learn(
-            20, callback=LagrangianMultiplier(1.0)
-        )
     scaled = VecNormalize(DummyVecEnv([Toll]))
     with pytest.raises(ConfigurationError, match="VecNormalize"):
         SAC("MlpPolicy", scaled, device="cpu").learn(20, callback=LagrangianMultiplier(1.0))

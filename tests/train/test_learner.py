@@ -70,9 +70,8 @@ def one_arm(fake_experiment, learner, *overrides, algorithm="SAC"):
 
 KINDS = {
     "naive": "naive",
-    "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}}}",
+    "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}, per_correction: 1.0}}",
     "safe_action": "safe_action",
-    "both": f"{{kind: both, penalty: {PENALTY}, per_correction: 1.0}}",
 }
 TAKEN = [("SAC", kind) for kind in KINDS] + [("PPO", "naive"), ("PPO", "adaption_penalty")]
 
@@ -109,7 +108,7 @@ def test_training_has_what_the_kind_says_and_the_rows_have_the_tasks_return(
     if arm.learner.penalised:
         taken = np.array([[info[keys.ADAPTION_PENALTY] for info in row] for row in infos])
         corrections = np.array([[info[keys.CBF_CORRECTION] for info in row] for row in infos])
-        np.testing.assert_allclose(taken, changed * (PENALTY + corrections * (kind == "both")), rtol=1e-12)
+        np.testing.assert_allclose(taken, changed * (PENALTY + corrections), rtol=1e-12)
         assert np.abs(np.array(watch.paid) + taken).max() < 1.0
     else:
         assert keys.ADAPTION_PENALTY not in infos[0, 0]
@@ -127,14 +126,11 @@ def test_training_has_what_the_kind_says_and_the_rows_have_the_tasks_return(
         buffer = model.replay_buffer
         assert type(buffer) is (ExecutedActionReplayBuffer if arm.learner.stores_executed else ReplayBuffer)
         executed = np.array([[info[keys.EXECUTED_ACTION] for info in row] for row in infos], np.float32)
-        stores = {"both": "executed_actions"}.get(kind, "actions")
-        difference = np.abs(getattr(buffer, stores)[: len(infos)] - executed).max(axis=-1)
+        difference = np.abs(buffer.actions[: len(infos)] - executed).max(axis=-1)
         assert (difference > 1e-6).any() == (not arm.learner.stores_executed)
-        if arm.learner.stores_executed:
-            assert buffer.mode == kind
 
 
-@pytest.mark.parametrize(("algorithm", "kind"), [("SAC", "both"), ("PPO", "adaption_penalty")])
+@pytest.mark.parametrize(("algorithm", "kind"), [("SAC", "adaption_penalty"), ("PPO", "adaption_penalty")])
 def test_evaluation_never_has_the_penalty(fake_experiment, monkeypatch, algorithm, kind):
     experiment = one_arm(fake_experiment, KINDS[kind], algorithm=algorithm)
     (arm,) = experiment.arms
@@ -163,18 +159,16 @@ def test_evaluation_never_has_the_penalty(fake_experiment, monkeypatch, algorith
     assert json.loads((evaluation_folder(folder) / "evaluation.json").read_text())["timesteps"] == 256
 
 
-def test_a_killed_run_goes_on_with_its_two_transitions(fake_experiment, monkeypatch):
-    experiment = one_arm(fake_experiment, KINDS["both"], "n_envs=1", "checkpoint_every=64")
+def test_a_killed_run_goes_on_with_its_executed_actions(fake_experiment, monkeypatch):
+    experiment = one_arm(fake_experiment, "safe_action", "n_envs=1", "checkpoint_every=64")
     (arm,) = experiment.arms
     folder = run_killed_after(experiment, 2, monkeypatch, arm=0)
     checkpoint = latest_checkpoint(folder / "checkpoints")
     envs = DummyVecEnv([lambda: make_stack(arm.env, arm.filter, arm.learner)])
     buffer = resume(checkpoint.folder, "SAC", envs, "cpu", 100).replay_buffer
-    assert type(buffer) is ExecutedActionReplayBuffer and buffer.mode == "both"
+    assert type(buffer) is ExecutedActionReplayBuffer
     assert buffer.size() == checkpoint.timesteps == 128
-    assert buffer.changed[:128].any()
-    assert (np.abs(buffer.task_rewards[:128]) < 1).all()
-    assert (buffer.rewards[:128][buffer.changed[:128]] < 1 - PENALTY).all()
+    assert (np.abs(buffer.rewards[:128]) < 1).all()
     train_run(arm, 0, folder, Reports().progress)
     assert json.loads((folder / "finished.json").read_text())["timesteps"] == 256
 
@@ -182,11 +176,14 @@ def test_a_killed_run_goes_on_with_its_two_transitions(fake_experiment, monkeypa
 @pytest.mark.parametrize(
     ("learner", "overrides", "message"),
     [
-        ("both", [], "both needs a penalty in units of the task's reward"),
-        ("adaption_penalty", [], "adaption_penalty needs a penalty"),
-        ("{kind: both, penalty: -1}", [], "learner.penalty: .* greater than or equal to 0, got -1"),
+        ("adaption_penalty", [], "adaption_penalty needs a penalty in units of the task's reward"),
+        (
+            "{kind: adaption_penalty, penalty: -1}",
+            [],
+            "learner.penalty: .* greater than or equal to 0, got -1",
+        ),
         ("{penalty: 1}", [], "naive takes no penalty"),
-        ("{kind: safe_action, penalty: 1}", [], "safe_action takes no penalty; adaption_penalty and both do"),
+        ("{kind: safe_action, penalty: 1}", [], "safe_action takes no penalty; adaption_penalty does"),
         ("safe_action", ["algorithm=DQN", "hyperparameters={}"], "is for continuous actions, and DQN has"),
         ("safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("safe_action", ["hyperparameters.n_steps=3"], "has one-step returns"),
@@ -205,7 +202,7 @@ def test_what_does_not_go_together_is_refused_with_the_reason(fake_experiment, l
 
 
 def test_the_stack_puts_the_penalty_outside_recorder_and_monitor(fake_experiment):
-    (arm,) = one_arm(fake_experiment, KINDS["both"]).arms
+    (arm,) = one_arm(fake_experiment, KINDS["adaption_penalty"]).arms
     env = make_stack(arm.env, arm.filter, arm.learner)
     assert isinstance(env, sw.AdaptionPenalty)
     assert (env.penalty, env.per_correction) == (arm.learner.penalty, arm.learner.per_correction)

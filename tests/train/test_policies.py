@@ -145,7 +145,6 @@ def test_a_recipe_that_has_changed_since_is_refused_unless_told(policy, monkeypa
 ARMS = {
     "protect": {"filter": {"protect": {"margin": 0.1}, "lease": {"budget": {"closing_speed": 3.0}}}},
     "factory": {"filter": {"factory": "fake_task:shield", "kwargs": {"margin": None}}},
-    "curriculum": {"filter": "protect", "learner": {"margin_curriculum": {"start": 0.1, "until": 0.5}}},
     "priced": {"hyperparameters": {"clip_range": "linear_0.2"}, "learner": {"cost_limit": 25}},
     "held": {"normalize": {"observation": True}, "action_repeat": 4, "n_envs": 3},
     "seen": {"env": {"id": "SafePointGoal1-v0", "observation": "constraints"}},

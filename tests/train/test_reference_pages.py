@@ -38,7 +38,7 @@ def test_the_page_s_required_keys_are_those_of_a_config():
     given = {"name": "x", "env": "Pendulum-v1", "algorithm": "PPO", "total_steps": 9, "arms": {"a": {}}}
     parse_experiment({**given, "seeds": [0]})
     required = {name for name, key in rows().items() if key.default == "required"}
-    inner = {"env.id", "learner.margin_curriculum.start", "sweep.parameters"}
+    inner = {"env.id", "sweep.parameters"}
     assert required == given.keys() | {"seeds"} | inner
 
 

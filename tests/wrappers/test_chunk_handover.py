@@ -463,17 +463,18 @@ def handover(env, **changed):
         ({"rate_limit": 0.0}, "rate_limit .*> 0"),
         ({"rate_limit": math.nan}, "rate_limit .*finite"),
         ({"rate_limit": [5.0, 5.0]}, "one for each of the 1 action components"),
-        ({"rate_limit": 1e-7}, "float32 resolves.*choose a larger one"),
         ({"blend_time": 0.0}, "blend_time .*> 0"),
-        ({"blend_time": 0.9}, "blend_time = 0.9 s is longer.*8 control steps.*choose a longer chunk_size"),
+        (
+            {"blend_time": 0.9},
+            "a blend of 8 control steps .* 8 control steps: choose a longer chunk_size",
+        ),
         ({"blend_time": 0.7, "inference_delay": 3}, "5 control steps"),
         (
             {"rate_limit": None, "execution_horizon": 8},
-            "no left-over to blend with: pass rate_limit or blend_time",
+            "a blend of 0 control steps does not fit.*pass rate_limit",
         ),
-        ({"rate_limit": None, "execution_horizon": 5, "inference_delay": [0, 3]}, "no left-over"),
-        ({"rate_limit": None, "chunk_size": 1, "execution_horizon": 1}, "no left-over"),
-        ({"control_dt": 0.2}, "dt = 0.1"),
+        ({"rate_limit": None, "execution_horizon": 5, "inference_delay": [0, 3]}, "a blend of 0"),
+        ({"rate_limit": None, "chunk_size": 1, "execution_horizon": 1}, "a blend of 0"),
         ({"fallback": "sleep"}, "no fallback 'sleep'; choose brake, hold, zero"),
         ({"fallback": "brake"}, "(?i)mujoco"),
         ({"plant": 3}, "plant is a MujocoPlant"),
@@ -501,7 +502,7 @@ def test_bad_arguments_are_refused_with_a_way_out(changed, says):
 def test_wrong_shapes_are_refused_and_the_env_is_not_stepped(chunk):
     env = handover(Line())
     env.reset(seed=0)
-    with pytest.raises(ActionError, match=r"expected a chunk of shape \(8, 1\)"):
+    with pytest.raises(ActionError, match=r"expected an action of shape \(8, 1\)"):
         env.step(chunk)
     assert env.unwrapped.given == []
     assert env.step([[0.25]] * 8)[4]["handover/latency"] == 0, "a list of the right shape is a chunk"

@@ -129,7 +129,7 @@ def test_an_env_without_frames_is_refused_with_the_line_to_write():
         overlay(Renderer(), None)
     with pytest.raises(ConfigurationError, match="'depth_array'"):
         overlay(Renderer(), "depth_array")
-    with pytest.raises(ConfigurationError, match="windows of MuJoCo envs alone"):
+    with pytest.raises(ConfigurationError, match=r"is 'human': .*render_mode='rgb_array'\)"):
         overlay(None, "human")
 
 

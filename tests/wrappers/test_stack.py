@@ -38,7 +38,7 @@ MAKE = {
     "CBFActionFilter": lambda env: sw.CBFActionFilter(env, [BLOCKED]),
     "protect": sw.protect,
     "SlipLimiter": lambda env: sw.SlipLimiter(env, list(WHEELS)),
-    "WholeBodyFilter": lambda env: sw.WholeBodyFilter(env, contacts="pyramid"),
+    "WholeBodyFilter": sw.WholeBodyFilter,
     "LeaseExpiry": lambda env: sw.LeaseExpiry(env, sw.StoppingBudget(room, braking=9.0, acceleration=20.0)),
     "TeleopChannel": lambda env: sw.TeleopChannel(env, 0.06, 0.04),
     "OcclusionPenalty": tracked,
@@ -52,7 +52,7 @@ MAKE = {
 FILTERS = {
     "SafePointGoal1-v0": ("CBFActionFilter", "protect"),
     "SafeRover-v0": ("SlipLimiter",),
-    "Ant-v5": ("WholeBodyFilter",),
+    "Hopper-v5": ("WholeBodyFilter",),
 }
 OTHERS = [name for name in MAKE if not any(name in names for names in FILTERS.values())]
 NEED_A_FILTER = {"AdaptionPenalty"}

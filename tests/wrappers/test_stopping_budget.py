@@ -351,7 +351,7 @@ def test_moving_admits_ends_at_which_no_machine_could_stop_in_time():
         ({"max_speed": 1.0}, "max_acceleration"),
         ({**LIMITS, "max_speed": [1.0, 2.0]}, "1 action comp"),
         ({**LIMITS, "max_speed": 0.0}, "max_speed"),
-        ({**LIMITS, "max_jerk": 1.0}, "motion_limits is"),
+        ({**LIMITS, "max_jerk": 1.0}, "motion_limits has no 'max_jerk'"),
         (3.0, "motion_limits is"),
     ],
 )

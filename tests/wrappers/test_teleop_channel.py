@@ -36,8 +36,7 @@ def some_actions(env, steps, seed=0):
 def test_an_ideal_channel_is_no_channel(env_id):
     bare = gym.make(env_id)
     actions = some_actions(bare, 40)
-    options = {"control_dt": 0.05} if env_id == "Pendulum-v1" else {}
-    env = sw.TeleopChannel(gym.make(env_id), 0.0, sw.teleop.Link(), **options)
+    env = sw.TeleopChannel(gym.make(env_id), 0.0, sw.teleop.Link())
     (seen, rewards), (expected, expected_rewards) = rollout(env, actions), rollout(bare, actions)
     assert np.array_equal(seen, expected) and rewards == expected_rewards
     info = env.step(actions[0])[4]
@@ -184,7 +183,6 @@ def refused(error=ConfigurationError, inside=None, env_id="TeleopContact-v0", ma
             {"ceiling": {"budget": {"clearance": lambda env: (1.0, 0.0), "braking": 1.0}}},
             "acceleration is missing",
         ),
-        ({"control_dt": 0.002}, "control_dt"),
     ],
 )
 def test_what_cannot_be_is_refused_when_it_is_built(options, match):
@@ -197,7 +195,7 @@ def test_waves_need_a_port():
 
 def test_envs_that_do_not_fit_are_refused():
     refused(env_id="CartPole-v1", match="Box action space")
-    refused(UnsupportedEnvError, env_id="Pendulum-v1", ceiling=ceiling(), control_dt=0.05, match="MuJoCo")
+    refused(UnsupportedEnvError, env_id="Pendulum-v1", ceiling=ceiling(), match="MuJoCo")
 
 
 TICK = 0.001

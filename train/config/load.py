@@ -154,8 +154,7 @@ def _conflicts(arm: ArmConfig) -> list[tuple[bool, str]]:
         ),
         (
             learner.of_filter and arm.filter.kind == "none",
-            "without a filter no action is ever changed, and there is no margin; leave `learner` out, or give the arm"
-            " a filter.",
+            "without a filter no action is ever changed; leave `learner` out, or give the arm a filter.",
         ),
         (
             learner.cost_limit is not None and scaled and not on_policy,

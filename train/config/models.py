@@ -58,36 +58,19 @@ def _check_algorithm(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class MarginCurriculumConfig(Section):
-    """How the margin of an arm's filter changes in training, in hundredths of the way."""
-
-    start: Annotated[Number, Field(ge=0)]
-    """Added margin at the first step, in the constraints' own unit; never below 0, so that constraints keep at least
-    their own."""
-    end: Annotated[Number, Field(ge=0)] = 0.0
-    """Added margin from `until` on; linear between."""
-    until: Annotated[Number, Field(gt=0, le=1)] = 1.0
-    """Share of `total_steps`."""
-
-
-@dataclass(frozen=True)
 class LearnerConfig(Section):
     """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
 
     text_is: ClassVar[str] = "kind"
-    _PENALISED: ClassVar = ("adaption_penalty", "both")
 
-    kind: Literal["naive", "adaption_penalty", "safe_action", "both"] = "naive"
-    """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ."""
+    kind: Literal["naive", "adaption_penalty", "safe_action"] = "naive"
+    """`safe_action` is for SAC, TD3, DDPG, TQC and CrossQ."""
     penalty: Annotated[Number, Field(ge=0)] = 0.0
-    """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
+    """For `adaption_penalty`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
     """For the same: taken off per unit of correction."""
-    margin_curriculum: MarginCurriculumConfig | None = None
-    """A margin that the arm's filter adds in training and that changes; see [its
-    keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
     cost_limit: Annotated[Number, Field(ge=0)] | None = None
-    """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-margin-that-changes-and-a-price-on-cost)
+    """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-price-on-cost)
     puts a price on cost, in training; with PPO this is PPO-Lagrangian. For any algorithm and arm, also without a
     filter."""
     multiplier_rate: Annotated[Number, Field(gt=0)] = 1e-3
@@ -102,13 +85,13 @@ class LearnerConfig(Section):
                 f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction."
             )
         if given and not self.penalised:
-            raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
+            raise ConfigurationError(f"{self.kind} takes no penalty; adaption_penalty does.")
         return self
 
     @property
     def penalised(self) -> bool:
         """Whether the reward is reduced where the action was changed."""
-        return self.kind in self._PENALISED
+        return self.kind == "adaption_penalty"
 
     @property
     def of_filter(self) -> bool:
@@ -118,7 +101,7 @@ class LearnerConfig(Section):
     @property
     def stores_executed(self) -> bool:
         """Whether the replay buffer holds executed actions."""
-        return self.kind in ("safe_action", "both")
+        return self.kind == "safe_action"
 
 
 NAIVE: Final = LearnerConfig()

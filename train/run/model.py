@@ -19,7 +19,6 @@ from safe_wrappers.sb3 import (
     ExecutedActionDictReplayBuffer,
     ExecutedActionReplayBuffer,
     LagrangianMultiplier,
-    MarginCurriculum,
 )
 
 from ..config import ArmConfig
@@ -76,7 +75,7 @@ def _constructor_arguments(arm: ArmConfig, envs: VecEnv) -> dict[str, Any]:
         settings["buffer_size"] = buffer_size(arm)
     if arm.learner.stores_executed:
         kind_of = ExecutedActionDictReplayBuffer if has_dict else ExecutedActionReplayBuffer
-        settings |= {"replay_buffer_class": kind_of, "replay_buffer_kwargs": {"mode": arm.learner.kind}}
+        settings["replay_buffer_class"] = kind_of
     return settings
 
 
@@ -95,17 +94,15 @@ def whole_rollouts(arm: ArmConfig) -> int:
 
 
 def learner_callbacks(arm: ArmConfig) -> list[BaseCallback]:
-    """What the arm's learner needs beside its algorithm: a margin that changes, a price on cost."""
-    learner, found = arm.learner, list[BaseCallback]()
-    if (margin := learner.margin_curriculum) is not None:
-        found.append(MarginCurriculum(margin.start, margin.end, margin.until))
-    if learner.cost_limit is not None:
-        found.append(LagrangianMultiplier(learner.cost_limit, learner.multiplier_rate))
-    return found
+    """What the arm's learner needs beside its algorithm: a price on cost."""
+    learner = arm.learner
+    if learner.cost_limit is None:
+        return []
+    return [LagrangianMultiplier(learner.cost_limit, learner.multiplier_rate)]
 
 
 def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
-    """Refuses an arm whose algorithm or margin does not fit this task, which only the task itself can tell."""
+    """Refuses an arm whose algorithm does not fit this task, which only the task itself can tell."""
     where = f"arms.{arm.name}"
     kinds: tuple[type, ...] = (spaces.Box,) if arm.algorithm in OFF_POLICY else ()
     if arm.algorithm in DISCRETE:
@@ -116,10 +113,3 @@ def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
             f"{where}: {arm.algorithm} needs actions of a {' or '.join(kind.__name__ for kind in kinds)}, and"
             f" {arm.env.id} has {env.action_space}. Other algorithms: {', '.join((*ON_POLICY, *others))}."
         )
-    if (margin := arm.learner.margin_curriculum) is not None:
-        if not env.has_wrapper_attr("set_margin"):
-            raise ConfigurationError(f"{where}.learner.margin_curriculum: the filter has no set_margin.")
-        try:
-            env.get_wrapper_attr("set_margin")(max(margin.start, margin.end))
-        except ConfigurationError as error:
-            raise ConfigurationError(f"{where}.learner.margin_curriculum: {error}") from None

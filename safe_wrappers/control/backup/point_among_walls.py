@@ -1,159 +1,139 @@
-"""A point mass on two axes among rectangular walls: the area swept by one control step and the braking after it.
+"""A point mass on two axes among rectangular walls: its way until rest, and the distances of a way from the walls.
 
-Each axis brakes separately (`damped_axis.py`). The path is covered by one rectangle per hold, which are fewer after
-each hold, so the distance from the walls never falls. If the level of the env's speed clip is not known, a single
-rectangle from the present position to the rest point is used: it contains the path for every clip above what one hold
-of full force can reverse.
+The point holds a control for one control step, or none, and then brakes each axis by itself (`damped_axis.py`).
+Positions are those of the physics steps; between two of them the rectangle that they span counts.
 """
 
 import math
-from typing import NamedTuple
+from typing import Final
 
 import numpy as np
 
-from safe_wrappers.control.backup import damped_axis as along
-from safe_wrappers.control.backup.damped_axis import DampedAxis
-from safe_wrappers.control.compiled import compiled
-from safe_wrappers.control.numerics.shapes import Rectangle, apart, closer, nearest, one_of
+from safe_wrappers.control.backup.damped_axis import DampedAxis, brake, clipped
+from safe_wrappers.control.compiled import compiled, hypot
 from safe_wrappers.errors import Array
 
-Pair = tuple[float, float]
-"""Numbers along x and along y."""
+MOST_HOLDS: Final = 4096
+"""Control steps to rest; a way that takes more has no end."""
+_AT_REST: Final = 1e-12
+"""m/s; slower is rest."""
+_HALVINGS: Final = 24
+"""Of the way between braking and the control that was asked for, along one axis."""
 
 
-class PointMotion(NamedTuple):
-    """Position (m) and velocity (m/s) of a point."""
+@compiled
+def _holds_to_rest(axis: DampedAxis, v: float) -> int:
+    """Control steps of braking, at most `MOST_HOLDS`."""
+    holds = 0
+    while abs(v) > _AT_REST and holds < MOST_HOLDS:
+        v = axis.keep * v + axis.add * brake(axis, v)
+        holds += 1
+    return holds
 
-    x: float
-    y: float
-    vx: float
-    vy: float
 
+@compiled
+def way(axes: tuple[DampedAxis, DampedAxis], place: Array, velocity: Array, held: Array) -> Array:
+    """Positions at every physics step until rest, the present one first, m, shape (instants, 2).
 
-class PointAmongWalls(NamedTuple):
-    """Two axes and the walls.
+    Args:
+        axes: Along x and along y.
+        place: Shape (2,), m.
+        velocity: Shape (2,), m/s.
+        held: The controls of the first control steps, shape (holds, 2); braking comes after them.
 
-    Attributes:
-        x_axis, y_axis: Constants of the motion.
-        walls: Rectangles, m, shape (n, 4).
-        clip_known: The axes' `clip` is the env's own; then the path counts, not only the rectangle around it.
+    Returns:
+        At least two instants. Where there is no rest within `MOST_HOLDS`, the last position is not a number.
     """
-
-    x_axis: DampedAxis
-    y_axis: DampedAxis
-    walls: Array
-    clip_known: bool
-
-
-@compiled
-def clipped(among: PointAmongWalls, motion: PointMotion) -> PointMotion:
-    """The motion after the env's clip."""
-    vx, vy = along.clipped(among.x_axis, motion.vx), along.clipped(among.y_axis, motion.vy)
-    return PointMotion(motion.x, motion.y, vx, vy)
-
-
-@compiled
-def step(among: PointAmongWalls, motion: PointMotion, ux: float, uy: float) -> PointMotion:
-    """The motion after one control step; `motion` is already clipped."""
-    x, vx = along.step(among.x_axis, motion.x, motion.vx, ux)
-    y, vy = along.step(among.y_axis, motion.y, motion.vy, uy)
-    return PointMotion(x, y, vx, vy)
-
-
-@compiled
-def rest(among: PointAmongWalls, motion: PointMotion) -> Pair:
-    """Position at which braking comes to rest, m."""
-    return along.rest(among.x_axis, motion.x, motion.vx), along.rest(among.y_axis, motion.y, motion.vy)
-
-
-@compiled
-def brake(among: PointAmongWalls, motion: PointMotion) -> Pair:
-    """The control of the next hold of braking."""
-    return along.brake(among.x_axis, motion.vx), along.brake(among.y_axis, motion.vy)
+    longest = 1
+    for i in range(2):
+        v = clipped(axes[i], velocity[i])
+        for k in range(len(held)):
+            v = axes[i].keep * v + axes[i].add * max(axes[i].low, min(held[k, i], axes[i].high))
+            v = clipped(axes[i], v)
+        longest = max(longest, len(held) + _holds_to_rest(axes[i], v))
+    substeps = axes[0].substeps
+    places = np.empty((longest * substeps + 1, 2))
+    for i in range(2):
+        axis, x, v = (
+            axes[i],
+            place[i] + 0.0 * velocity[i],
+            velocity[i],
+        )  # the clip makes numbers of what is none
+        places[0, i] = x
+        for k in range(longest):
+            v = clipped(axis, v)
+            u = max(axis.low, min(held[k, i], axis.high)) if k < len(held) else brake(axis, v)
+            for j in range(substeps):
+                v = axis.decay * v + axis.gain * u
+                x += axis.timestep * v
+                places[k * substeps + j + 1, i] = x
+        if abs(v) > _AT_REST and longest >= MOST_HOLDS:
+            places[-1, i] = math.nan
+    return places
 
 
 @compiled
-def _spanned(x: float, y: float, to_x: float, to_y: float) -> Rectangle:
-    """Rectangle spanned by two points."""
-    return min(x, to_x), max(x, to_x), min(y, to_y), max(y, to_y)
+def distances(places: Array, walls: Array, whole: bool) -> Array:
+    """Signed distances of a way from walls, m, shape (parts of the way, k).
+
+    A part is the rectangle that two successive positions span. Its distance is Euclidean outside of a wall, and where
+    they overlap, minus the shortest translation along an axis that separates them.
+
+    Args:
+        places: Shape (instants, 2), m. If one is not finite, no distance is a number.
+        walls: Rectangles x from, x to, y from, y to, m, shape (k, 4).
+        whole: The first part is the rectangle around the way, the last one its end.
+    """
+    corners = places
+    if whole:
+        corners = np.empty((4, 2))
+        for i in range(2):
+            corners[0, i], corners[1, i] = places[:, i].min(), places[:, i].max()
+        corners[2:] = places[-1]
+    apart = np.full((len(corners) - 1, len(walls)), math.nan)
+    if not math.isfinite(places.sum()):
+        return apart
+    for i in range(len(corners) - 1):
+        x, y, to_x, to_y = corners[i, 0], corners[i, 1], corners[i + 1, 0], corners[i + 1, 1]
+        left, right, lower, upper = min(x, to_x), max(x, to_x), min(y, to_y), max(y, to_y)
+        for k in range(len(walls)):
+            across = max(left - walls[k, 1], walls[k, 0] - right)
+            along = max(lower - walls[k, 3], walls[k, 2] - upper)
+            apart[i, k] = hypot(across, along) if across > 0.0 and along > 0.0 else max(across, along)
+    return apart
 
 
 @compiled
-def held(among: PointAmongWalls, motion: PointMotion, ux: float, uy: float) -> Rectangle:
-    """Rectangle that contains one control step; `motion` is already clipped."""
-    x0, x1 = along.extent(among.x_axis, motion.x, motion.vx, ux)
-    y0, y1 = along.extent(among.y_axis, motion.y, motion.vy, uy)
-    return x0, x1, y0, y1
+def slides(
+    axes: tuple[DampedAxis, DampedAxis],
+    place: Array,
+    velocity: Array,
+    asked: Array,
+    walls: Array,
+    room: float,
+    whole: bool,
+) -> Array:
+    """Two controls that keep a distance `room` from the walls, where braking does, shape (2, 2).
 
-
-@compiled
-def stop(among: PointAmongWalls, motion: PointMotion) -> Rectangle:
-    """Rectangle that contains braking, from the present position to the rest point."""
-    end_x, end_y = rest(among, motion)
-    return _spanned(motion.x, motion.y, end_x, end_y)
-
-
-@compiled
-def reached(among: PointAmongWalls, motion: PointMotion, ux: float, uy: float) -> Rectangle:
-    """Rectangle that contains one control step and the braking after it."""
-    x0, x1, y0, y1 = held(among, motion, ux, uy)
-    end_x, end_y = rest(among, step(among, motion, ux, uy))
-    return min(x0, end_x), max(x1, end_x), min(y0, end_y), max(y1, end_y)
-
-
-@compiled
-def reachable(among: PointAmongWalls, motion: PointMotion) -> Rectangle:
-    """Rectangle that contains what any control of one step can reach."""
-    # Positions grow with the control along each axis, so the two extreme controls bound all.
-    x_axis, y_axis = among.x_axis, among.y_axis
-    low = reached(among, motion, x_axis.low, y_axis.low)
-    high = reached(among, motion, x_axis.high, y_axis.high)
-    return low[0], high[1], low[2], high[3]
-
-
-@compiled
-def path(among: PointAmongWalls, motion: PointMotion) -> Array:
-    """Rectangles that contain braking, shape (n, 4): one per hold, and the rest point."""
-    xs = along.braking(among.x_axis, motion.x, motion.vx)
-    ys = along.braking(among.y_axis, motion.y, motion.vy)
-    n, last_x, last_y = max(len(xs), len(ys)), len(xs) - 1, len(ys) - 1
-    found = np.empty((n, 4))
-    for i in range(n):  # one axis may be at rest before the other
-        x, to_x = xs[min(i, last_x)], xs[min(i + 1, last_x)]
-        y, to_y = ys[min(i, last_y)], ys[min(i + 1, last_y)]
-        found[i, 0], found[i, 1], found[i, 2], found[i, 3] = _spanned(x, y, to_x, to_y)
-    return found
-
-
-@compiled
-def distance(among: PointAmongWalls, motion: PointMotion, enough: float = math.inf) -> float:
-    """Distance of the braking path from the nearest wall, m, at most `enough`."""
-    end_x, end_y = rest(among, motion)
-    around = _spanned(motion.x, motion.y, end_x, end_y)
-    best, wall = nearest(around, among.walls, enough)
-    if wall < 0 or not among.clip_known or not math.isfinite(end_x + end_y):
-        return best
-    # The path contains its ends. Where one of them is as close as the rectangle, the path is, too.
-    close = one_of(among.walls, wall)
-    start = apart((motion.x, motion.x, motion.y, motion.y), close)
-    ends = min(start, apart((end_x, end_x, end_y, end_y), close))
-    if ends <= best:
-        return best
-    best, steps = min(ends, enough), path(among, motion)
-    limit, wall = max(best, 0.0), -1
-    while True:
-        wall = closer(around, among.walls, limit, wall + 1)
-        if wall < 0:
-            return best
-        for i in range(len(steps)):
-            best = min(best, apart(one_of(steps, i), one_of(among.walls, wall)))
-
-
-@compiled
-def clear(among: PointAmongWalls, motion: PointMotion, ux: float, uy: float, room: float) -> bool:
-    """Whether one control step and braking after it keep a distance `room` >= 0 from every wall."""
-    if closer(reached(among, motion, ux, uy), among.walls, room) < 0:
-        return True
-    if not among.clip_known or closer(held(among, motion, ux, uy), among.walls, room) >= 0:
-        return False
-    return distance(among, step(among, motion, ux, uy), room) >= room
+    Each begins with braking and takes over as much as it can of the control that was asked for, shape (2,), along one
+    axis after the other: the first along x first, the second along y.
+    """
+    found = np.empty((2, 1, 2))
+    for first in range(2):
+        control = found[first]
+        for i in range(2):
+            control[0, i] = brake(axes[i], clipped(axes[i], velocity[i]))
+        for i in (first, 1 - first):
+            kept, tried = control[0, i], asked[i]
+            refused = tried
+            for _ in range(_HALVINGS):
+                control[0, i] = tried
+                if distances(way(axes, place, velocity, control), walls, whole).min() >= room:
+                    kept = tried
+                else:
+                    refused = tried
+                if kept == asked[i]:
+                    break
+                tried = 0.5 * (kept + refused)
+            control[0, i] = kept
+    return found[:, 0]

@@ -1,12 +1,4 @@
-"""Shapes: discs as a learner sees them, convex outlines, axis-aligned rectangles, and surfaces seen from a point.
-
-The signed distance of two rectangles is Euclidean outside and, where they overlap, minus the shortest translation
-along an axis that separates them.
-
-A surface is a row of eight numbers: its kind, its number of coordinates, and two triples. A PLANE has a point and the
-unit normal into free space; a ROUND one its centre and, first of the second triple, its radius; a BLOCK its centre
-and half of its sides. What has fewer coordinates than the point reaches along the others without end.
-"""
+"""Shapes: discs as a learner sees them, convex outlines and axis-aligned rectangles."""
 
 import math
 from collections.abc import Iterable
@@ -132,52 +124,6 @@ def clearances_on_a_course(outline: Array, places: Array, ahead: Array, discs: A
     return left
 
 
-@compiled
-def gaps(a: Rectangle, b: Rectangle) -> tuple[float, float]:
-    """Signed gap along x and along y, m; negative where the rectangles overlap along that axis."""
-    return max(a[0] - b[1], b[0] - a[1]), max(a[2] - b[3], b[2] - a[3])
-
-
-@compiled
-def apart(a: Rectangle, b: Rectangle) -> float:
-    """Signed distance of two rectangles, m."""
-    across, along = gaps(a, b)
-    return hypot(across, along) if across > 0.0 and along > 0.0 else max(across, along)
-
-
-@compiled
-def one_of(rectangles: Array, i: int) -> Rectangle:
-    """A rectangle of several, shape (n, 4)."""
-    return rectangles[i, 0], rectangles[i, 1], rectangles[i, 2], rectangles[i, 3]
-
-
-@compiled
-def closer(around: Rectangle, among: Array, limit: float, first: int = 0) -> int:
-    """The first of several, shape (n, 4), from an index on, that is closer than `limit` >= 0, m; -1: none is."""
-    wide = limit + _TOUCHING  # sums and differences are rounded, and `apart` decides
-    x0, x1, y0, y1 = around[0] - wide, around[1] + wide, around[2] - wide, around[3] + wide
-    for i in range(first, len(among)):
-        close = among[i, 0] < x1 and among[i, 1] > x0 and among[i, 2] < y1 and among[i, 3] > y0
-        # Near a corner the Euclidean distance may be larger than along either axis.
-        if close and apart(around, one_of(among, i)) < limit:
-            return i
-    return -1
-
-
-@compiled
-def nearest(around: Rectangle, among: Array, limit: float) -> tuple[float, int]:
-    """The smallest distance below `limit` and the rectangle it belongs to, or the limit and -1."""
-    best, found = limit, -1
-    for i in range(len(among)):
-        across, along = gaps(around, one_of(among, i))
-        if across >= best or along >= best:
-            continue
-        distance = apart(around, one_of(among, i))
-        if distance < best:
-            best, found = distance, i
-    return best, found
-
-
 def merged(rectangles: Iterable[Rectangle]) -> list[Rectangle]:
     """Rectangles that cover the same area, touching ones of equal side joined: first along x, then along y."""
     return _joined(_joined(rectangles, 0), 2)
@@ -199,76 +145,3 @@ def _joined(rectangles: Iterable[Rectangle], axis: int) -> list[Rectangle]:
 def _continues(last: Rectangle, r: Rectangle, axis: int, other: int) -> bool:
     level = abs(last[other] - r[other]) + abs(last[other + 1] - r[other + 1]) <= _TOUCHING
     return level and r[axis] <= last[axis + 1] + _TOUCHING
-
-
-PLANE: Final = 0.0
-ROUND: Final = 1.0
-BLOCK: Final = 2.0
-SURFACE_NUMBERS: Final = 8
-"""Of one surface."""
-_AT_THE_CENTRE: Final = 1e-12
-"""m; closer to the centre of a round one every way out is as good."""
-
-
-@compiled
-def nearest_points(surfaces: Array, point: Array) -> tuple[Array, Array, Array]:
-    """Signed distances, m, normals towards the point, and curvatures of the surfaces of equal distance, 1/m.
-
-    Args:
-        surfaces: Shape (k, 8).
-        point: Shape (d,), m; d is at least each surface's number of coordinates.
-
-    Returns:
-        Shapes (k,), (k, d) and (k, d); the curvature is along each coordinate.
-    """
-    k, d = len(surfaces), len(point)
-    distance, normal, curvature = np.zeros(k), np.zeros((k, d)), np.zeros((k, d))
-    for i in range(k):
-        kind, n = surfaces[i, 0], int(surfaces[i, 1])
-        if kind == PLANE:
-            for j in range(n):
-                normal[i, j] = surfaces[i, 5 + j]
-                distance[i] += normal[i, j] * (point[j] - surfaces[i, 2 + j])
-            continue
-        square, deepest, face = 0.0, -math.inf, 0
-        for j in range(n):
-            beyond = offset = point[j] - surfaces[i, 2 + j]
-            if kind == BLOCK:
-                beyond = abs(offset) - surfaces[i, 5 + j]
-                if beyond > deepest:
-                    deepest, face = beyond, j
-                beyond = 0.0 if beyond < 0.0 else -beyond if offset < 0.0 else beyond
-            normal[i, j] = beyond
-            square += beyond * beyond
-        length = math.sqrt(square)
-        if kind == ROUND:
-            distance[i] = length - surfaces[i, 5]
-            for j in range(n):
-                normal[i, j] /= length if length > _AT_THE_CENTRE else 1.0
-                curvature[i, j] = 1.0 / (1e-9 if length < 1e-9 else length)
-            if length <= _AT_THE_CENTRE:
-                normal[i, 0] = 1.0
-        elif length > 0.0:
-            distance[i] = length
-            sides = 0
-            for j in range(n):
-                sides += normal[i, j] != 0.0
-            for j in range(n):
-                if sides > 1 and normal[i, j] != 0.0:
-                    curvature[i, j] = 1.0 / length
-                normal[i, j] /= length
-        else:
-            distance[i] = deepest if length == 0.0 else length  # the length may be no number
-            for j in range(n):
-                normal[i, j] = 0.0
-            normal[i, face] = -1.0 if point[face] < surfaces[i, 2 + face] else 1.0
-    return distance, normal, curvature
-
-
-@compiled
-def surface_distances(surfaces: Array, points: Array) -> Array:
-    """Signed distances of points, shape (n, d), as of `nearest_points`, shape (n, k), m."""
-    found = np.empty((len(points), len(surfaces)))
-    for i in range(len(points)):
-        found[i] = nearest_points(surfaces, points[i])[0]
-    return found

@@ -15,8 +15,7 @@ import numpy as np
 from safe_wrappers.errors import Array, ConfigurationError, UnsupportedEnvError, positive
 from safe_wrappers.plants.copies import EnvCopier
 from safe_wrappers.plants.env_checks import name_of
-from safe_wrappers.plants.mujoco.forecast import RESETS, Recorder
-from safe_wrappers.plants.mujoco.model import control_range
+from safe_wrappers.plants.mujoco.model import RESETS
 
 ModelOf = Callable[[Any], mujoco.MjModel]
 """Takes the unwrapped env; returns its model."""
@@ -74,14 +73,14 @@ def checked_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
             "instead, or say where it keeps them: MujocoPlant(model=lambda env: ..., data=lambda env: ...)"
         )
     model: mujoco.MjModel = source.model if given is None else copy.copy(given)
-    for what, read in (
-        ("joints and actuators (nq, nv, nu)", lambda m: (m.nq, m.nv, m.nu)),
-        ("timestep, s", lambda m: m.opt.timestep),
-    ):
-        expected, found = read(source.model), read(model)
-        if not np.allclose(found, expected, rtol=1e-9, atol=0.0):
-            wrong = f"the plant's model must have the env's {what}: expected {expected}, got {found}"
-            raise ConfigurationError(wrong)
+    (*expected, step_s), (*found, own_step_s) = (
+        (m.nq, m.nv, m.nu, m.opt.timestep) for m in (source.model, model)
+    )
+    if found != expected or not np.isclose(own_step_s, step_s, rtol=1e-9, atol=0.0):
+        raise ConfigurationError(
+            "the plant's model must have the env's joints and actuators (nq, nv, nu) and timestep: expected "
+            f"{expected} and {step_s} s, got {found} and {own_step_s} s"
+        )
     if model.opt.integrator > _LAST_INTEGRATOR:
         raise UnsupportedEnvError(
             "the model's integrator is 'discrete' (MuJoCo 3.13 and later), whose accelerations are those of a "
@@ -112,26 +111,22 @@ def physics_steps(raw: Any, source: Any = None, control_dt: float | None = None)
         env = next((e for e in held if getattr(e, "data", None) is raw.data), raw)
     timestep = float((raw if own else source).model.opt.timestep)
     counts = (getattr(env, name, None) for name in ("frame_skip", "n_substeps") if own)
-    said = next((int(count) for count in counts if count is not None), None)
+    said: float | None = next((int(count) for count in counts if count is not None), None)
     if said is None and getattr(env, "dt", None) is not None:
         said = round(float(env.dt) / timestep)
-    if control_dt is None:
-        if said is None:
-            raise UnsupportedEnvError(
-                f"{raw} does not say how long a step lasts: give it an attribute dt (s) or frame_skip (physics "
-                "steps), or pass MujocoPlant(control_dt=...), in seconds"
-            )
-        return said
-    steps = positive("control_dt", control_dt, "s") / timestep
-    count = round(steps)
-    if count < 1 or not np.isclose(steps, count, rtol=1e-6):
-        wrong = f"is not a whole number of physics steps of {timestep} s: {steps:g}"
-        raise ConfigurationError(f"control_dt = {control_dt} s {wrong}")
-    if said not in (None, count):
-        wrong = (
-            f"is {count} physics steps of {timestep} s, but {raw} takes {said} with one action: leave it out"
+    if control_dt is None and said is None:
+        raise UnsupportedEnvError(
+            f"{raw} does not say how long a step lasts: give it an attribute dt (s) or frame_skip (physics "
+            "steps), or pass MujocoPlant(control_dt=...), in seconds"
         )
-        raise ConfigurationError(f"control_dt = {control_dt} s {wrong}")
+    steps = said if control_dt is None else positive("control_dt", control_dt, "s") / timestep
+    assert steps is not None
+    count = round(steps)
+    if count < 1 or not np.isclose(steps, count, rtol=1e-6) or said not in (None, count):
+        raise ConfigurationError(
+            f"control_dt = {control_dt} s is {steps:g} physics steps of {timestep} s, which is to be a whole number; "
+            f"{raw} says {'nothing' if said is None else said}: leave control_dt out where the env says it"
+        )
     return count
 
 
@@ -220,26 +215,6 @@ def refuse_mapped(action_map: ActionMap | None, asker: str) -> None:
             "offset + scale * action. Constraints that forecast take that into account (SpeedLimit, JointSpeedLimit, "
             "JointPositionLimit, Workspace), as do Clearance, Barrier and ImpactSpeedLimit"
         )
-
-
-class MappedRecorder(Recorder):
-    """A `Recorder` of actions that the env maps to controls."""
-
-    def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int, action_map: ActionMap
-    ) -> None:
-        super().__init__(model, data, substeps)
-        self._map = action_map
-        # Brakes are as strong as actions can make them.
-        self._low, self._high = (np.clip(end, *control_range(model)) for end in action_map.reach())
-
-    def act(self, data: mujoco.MjData, control: Array) -> None:
-        """Give the machine an action, shape (nu,), as its env does at the start of a control interval."""
-        data.ctrl[:] = self._map.control(control)
-
-    def braking(self, data: mujoco.MjData) -> Array:
-        """The action that brakes, shape (nu,)."""
-        return self._map.action(super().braking(data))
 
 
 def action_map_of(env: gym.Env[Any, Any], source: Any, lower: Array, upper: Array) -> ActionMap | None:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import Array, name_list
-from safe_wrappers.plants.mujoco.forecast import RESETS
-from safe_wrappers.plants.mujoco.model import fixed_bodies, named
+from safe_wrappers.plants.mujoco.model import RESETS, fixed_bodies, named
 
 Visit = Callable[[mujoco.MjData, float], None]
 """Takes data with the contacts and forces of one evaluation, and the time for which it counts, s."""
@@ -37,7 +36,7 @@ class Replay:
     them between substeps, or writes to the state, ends elsewhere than the replay; then `after` returns False.
 
     Runge-Kutta steps are made here stage by stage, since MuJoCo keeps only the forces of the last stage; on Ant-v5
-    these alone are wrong by half of the impulse in the median step.
+    these alone are wrong by half of the impulse in the median step. Activations of actuators are not followed there.
     """
 
     def __init__(self, raw: Any) -> None:
@@ -87,11 +86,16 @@ def evaluations(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> Non
 def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> None:
     """`mj_step` by the classical four stages, in the order of MuJoCo's own sums."""
     step_s, time = float(model.opt.timestep), data.time
-    qpos, qvel, act, qacc, act_dot = data.qpos, data.qvel, data.act, data.qacc, data.act_dot
-    qpos0, qvel0, act0 = qpos.copy(), qvel.copy(), act.copy()
-    velocity, acceleration, activation = np.zeros(model.nv), np.zeros(model.nv), np.zeros(model.na)
+    qpos, qvel, qacc = data.qpos, data.qvel, data.qacc
+    qpos0, qvel0, velocity, acceleration = qpos.copy(), qvel.copy(), np.zeros(model.nv), np.zeros(model.nv)
     rate = np.zeros(model.nv)
     turns = _turns(model) if RATES_OF_ROTATION_VECTORS else np.zeros(0, dtype=np.intp)
+
+    def move(at_rate: Array, at_acceleration: Array) -> None:
+        qpos[:] = qpos0
+        mujoco.mj_integratePos(model, qpos, at_rate, step_s)
+        qvel[:] = qvel0 + step_s * at_acceleration
+
     for ahead, weight in _STAGES:
         mujoco.mj_forwardSkip(model, data, _FROM_POSITIONS, 1)
         visit(data, weight * step_s)
@@ -101,21 +105,11 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
             stage[turns] = rotation_vector_rate(step_s * rate[turns], qvel[turns])
         velocity += weight * stage
         acceleration += weight * qacc
-        if model.na:
-            activation += weight * act_dot
         if ahead:
             rate = ahead * stage
-            qpos[:] = qpos0
-            mujoco.mj_integratePos(model, qpos, rate, step_s)
-            qvel[:] = qvel0 + step_s * (ahead * qacc)
-            if model.na:
-                act[:] = act0 + step_s * (ahead * act_dot)
+            move(rate, ahead * qacc)
             data.time = time + ahead * step_s
-    qpos[:] = qpos0
-    mujoco.mj_integratePos(model, qpos, velocity, step_s)
-    qvel[:] = qvel0 + step_s * acceleration
-    if model.na:
-        act[:] = _within_ranges(model, act0 + step_s * activation)
+    move(velocity, acceleration)
     data.qacc_warmstart[:] = qacc
 
 
@@ -126,7 +120,7 @@ def _turns(model: mujoco.MjModel) -> NDArray[np.intp]:
     return np.asarray(first[:, None] + np.arange(3), dtype=np.intp)
 
 
-def rotation_vector_rate(turned: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_vector_rate(turned: Array, velocity: Array) -> Array:
     """Rates of rotation vectors, rad/s, from angular velocities in the turned body's frame, rad/s; shapes (n, 3).
 
     The inverse of the exponential's derivative: Iserles et al., "Lie-group methods", Acta Numerica 9 (2000).
@@ -140,126 +134,91 @@ def rotation_vector_rate(turned: NDArray[np.float64], velocity: NDArray[np.float
         return np.asarray(velocity + 0.5 * across + second * np.cross(turned, across))
 
 
-def _within_ranges(model: mujoco.MjModel, act: np.ndarray) -> np.ndarray:
-    """Activations clipped where their actuators limit them."""
-    limited = model.actuator_actlimited.astype(bool) & (model.actuator_actadr >= 0)
-    last = model.actuator_actadr[limited] + model.actuator_actnum[limited] - 1
-    act[last] = np.clip(act[last], *model.actuator_actrange[limited].T)
-    return act
-
-
 # Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here.
 _FASTEST = float(mujoco.mjMAXVAL) ** 2
 
 
-class NormalContact(NamedTuple):
-    """One contact."""
+class Contacts(NamedTuple):
+    """The n contacts of some evaluations of the physics. The fixed world is never the pushed body."""
 
-    bodies: tuple[int, int]  # ids, the smaller first; `nbody` stands for something flexible
-    gap: float  # signed distance, m; negative where they penetrate
-    force: float  # along the normal, N; positive pushes them apart
-
-
-class Contacts:
-    """Reads the contacts between the named bodies of a model and those they touch; None is all of them.
-
-    Attributes:
-        watched: Which two bodies count, shape (nbody + 1, nbody + 1); the last stands for flexible parts.
-
-    Raises:
-        UnknownNameError: No body has that name; the message lists all names.
-    """
-
-    def __init__(
-        self, model: mujoco.MjModel, bodies: Sequence[str] | None = None, against: Sequence[str] | None = None
-    ) -> None:
-        self.model = model
-        one, other = chosen_bodies(model, "bodies", bodies), chosen_bodies(model, "against", against)
-        self.watched = one[:, None] & other | other[:, None] & one
-        self._watched = self.watched.tolist()
-        # The last entry is for geom -1, of something flexible.
-        self._body_of_geom: list[int] = [*model.geom_bodyid.tolist(), model.nbody]
-        # A pyramidal cone's edges share the normal force; an elliptic cone's first row has it.
-        pyramids = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
-        self._rows = {dim: 2 * (dim - 1) if pyramids and dim > 1 else 1 for dim in (1, 3, 4, 6)}
-
-    def read(self, data: mujoco.MjData) -> list[NormalContact]:
-        """The watched contacts, as MuJoCo has computed them last."""
-        if data.ncon == 0:
-            return []
-        contact, forces, body, found = data.contact, data.efc_force.tolist(), self._body_of_geom, []
-        fields = (f.tolist() for f in (contact.geom, contact.dist, contact.efc_address, contact.dim))
-        for (geom1, geom2), gap, row, dim in zip(*fields, strict=True):
-            first, second = body[geom1], body[geom2]
-            if self._watched[first][second]:
-                force = sum(forces[row : row + self._rows[dim]]) if row >= 0 else 0.0
-                found.append(NormalContact((min(first, second), max(first, second)), gap, force))
-        return found
-
-
-class ContactForecast(NamedTuple):
-    """Every contact of the robot with what does not move, at every evaluation of the physics of one held control."""
-
-    steps: int  # number of evaluations: one per physics substep, four with Runge-Kutta
-    step: NDArray[np.int64]  # the evaluation that each contact belongs to, shape (n,)
-    body: NDArray[np.int64]  # id of the body of the robot, shape (n,)
+    steps: int  # number of evaluations: of a held control one per physics substep, four with Runge-Kutta
+    step: NDArray[np.intp]  # the evaluation that each contact belongs to, shape (n,)
+    bodies: NDArray[np.intp]  # ids of the other body and of the pushed one, shape (n, 2); `nbody` is flexible
+    gap: Array  # signed distance, shape (n,), m; negative where they penetrate
     point: Array  # shape (n, 3), m
-    normal: Array  # pointing at the robot, shape (n, 3)
-    force: Array  # on the robot, shape (n, 3), N
-    friction: (
-        Array  # of sliding, shape (n,): the smaller of two directions' coefficients; 0 without (condim 1)
-    )
-    finite: (
-        bool  # False where numbers left MuJoCo's bounds (it then resets the state): contacts are meaningless
-    )
+    normal: Array  # pointing at the pushed body, shape (n, 3)
+    friction: Array  # of sliding, shape (n,): the smaller of two directions'; 0 without friction (condim 1)
+    force: Array  # on the pushed body, shape (n, 3), N
+    finite: bool  # False where MuJoCo resets the state: contacts are meaningless
     holds: int = 1  # control intervals
+
+    @property
+    def body(self) -> NDArray[np.intp]:
+        """Ids of the pushed bodies, shape (n,)."""
+        return self.bodies[:, 1]
+
+
+_WHOLE, _REAL = np.zeros((0, 2), dtype=np.intp), np.zeros((0, 9))
+_NOTHING = (
+    *(_WHOLE[:, 0], _WHOLE, _WHOLE[:, 0], _WHOLE[:, 0]),
+    *(_REAL[:, 0], _REAL[:, :3], _REAL, _REAL[:, :5], _REAL[:, :6]),
+)
+"""What `ContactReader.read` keeps of an evaluation without contacts."""
 
 
 class ContactReader:
-    """Reads the contacts of a model's moving bodies with the fixed world."""
+    """Reads those contacts of a model that its solver has, evaluation by evaluation.
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    Args:
+        model: Of the data to be read.
+        watched: Which two bodies count, shape (nbody + 1, nbody + 1); the last stands for flexible parts. None: all.
+    """
+
+    def __init__(self, model: mujoco.MjModel, watched: NDArray[np.bool_] | None = None) -> None:
         self._model = model
-        # The last entry is for geom -1, of something flexible: it moves, but is not a body of the robot.
-        bodies = np.where(fixed_bodies(model), 0, np.arange(model.nbody))
-        self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
-        self._wrench = np.zeros(6)
+        self._watched = np.ones((model.nbody + 1,) * 2, dtype=bool) if watched is None else watched
+        self._fixed = np.append(fixed_bodies(model), False)
+        self._body_of_geom = np.append(model.geom_bodyid, model.nbody)  # the last is for geom -1
         self.clear()
 
     def clear(self) -> None:
         """Forget what has been read."""
-        self.count = 0
-        self._found: list[tuple[Any, ...]] = []
+        self._steps = 0
+        self._seen = [_NOTHING]
 
     def read(self, data: mujoco.MjData) -> None:
-        """Copy every contact of a moving body with the fixed world, as MuJoCo has computed them last."""
-        step, body, contact = self.count, self._body_of_geom, data.contact
-        self.count += 1
-        for i, (one, other) in enumerate(contact.geom.tolist()):
-            first, second = body[one], body[other]
-            if first == second or min(first, second) != 0 or contact.efc_address[i] < 0:
-                continue
-            mujoco.mj_contactForce(self._model, data, i, self._wrench)
-            # MuJoCo's normal points from the first geom to the second, and the force is on the second.
-            side = 1.0 if first == 0 else -1.0
-            slide = contact.friction[i, :2].min() if contact.dim[i] > 1 else 0.0
-            frame = contact.frame[i].reshape(3, 3).copy()
-            self._found.append(
-                (step, first or second, contact.pos[i].copy(), side, frame, self._wrench[:3].copy(), slide)
-            )
+        """Copy the contacts, as MuJoCo has computed them last; `found` chooses among them."""
+        step, contact = self._steps, data.contact
+        self._steps += 1
+        if not data.ncon:
+            return
+        wrenches = np.empty((data.ncon, 6))
+        for i, wrench in enumerate(wrenches):
+            mujoco.mj_contactForce(self._model, data, i, wrench)
+        kinds = contact.geom, contact.efc_address, contact.dim
+        places = contact.dist, contact.pos, contact.frame, contact.friction
+        copies = (part.copy() for part in (*kinds, *places))
+        self._seen.append((np.full(data.ncon, step), *copies, wrenches))
 
-    def forecast(self, finite: bool) -> ContactForecast:
-        """All contacts that have been read since `clear`."""
-        if not self._found:
-            none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-            return ContactForecast(self.count, none, none, nowhere, nowhere, nowhere, np.zeros(0), finite)
-        step, body, point, side, frame, force, friction = (
-            np.array(part) for part in zip(*self._found, strict=True)
+    def found(self, finite: bool = True) -> Contacts:
+        """The watched contacts that have been read since `clear`."""
+        step, geoms, row, dim, gap, point, frame, friction, wrench = map(
+            np.concatenate, zip(*self._seen, strict=True)
         )
-        normal, force = side[:, None] * frame[:, 0], side[:, None] * np.einsum("ki,kij->kj", force, frame)
-        return ContactForecast(self.count, step, body, point, normal, force, friction, finite)
+        bodies = self._body_of_geom[geoms]
+        chosen = self._watched[bodies[:, 0], bodies[:, 1]] & (row >= 0)
+        # MuJoCo's normal points from the first geom to the second, and its force pushes the second.
+        turned = self._fixed[bodies[:, 1]][:, None]
+        side, bodies = np.where(turned, -1.0, 1.0), np.where(turned, bodies[:, ::-1], bodies)
+        frame = frame.reshape(-1, 3, 3)
+        force = side * np.einsum("ki,kij->kj", wrench[:, :3], frame)
+        sliding = friction[:, :2].min(axis=1) * (dim > 1)
+        return Contacts(
+            *(self._steps, step[chosen], bodies[chosen], gap[chosen], point[chosen]),
+            *((side * frame[:, 0])[chosen], sliding[chosen], force[chosen], finite),
+        )
 
-    def follow(self, data: mujoco.MjData, substeps: int) -> ContactForecast:
+    def follow(self, data: mujoco.MjData, substeps: int) -> Contacts:
         """Step the data, with the control it has, and return the contacts of all these physics substeps."""
         data.warning.number[RESETS] = 0
         self.clear()
@@ -273,7 +232,26 @@ class ContactReader:
         for _ in range(substeps):
             evaluations(self._model, data, visit)
         inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
-        return self.forecast(inside and not data.warning.number[RESETS].any())
+        return self.found(inside and not data.warning.number[RESETS].any())
+
+
+def between(
+    model: mujoco.MjModel, bodies: Sequence[str] | None = None, against: Sequence[str] | None = None
+) -> NDArray[np.bool_]:
+    """For a `ContactReader`: the contacts between named bodies and those they touch; None is all of them.
+
+    Raises:
+        UnknownNameError: No body has that name; the message lists all names.
+    """
+    one, other = chosen_bodies(model, "bodies", bodies), chosen_bodies(model, "against", against)
+    return np.asarray(one[:, None] & other | other[:, None] & one)
+
+
+def on_the_world(model: mujoco.MjModel, robot: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    """For a `ContactReader`: the contacts of moving bodies, of a robot's, shape (nbody,), with the fixed world."""
+    fixed = fixed_bodies(model)
+    ours, world = np.append(~fixed if robot is None else robot & ~fixed, False), np.append(fixed, False)
+    return np.asarray(ours[:, None] & world | world[:, None] & ours)
 
 
 def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:

@@ -8,7 +8,6 @@ a round foot that rolls, such a point moves into the foot.
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
@@ -21,6 +20,7 @@ from safe_wrappers.control.legged import CentroidalMomentum, centroidal_momentum
 from safe_wrappers.errors import Array, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
+from safe_wrappers.plants.mujoco.contacts import ContactReader, Contacts
 from safe_wrappers.plants.mujoco.model import (
     AT_A_JOINT,
     SCALAR_JOINTS,
@@ -36,21 +36,8 @@ LEFT_OVER: Final = 0.05
 """Share of a vibration's amplitude that may be left after a control interval for a rigid model to be good enough."""
 
 
-class ContactPoints(NamedTuple):
-    """The k contacts of MuJoCo's solver. The world is never the pushed body."""
-
-    points: Array  #: shape (k, 3), m
-    normals: Array  #: unit normals, pointing at the pushed body, shape (k, 3)
-    first_tangents: Array  #: the first axis of MuJoCo's friction pyramid, shape (k, 3)
-    friction: Array  #: coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1)
-    pushed_by: NDArray[np.intp]  #: ids of the other bodies, shape (k,)
-    jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
-    drift: Array  #: `dJ/dt qvel`, shape (k, 3), m/s^2
-    forces: Array  #: on the pushed body, as MuJoCo's solver found them last, shape (k, 3), N
-
-
 class FloatingBaseTerms(NamedTuple):
-    """The equations of motion at one state.
+    """The equations of motion at one state, with the k contacts of MuJoCo's solver.
 
     The bias has Coriolis, centrifugal and gravity forces, minus passive and applied forces, minus the actuators'
     forces at zero control, minus constraint forces other than contacts, as MuJoCo found them for the data's control.
@@ -59,7 +46,9 @@ class FloatingBaseTerms(NamedTuple):
     inertia: Array  #: M with armature, shape (nv, nv)
     bias: Array  #: h, shape (nv,)
     actuation: Array  #: B, shape (nv, nu): generalised force per control, inside the actuators' force ranges
-    contacts: ContactPoints
+    contacts: Contacts
+    jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
+    drift: Array  #: `dJ/dt qvel`, shape (k, 3), m/s^2
 
 
 def equations_of_motion(
@@ -68,7 +57,8 @@ def equations_of_motion(
     """The terms at the state of the data, which are only read and must be up to date (`mj_forward`).
 
     Raises:
-        UnsupportedEnvError: An actuator that is not affine in its control; not checked where `actuators` are given.
+        UnsupportedEnvError: Something flexible is in contact, which has no body; or an actuator that is not affine in
+            its control, which is not checked where `actuators` are given.
     """
     acts = AffineActuators(model) if actuators is None else actuators
     gain, _ = acts.gain_and_bias(data.actuator_length, data.actuator_velocity)
@@ -77,38 +67,21 @@ def equations_of_motion(
     if data.nefc:
         mujoco.mj_mulJacTVec(model, data, others, np.where(data.efc_type < _CONTACT, data.efc_force, 0.0))
     bias = actuation @ np.clip(data.ctrl, *control_range(model)) - data.qfrc_smooth - others
-    return FloatingBaseTerms(inertia(model, data), bias, actuation, contact_points(model, data))
-
-
-def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
-    """The contacts of data that are up to date (`mj_forward`).
-
-    Raises:
-        UnsupportedEnvError: Something flexible is in contact, which has no body.
-    """
-    found, fixed = data.contact, fixed_bodies(model)
-    touching = np.flatnonzero(found.efc_address >= 0)
-    if (found.geom[touching] < 0).any():
+    reader = ContactReader(model)
+    reader.read(data)
+    contacts = reader.found()
+    if (contacts.bodies == model.nbody).any():
         raise UnsupportedEnvError("something flexible is in contact, which has no body")
-    bodies, frames = model.geom_bodyid[found.geom[touching]], found.frame[touching].reshape(-1, 3, 3)
-    # MuJoCo's normal points from the first geom to the second, and its force pushes the second.
-    turned = fixed[bodies[:, 1]][:, None]
-    signs, bodies = np.where(turned, -1.0, 1.0), np.where(turned, bodies[:, ::-1], bodies)
-    jacobians = np.zeros((len(touching), 3, model.nv))
-    forces, drift = np.zeros((len(touching), 3)), np.zeros((len(touching), 3))
-    jac, dot, wrench = np.zeros((3, model.nv)), np.zeros((3, model.nv)), np.zeros(6)
-    for row, i in enumerate(touching.tolist()):
-        mujoco.mj_contactForce(model, data, i, wrench)
-        forces[row] = signs[row] * (wrench[:3] @ frames[row])
-        for body, side in zip(bodies[row].tolist(), (-1.0, 1.0), strict=True):
+    fixed, (jac, dot) = fixed_bodies(model), np.zeros((2, 3, model.nv))
+    jacobians, drift = np.zeros((len(contacts.point), 3, model.nv)), np.zeros((len(contacts.point), 3))
+    for row, (point, bodies) in enumerate(zip(contacts.point, contacts.bodies.tolist(), strict=True)):
+        for body, side in zip(bodies, (-1.0, 1.0), strict=True):
             if not fixed[body]:
-                mujoco.mj_jac(model, data, jac, None, found.pos[i], body)
-                mujoco.mj_jacDot(model, data, dot, None, found.pos[i], body)
+                mujoco.mj_jac(model, data, jac, None, point, body)
+                mujoco.mj_jacDot(model, data, dot, None, point, body)
                 jacobians[row] += side * jac
                 drift[row] += side * (dot @ data.qvel)
-    friction = np.where(found.dim[touching] > 1, found.friction[touching, 0], 0.0)
-    geometry = np.array(found.pos[touching]), signs * frames[:, 0], np.array(frames[:, 1]), friction
-    return ContactPoints(*geometry, bodies[:, 0], jacobians, drift, forces)
+    return FloatingBaseTerms(inertia(model, data), bias, actuation, contacts, jacobians, drift)
 
 
 class MomentumReader:
@@ -196,29 +169,25 @@ class InverseDynamics:
             yield self._data
 
 
-@dataclass(frozen=True)
-class RigidModelCheck:
-    """What `rigid_model_check` found; printed, it is the verdict.
+class RigidModelCheck(NamedTuple):
+    """What `rigid_model_check` found of springs behind a motor; printed, it is the verdict."""
 
-    Attributes:
-        springs: Names of the joints that are springs behind a motor; empty if there are none.
-        resonances: Of the springs, at the pose of the check, the slowest first, rad/s.
-        damping_ratios: Of each of them, to first order in the damping.
-        boundary_layer_s: Time constant with which the slowest of the vibrations decays, 1 / (ratio resonance), s;
-            infinite without damping, 0 without springs.
-        control_dt: Control interval of the env, s.
-    """
+    resonances: tuple[float, ...]  #: of the springs, at the pose of the check, the slowest first, rad/s
+    damping_ratios: tuple[float, ...]  #: of each of them, to first order in the damping
+    control_dt: float  #: control interval of the env, s
 
-    springs: tuple[str, ...]
-    resonances: tuple[float, ...]
-    damping_ratios: tuple[float, ...]
-    boundary_layer_s: float
-    control_dt: float
+    @property
+    def boundary_layer_s(self) -> float:
+        """Time constant with which the slowest vibration decays, s; infinite without damping, 0 without springs."""
+        if not self.resonances:
+            return 0.0
+        slowest = min(w * z for w, z in zip(self.resonances, self.damping_ratios, strict=True))
+        return 1.0 / slowest if slowest > 0.0 else np.inf
 
     @property
     def left_over(self) -> float:
         """Share of a vibration's amplitude that is left after one control interval."""
-        return float(np.exp(-self.control_dt / self.boundary_layer_s)) if self.boundary_layer_s > 0.0 else 0.0
+        return float(np.exp(-self.control_dt / self.boundary_layer_s)) if self.resonances else 0.0
 
     @property
     def rigid_is_good_enough(self) -> bool:
@@ -227,7 +196,7 @@ class RigidModelCheck:
 
     def __str__(self) -> str:
         """The verdict and why, in one sentence."""
-        if not self.springs:
+        if not self.resonances:
             return "rigid model is good enough: no spring lies behind a motor"
         found = zip(self.resonances, self.damping_ratios, strict=True)
         rings = ", ".join(f"{w / (2.0 * np.pi):.3g} Hz (damping ratio {z:.2g})" for w, z in found)
@@ -264,35 +233,21 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
     plant.observe()
     data, model = plant.forward(), plant.model
     moment = plant.actuators.moment(data)
-    scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
-    springs = _springs(model, np.asarray(moment.any(axis=0)), scalar)
-    if not len(springs):
-        return RigidModelCheck((), (), (), 0.0, plant.control_dt)
-    stiffness, damping = np.zeros((model.nv, model.nv)), np.diag(model.dof_damping)
-    every = model.jnt_dofadr[scalar]
-    stiffness[every, every] = model.jnt_stiffness[scalar]
+    scalar = np.flatnonzero(np.isin(model.jnt_type, SCALAR_JOINTS))
+    dofs = model.jnt_dofadr[scalar]
+    springs, damping = np.zeros(model.nv), np.diag(model.dof_damping)
+    springs[dofs] = model.jnt_stiffness[scalar]
     affine = (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE))[: len(moment)]
     fed_back = -model.actuator_biasprm[: len(moment)] * affine[:, None]
-    stiffness += moment.T * fed_back[:, 1] @ moment
+    stiffness = np.diag(springs) + moment.T * fed_back[:, 1] @ moment
     damping = damping + moment.T * fed_back[:, 2] @ moment
+    driven = np.asarray(moment.any(axis=0))
+    behind = np.zeros(model.nv, dtype=bool)  # whether a driven joint is before it on the way from the world
+    for dof, before in enumerate(model.dof_parentid):  # which is smaller
+        behind[dof] = before >= 0 and (driven[before] or behind[before])
+    springs *= behind & ~driven
     found = modes(inertia(model, data), stiffness, damping)
-    at_springs = found.shapes[model.jnt_dofadr[springs]]
-    own = (at_springs**2 * model.jnt_stiffness[springs][:, None]).sum(axis=0)  # of the stored energy
-    chosen = (found.resonances > 0.0) & (own > 0.5 * found.resonances**2)
-    resonances, ratios = found.resonances[chosen], found.damping_ratios[chosen]
-    slowest = float((resonances * ratios).min(initial=np.inf))
-    names = tuple(model.joint(int(j)).name or f"#{j}" for j in springs)
-    decay = 1.0 / slowest if slowest > 0.0 else np.inf
-    return RigidModelCheck(names, tuple(resonances.tolist()), tuple(ratios.tolist()), decay, plant.control_dt)
-
-
-def _springs(model: mujoco.MjModel, driven: NDArray[np.bool_], scalar: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Joints with stiffness that no actuator drives and that have a driven joint before them, shape (n,)."""
-    found = []
-    for j in np.flatnonzero(scalar & (model.jnt_stiffness > 0.0)):
-        dof = before = int(model.jnt_dofadr[j])
-        while before >= 0 and not driven[before]:
-            before = int(model.dof_parentid[before])
-        if before >= 0 and before != dof:
-            found.append(j)
-    return np.array(found, dtype=np.intp)
+    stored = springs @ found.shapes**2  # twice the energy in the springs, at an amplitude of 1
+    chosen = (found.resonances > 0.0) & (stored > 0.5 * found.resonances**2)
+    resonances, ratios = found.resonances[chosen].tolist(), found.damping_ratios[chosen].tolist()
+    return RigidModelCheck(tuple(resonances), tuple(ratios), plant.control_dt)

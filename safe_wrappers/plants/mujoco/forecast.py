@@ -6,13 +6,12 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.errors import Array
-from safe_wrappers.plants.mujoco.model import Remade, control_range
+from safe_wrappers.plants.mujoco.binding import ActionMap
+from safe_wrappers.plants.mujoco.model import RESETS, Remade, control_range
 from safe_wrappers.plants.plant import Trajectory
 
 _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
-RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
-"""The warnings after which MuJoCo resets the state."""
 _NONE: Final = bytes(4 * (RESETS.stop - RESETS.start))
 """The counts of these warnings where there was none."""
 _EULER: Final = int(mujoco.mjtIntegrator.mjINT_EULER)
@@ -63,9 +62,18 @@ class MujocoTrajectory(Trajectory):
 
 
 class Recorder(Remade):
-    """Steps the plant's own model and keeps what a forecast holds; `substeps` are those of a control interval."""
+    """Steps the plant's own model and keeps what a forecast holds; `substeps` are those of a control interval.
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int) -> None:
+    With an `action_map` a control is the action that the env maps to the model's.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        substeps: int,
+        action_map: ActionMap | None = None,
+    ) -> None:
         self._model, self._data, self.substeps, self.nq = model, data, substeps, int(model.nq)
         self.is_runge_kutta = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
         self._resets = data.warning.number[RESETS]
@@ -83,7 +91,10 @@ class Recorder(Remade):
         rest, per_length = -bias[:, :2].T / np.where(acts, gain, 1.0)
         damping[bias[:, 2] != 0.0] = 0.0  # it has damping of its own
         self._servos = rest, per_length, damping
-        self._low, self._high = control_range(model)
+        self._map = action_map
+        self._low, self._high = low, high = control_range(model)
+        if action_map is not None:  # brakes are as strong as actions can make them
+            self._low, self._high = (np.clip(end, low, high) for end in action_map.reach())
 
     def record(
         self, control: Array, horizon: int, first: MujocoTrajectory | None = None, euler: bool = False
@@ -181,11 +192,12 @@ class Recorder(Remade):
 
     def act(self, data: mujoco.MjData, control: Array) -> None:
         """Give the machine a control, as its env does at the start of a control interval."""
-        data.ctrl[:] = control
+        data.ctrl[:] = control if self._map is None else self._map.control(control)
 
     def braking(self, data: mujoco.MjData) -> Array:
-        """Every actuator against its own motion, shape (nu,); read once per control interval, as controllers do."""
-        return self._against_motion(data)
+        """The control that brakes, shape (nu,)."""
+        told = self._against_motion(data)
+        return told if self._map is None else self._map.action(told)
 
     def brake(self, data: mujoco.MjData) -> None:
         """Give the machine the control that brakes."""
@@ -196,6 +208,7 @@ class Recorder(Remade):
         return False
 
     def _against_motion(self, data: mujoco.MjData) -> Array:
+        """Every actuator against its own motion, shape (nu,); read once per control interval, as controllers do."""
         rest, per_length, damping = self._servos
         told = rest + per_length * data.actuator_length - damping * data.actuator_velocity
         return np.asarray(np.minimum(np.maximum(told, self._low), self._high))

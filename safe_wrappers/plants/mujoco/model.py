@@ -20,6 +20,9 @@ _ALONG_S = 1e-5
 AT_A_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 """The transmissions of actuators that act on one joint."""
 
+RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+"""The warnings after which MuJoCo resets the state."""
+
 
 class Remade:
     """Base of what keeps addresses or views of MuJoCo's memory: a copy is made anew, from copies of the arguments."""
@@ -56,24 +59,18 @@ def names(model: mujoco.MjModel, kind: str, pattern: str = "*") -> list[str]:
     return [n for n in every if n and fnmatchcase(n, pattern)]
 
 
-class Frames:
-    """Jacobians of the named frames of a machine."""
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self._model, self._data = model, data
-        self._known: dict[tuple[str, str], tuple[int, int]] = {}
-
-    def jacobian(self, kind: str, name: str, compute: Any = mujoco.mj_jac) -> tuple[Array, Array]:
-        """A frame's origin, shape (3,), m, and its Jacobian, or with `mj_jacDot` the rate of that, shape (3, nv)."""
-        if (kind, name) not in self._known:
-            handle = named(self._model, kind, name)
-            body = handle if kind == "body" else int(getattr(self._model, f"{kind}_bodyid")[handle])
-            self._known[kind, name] = body, handle
-        body, handle = self._known[kind, name]
-        p = getattr(self._data, "xpos" if kind == "body" else f"{kind}_xpos")[handle].copy()
-        jacobian = np.zeros((3, self._model.nv))
-        compute(self._model, self._data, jacobian, None, p, body)
-        return p, jacobian
+def frame(
+    model: mujoco.MjModel, data: mujoco.MjData, kind: str, name: str, compute: Any = mujoco.mj_jac
+) -> tuple[Array, Array]:
+    """Origin of a "body", "site" or "geom", shape (3,), m, and its Jacobian, or by `mj_jacDot` its rate, (3, nv)."""
+    i = named(model, kind, name)
+    body = i if kind == "body" else int(getattr(model, f"{kind}_bodyid")[i])
+    origin, jacobian = (
+        getattr(data, "xpos" if kind == "body" else f"{kind}_xpos")[i].copy(),
+        np.zeros((3, model.nv)),
+    )
+    compute(model, data, jacobian, None, origin, body)
+    return origin, jacobian
 
 
 def fixed_bodies(model: mujoco.MjModel) -> NDArray[np.bool_]:

@@ -1,6 +1,7 @@
 """A point mass on two slides in a MuJoCo model: its joints, actuators and constants, and the walls around it."""
 
 import copy
+from collections.abc import Sequence
 from typing import NamedTuple, NoReturn
 
 import mujoco
@@ -24,15 +25,24 @@ class PlanarPoint(NamedTuple):
 
     body: int  # index of the body
     axes: tuple[DampedAxis, DampedAxis]  # constants of the motion
-    joints: tuple[int, int]  # indices of the two slides, in qpos and in qvel
-    actuators: tuple[int, int]  # indices of their actuators
-    origin: tuple[float, float]  # where the point is at qpos = 0, m
+    joints: list[int]  # indices of the two slides, in qpos and in qvel
+    actuators: list[int]  # indices of their actuators
+    origin: Array  # where the point is at qpos = 0, m, shape (2,)
 
-    def control(self, like: Array, pair: Array | tuple[float, float]) -> Array:
+    def motion(self, plant: MujocoPlant) -> tuple[Array, Array]:
+        """Position, m, and velocity, m/s, in the plant's state, shapes (2,)."""
+        return plant.qpos[self.joints] + self.origin, plant.qvel[self.joints]
+
+    def control(self, like: Array, pair: Sequence[float] | Array) -> Array:
         """A control, shape (nu,), with other values on the two slides."""
         whole = np.array(like)
-        whole[list(self.actuators)] = pair
+        whole[self.actuators] = pair
         return whole
+
+
+def nearest_first(pairs: Array, asked: Array) -> Array:
+    """Pairs, shape (k, 2), by their distance from the one that was asked for, shape (2,)."""
+    return np.asarray(pairs[np.argsort(((pairs - asked) ** 2).sum(axis=1), kind="stable")])
 
 
 def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> PlanarPoint:
@@ -58,11 +68,10 @@ def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> Pl
     if m.jnt_limited[list(slides)].any():
         _refuse("its slides must have no limits (walls stop it, not joints)")
     actuators = _actuators(m, joints, alone=body is None)
-    order = int(m.jnt_qposadr[joints[0]]), int(m.jnt_qposadr[joints[1]])
+    order = m.jnt_qposadr[list(joints)].tolist()
     axes = _measured(plant, order, actuators, clip)
     index = int(m.jnt_bodyid[slides[0]])
-    x, y, _ = data.xpos[index].tolist()
-    return PlanarPoint(index, axes, order, actuators, (x, y))
+    return PlanarPoint(index, axes, order, actuators, data.xpos[index, :2].copy())
 
 
 def _slides(m: mujoco.MjModel, body: int | None) -> tuple[int, int]:
@@ -89,28 +98,27 @@ def _along_x_and_y(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
     _refuse(f"its slides must go along world x and world y; they go along {found}")
 
 
-def _actuators(m: mujoco.MjModel, joints: tuple[int, int], alone: bool) -> tuple[int, int]:
+def _actuators(m: mujoco.MjModel, joints: tuple[int, int], alone: bool) -> list[int]:
     driven = [int(m.actuator_trnid[a, 0]) if m.actuator_trntype[a] in AT_A_JOINT else -1 for a in range(m.nu)]
     if alone and sorted(driven) != [0, 1]:
         _refuse("each of its slides needs a force actuator of its own, and there must be no other actuator")
     if [driven.count(j) for j in joints] != [1, 1]:
         _refuse("each of its slides needs a force actuator of its own, and only one")
-    return driven.index(joints[0]), driven.index(joints[1])
+    return [driven.index(joint) for joint in joints]
 
 
 def _measured(
-    plant: MujocoPlant, order: tuple[int, int], actuators: tuple[int, int], clip: float
+    plant: MujocoPlant, at: list[int], motors: list[int], clip: float
 ) -> tuple[DampedAxis, DampedAxis]:
     """The axes' constants from single physics steps of the plant's model without contacts."""
     m = plant.model
     least, most = plant.acting_range
-    low, high = least[list(actuators)], most[list(actuators)]
+    low, high = least[motors], most[motors]
     if not (np.isfinite([low, high]).all() and (low < 0.0).all() and (high > 0.0).all()):
         _refuse(f"its controls must be bounded and push both ways; they act from {least} to {most}")
     free = copy.copy(m)
     free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     data = mujoco.MjData(free)
-    at, motors = list(order), list(actuators)
 
     def step(x: Array, v: Array, u: Array, around: np.random.Generator | None = None) -> tuple[Array, Array]:
         mujoco.mj_resetData(free, data)

@@ -14,7 +14,7 @@ from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
-from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
+from safe_wrappers.plants.mujoco.contacts import ContactReader, Contacts, on_the_world
 from safe_wrappers.plants.mujoco.forecast import MujocoTrajectory, Poses, Recorder
 from safe_wrappers.plants.mujoco.model import (
     DYNAMICS,
@@ -139,23 +139,17 @@ class MujocoPlant(Plant):
         if moved:
             self._nq, self._nv = int(model.nq), int(model.nv)
             self._snapshot: Array = np.zeros(mujoco.mj_stateSize(model, STATE))
-        self.frames = of_model.Frames(model, self.data)
         self._delay_steps = int(np.ceil(self.delay_s / model.opt.timestep - 1e-9))
         self._pending = deque(self._pending, maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._recorder = self._new_recorder()
-        self._contact_reader = ContactReader(model)
+        self._contact_reader = ContactReader(model, on_the_world(model))
         # Last: a model that was refused is refused again at the next observation.
         self._env_model, self._outdated = source.model, False
         self.model_version += 1
         self._forget()
 
     def _new_recorder(self) -> Recorder:
-        stepped = self.model, self.data, self.substeps
-        return (
-            Recorder(*stepped)
-            if self.action_map is None
-            else binding.MappedRecorder(*stepped, self.action_map)
-        )
+        return Recorder(self.model, self.data, self.substeps, self.action_map)
 
     def _bind_actions(self, env: gym.Env[Any, Any]) -> None:
         """Find the bounds of the action, and the map from it to the control."""
@@ -180,7 +174,7 @@ class MujocoPlant(Plant):
         self._loaded = self._forwarded = False
         self._affine: tuple[Array, Array] | None = None
         self._forecasts: dict[tuple[bytes, bool], MujocoTrajectory] = {}
-        self._contact_forecasts: dict[bytes, ContactForecast] = {}
+        self._contact_forecasts: dict[bytes, Contacts] = {}
 
     def observe(self) -> None:
         """Take the env's present state; everything else is computed on demand."""
@@ -241,10 +235,6 @@ class MujocoPlant(Plant):
         for i, control in enumerate(self._pending):
             self._recorder.act(self.data, control)
             mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
-        self._keep()
-
-    def _keep(self) -> None:
-        """Make the data's state the present one."""
         mujoco.mj_getState(self.model, self.data, self._snapshot, STATE)
         self._loaded = False
 
@@ -367,7 +357,7 @@ class MujocoPlant(Plant):
         self._load_to_step()
         return self._recorder.sketch(control, horizon)
 
-    def contact_forecast(self, control: Array) -> ContactForecast:
+    def contact_forecast(self, control: Array) -> Contacts:
         """Contacts with the fixed world while a control, shape (nu,), is held for one interval; kept as forecasts."""
         key = control.tobytes()
         if key not in self._contact_forecasts:
@@ -411,7 +401,7 @@ class MujocoPlant(Plant):
         data = self.pose()
         if not self._forwarded:
             mujoco.mj_comPos(self.model, data)  # for the Jacobian
-        p, jacobian = self.frames.jacobian(kind, name)
+        p, jacobian = of_model.frame(self.model, self.data, kind, name)
         return p, jacobian @ self.qvel
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
@@ -420,8 +410,8 @@ class MujocoPlant(Plant):
         The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
         drift, effect = self.acceleration
-        p, jacobian = self.frames.jacobian(kind, name)
-        _, rate = self.frames.jacobian(kind, name, mujoco.mj_jacDot)
+        p, jacobian = of_model.frame(self.model, self.data, kind, name)
+        _, rate = of_model.frame(self.model, self.data, kind, name, mujoco.mj_jacDot)
         return p, jacobian @ self.qvel, jacobian @ drift + rate @ self.qvel, jacobian @ effect
 
     def attribute(self, name: str) -> Any:

@@ -47,8 +47,8 @@ GOOD = (np.zeros((4, 2)), np.zeros((3, 1)))
         ([(np.zeros(4), np.zeros((3, 1)))], "episode 0: expected"),
         ([GOOD, (np.zeros((4, 3)), np.zeros((3, 1)))], r"episode 1: expected .* got \(4, 3\) and \(3, 1\)"),
         ([GOOD, (np.zeros((4, 2)), np.zeros((3, 2)))], r"episode 1: expected .* got \(4, 2\) and \(3, 2\)"),
-        ([GOOD, (np.array([[0, 0], [0, np.nan], [0, 0], [0, 0]]), GOOD[1])], "episode 1 has numbers"),
-        ([(GOOD[0], np.array([[0.0], [0.0], [np.inf]]))], "episode 0 has numbers that are not finite"),
+        ([GOOD, (np.array([[0, 0], [0, np.nan], [0, 0], [0, 0]]), GOOD[1])], "of episode 1 must be finite"),
+        ([(GOOD[0], np.array([[0.0], [0.0], [np.inf]]))], "actions of episode 0 must be finite"),
         ([({"a": 1}, GOOD[1])], "observations of episode 0 is a number or an array"),
     ],
 )  # fmt: skip
