@@ -66,7 +66,7 @@ _MATTER = {
     "control/backup/heading_drive.py": "clearances not; clearances comparison",
     "constraints/backup/coasting_clearance.py": "CoastingClearance.leaves_clear not;"
     " CoastingClearance._after min/max; CoastingClearance.h_along not",
-    "constraints/backup/escape_clearance.py": "EscapeClearance.clearance not; EscapeClearance._backup not",
+    "constraints/backup/escape_clearance.py": "EscapeClearance.clearance not; EscapeClearance.proposals not",
     "constraints/backup/wall_clearance.py": "WallClearance.proposals not; WallClearance.h_along arithmetic",
     "control/backup/point_among_walls.py": "way min/max; distances min/max; slides comparison",
     "constraints/predictive_shield.py": "PredictiveShield.plan comparison; PredictiveShield._after not",
