@@ -11,14 +11,14 @@ from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup.heading_drive import clearances, look, way_to_rest
 from safe_wrappers.control.numerics.shapes import nearest_discs
 from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
+from safe_wrappers.filter.constraint import HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
 
 @dataclass
-class HeadingDriveClearance(Detour, Constraint, Model):
+class HeadingDriveClearance(Detour, Model):
     """Keep a planar robot out of every disc until it rests.
 
     The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading only.
