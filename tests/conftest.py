@@ -19,7 +19,7 @@ settings.load_profile("reproducible")
 
 BEGIN = (
     # Each worker compiles other parts of the package first and finds those of the other one compiled.
-    "test_drive_among_discs",
+    "test_heading_drive",
     "test_point_among_walls",
     "test_support_distances",
     "test_contact_feasibility",

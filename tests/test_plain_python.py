@@ -14,7 +14,7 @@ from safe_wrappers.control.compiled import IS_COMPILED
 FOLDERS = [str(Path(__file__).parent / name) for name in ("control", "constraints", "plants")]
 CALLS = {
     "test_stopping": ("random_looks", [200]),
-    "test_drive_among_discs": ("random_scenes", [400]),
+    "test_heading_drive": ("random_scenes", [10]),
     "test_point_among_walls": ("random_scenes", [40]),
 }
 """Module -> its function that returns a digest, and the arguments."""

@@ -10,7 +10,7 @@ from matplotlib.patches import Circle, FancyBboxPatch
 import safe_wrappers as sw
 from _crossing import road, tracked
 from _style import FORBIDDEN, OFF, ON, SAFE, panels
-from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
+from safe_wrappers.control.backup.evasive_maneuvers import ways
 from safe_wrappers.plants.mujoco.planar_point import planar_point
 
 LAYOUT = {
@@ -44,17 +44,15 @@ def draw() -> Figure:
             pad = f"round,pad={raw.car_radius}"
             ax.add_patch(FancyBboxPatch(corner, *size, boxstyle=pad, color=FORBIDDEN, alpha=0.12, lw=0))
     point = planar_point(plant, np.inf, "robot")
-    ways = [Maneuver(0.0, 0.0, 0)]
-    for x, y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
-        ways += [Maneuver(x, y, round(s / plant.control_dt)) for s in (0.3, 0.8)]
+    directions = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
+    controls = np.array([(0.0, 0.0), *np.repeat(directions, 2, axis=0)])
+    going = np.array([0, *(round(s / plant.control_dt) for s in (0.3, 0.8) * 4)])
     instants = np.arange(0, round(2.4 / plant.control_dt) + 1)
-    x, y = EvasiveManeuvers(point.axes, ways, instants).paths(
-        raw.agent_position[None], raw.agent_velocity[None], np.arange(len(ways))
-    )
+    found = ways(point.axes, raw.agent_position, raw.agent_velocity, controls, going, instants)
     times = plant.control_dt * instants
     centers, halves = discs.boxes(plant, times)
-    for along, across in zip(x[0], y[0], strict=True):
-        place = np.stack([along, across], axis=1)[:, None]
+    for way in found:
+        (along, across), place = way.T, way[:, None]
         gap = np.linalg.norm(np.maximum(np.abs(place - centers) - halves, 0.0), axis=2)
         free = bool((gap - raw.car_radius - raw.robot_radius).min() >= 0.05)
         ax.plot(along, across, color=SAFE if free else OFF, ls="-" if free else "--")

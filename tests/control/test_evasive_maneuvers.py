@@ -6,24 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.backup.damped_axis import damped_axis
-from safe_wrappers.control.backup.evasive_maneuvers import (
-    Around,
-    EvasiveManeuvers,
-    Maneuver,
-    least_left,
-)
+from safe_wrappers.control.backup.evasive_maneuvers import Around, least_left, ways
 
 AXES = (
     damped_axis(0.98, 0.04, 0.01, 4, -1.0, 1.0),
     damped_axis(1.0, 0.05, 0.02, 3, -0.7, 1.3),  # no damping, and stronger one way than the other
 )
-BANK = [
-    Maneuver(0.0, 0.0, 0),
-    Maneuver(1.0, 0.0, 1),
-    Maneuver(-1.0, 0.0, 5),
-    Maneuver(0.0, 1.0, 9),
-    Maneuver(0.5, -1.0, 20),
-]
+BANK = [(0.0, 0.0, 0), (1.0, 0.0, 1), (-1.0, 0.0, 5), (0.0, 1.3, 9), (0.5, -0.7, 20)]
+"""Controls along x and y, and for how many control steps."""
 INSTANTS = np.arange(0, 41, 2)
 
 
@@ -34,9 +24,8 @@ def substeps(axis, x, v, control):
     return x, v
 
 
-def played(axis, x, v, share, going, holds):
-    """Positions after every hold: full force, then the brake, in its last hold just to rest."""
-    force = share * (axis.high if share > 0 else -axis.low)
+def played(axis, x, v, force, going, holds):
+    """Positions after every hold: some force, then the brake, in its last hold just to rest."""
     xs = [x]
     for k in range(holds):
         if k < going:
@@ -52,30 +41,14 @@ def played(axis, x, v, share, going, holds):
 speed = st.floats(-6.0, 6.0)
 
 
-@given(position=st.tuples(speed, speed), velocities=st.lists(st.tuples(speed, speed), min_size=1, max_size=4))
-def test_every_way_is_the_manoeuvre_played(position, velocities):
-    bank = EvasiveManeuvers(AXES, BANK, INSTANTS)
-    velocity = np.array(velocities)
-    which = np.array([4, 0, 2, 3])
-    starts = np.broadcast_to(np.array(position), velocity.shape)
-    ways = bank.paths(starts, velocity, which)
-    for i, axis in enumerate(AXES):
-        for c, v in enumerate(velocity[:, i]):
-            for row, m in enumerate(which):
-                xs = played(axis, position[i], float(v), BANK[m][i], BANK[m].holds, int(INSTANTS[-1]))
-                np.testing.assert_allclose(ways[i][c, row], np.array(xs)[INSTANTS], rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("m", range(len(BANK)))
-def test_the_first_control_begins_the_manoeuvre(m):
-    bank = EvasiveManeuvers(AXES, BANK, np.arange(0, 41))
-    velocity = np.array([1.1, -0.4])
-    control = bank.first(m, velocity)
-    for i, axis in enumerate(AXES):
-        after = substeps(axis, 0.3, velocity[i], control[i])[0]
-        way = bank.paths(np.array([[0.3, 0.3]]), velocity[None], np.array([m]))[i][0, 0]
-        assert after == pytest.approx(way[1], abs=1e-12)
-    assert (np.abs(control) <= [1.0, 1.3]).all() and control[1] >= -0.7
+@given(position=st.tuples(speed, speed), velocity=st.tuples(speed, speed))
+def test_every_way_is_the_manoeuvre_played(position, velocity):
+    *controls, going = (np.array(part) for part in zip(*BANK, strict=True))
+    found = ways(AXES, np.array(position), np.array(velocity), np.stack(controls, axis=1), going, INSTANTS)
+    for m, (*forces, holds) in enumerate(BANK):
+        for i, axis in enumerate(AXES):
+            xs = played(axis, position[i], velocity[i], forces[i], holds, int(INSTANTS[-1]))
+            np.testing.assert_allclose(found[m, :, i], np.array(xs)[INSTANTS], rtol=0, atol=1e-9)
 
 
 # Clearances of ways against distances computed point by point, by NumPy
@@ -92,7 +65,7 @@ def scene(rng, boxes, discs, planes, instants=6):
 
 
 def by_points(x, y, around):
-    """Clearances from each box, disc and plane, shape (obstacles, c, m, k)."""
+    """Clearances from each box, disc and plane, shape (obstacles, m, k)."""
     found = []
     for i, size in enumerate(around.sizes):
         (cx, cy), (hx, hy) = around.centers[:, i].T, around.halves[:, i].T
@@ -106,16 +79,16 @@ def by_points(x, y, around):
 def test_the_nearest_of_all_counts_at_the_worst_instant(seed):
     rng = np.random.default_rng(seed)
     around = scene(rng, *rng.integers(0, 4, 2), planes=1 + seed % 3)
-    x, y = rng.uniform(-1.5, 1.5, (2, 3, 4, 6))
+    places = rng.uniform(-1.5, 1.5, (4, 6, 2))
     wanted = rng.uniform(0.0, 0.3, 6)
-    found = least_left(x, y, around, wanted)
-    expected = (by_points(x, y, around).min(axis=0) - wanted).min(axis=-1)
+    found = least_left(places, around, wanted)
+    expected = (by_points(places[..., 0], places[..., 1], around).min(axis=0) - wanted).min(axis=-1)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 def test_no_number_is_not_clear():
     around = scene(np.random.default_rng(0), 2, 2, 1)
-    x, y = np.zeros((2, 1, 2, 6))
-    x[0, 1, 2] = np.nan
-    left = least_left(x, y, around, np.zeros(6))
-    assert np.isfinite(left[0, 0]) and np.isnan(left[0, 1])
+    places = np.zeros((2, 6, 2))
+    places[1, 2, 0] = np.nan
+    left = least_left(places, around, np.zeros(6))
+    assert np.isfinite(left[0]) and np.isnan(left[1])

@@ -1,35 +1,34 @@
-"""The heading drive: its prediction is MuJoCo's, its stopping area holds MuJoCo's braking, its distance is right."""
+"""The heading drive: its steps, and what they leave of discs until it rests, are MuJoCo's."""
 
+import hashlib
 import math
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.control.backup.heading_drive import (
+    REST_M,
     Motion,
-    StoppingPath,
+    advance,
     brake_control,
-    end_distance,
-    path_distance,
-    predict,
-    stopping_path,
+    clearances,
+    look,
+    reach,
 )
 from safe_wrappers.plants.mujoco.planar_robot import heading_drive
 
 
-def robot(level=0, uncertainty=0.0):
+def robot(level=0):
     """Env, plant and constants."""
     env = gym.make(f"SafePointGoal{level}-v0").unwrapped
     layout = {"goal": [900.0, 900.0]} if level == 0 else {}
     env.reset(seed=0, options={"layout": {**layout}} if layout else None)
     plant = sw.MujocoPlant()
     plant.bind(env)
-    return env, plant, heading_drive(plant, "agent", uncertainty)
+    return env, plant, heading_drive(plant, "agent")
 
 
 def place(env, motion):
@@ -63,105 +62,60 @@ def test_prediction_is_mujocos_own_step():
             action *= 0.04  # inside the drive's clamp
         place(env, motion)
         env.step(action)
-        np.testing.assert_allclose(now(env), predict(drive, motion, *action), atol=1e-9)
+        places = np.empty((drive.substeps, 2))
+        np.testing.assert_allclose(advance(drive, motion, *action, places), now(env), atol=1e-9)
+        np.testing.assert_allclose(places, env._path[-drive.substeps :], atol=1e-9)
 
 
-def backup(drive, motion):
-    ahead = motion.vx * math.cos(motion.heading) + motion.vy * math.sin(motion.heading)
-    return np.array([brake_control(drive, ahead), 0.0])
-
-
-def excursion(drive, truth, yaw=0.0, speed=1.3, runs=12, seed=4):
-    """How far a machine gets out of the area while it runs the backup manoeuvre, m."""
-    rng = np.random.default_rng(seed)
-    worst = -math.inf
-    for _ in range(runs):
-        motion = random_motion(rng, speed, yaw)
-        place(truth, motion)
-        path = stopping_path(drive, motion)
-        for _ in range(150):
-            truth.step(backup(drive, now(truth)))
-            worst = max(worst, *(path_distance(path, float(x), float(y)) for x, y in truth._path))
-    return worst
-
-
-@pytest.mark.parametrize("speed", [0.7, 1.0, 1.3])
-def test_the_area_holds_mujocos_stopping_path(speed):
-    # The drag's torque about the axis turns the heading by up to 0.02 rad while sliding: `wander` covers it.
+@pytest.mark.parametrize("control", [None, (1.0, 1.0), (-0.03, -0.4)])
+def test_clearances_are_those_of_mujocos_steps_until_it_rests(control):
     env, _, drive = robot()
-    assert excursion(drive, env, speed=speed, runs=25) <= 1e-3
+    rng, models = np.random.default_rng(4), np.array([drive], dtype=np.float64)
+    for _ in range(10):
+        motion, discs = random_motion(rng), np.column_stack([rng.uniform(-1.2, 1.2, (6, 2)), np.full(6, 0.1)])
+        place(env, motion)
+        first = control or (brake_control(drive, motion), 0.0)
+        least, end = clearances(models, np.array(motion), *first, discs, True)
+        seen = np.linalg.norm(discs[:, :2] - motion[:2], axis=1) - 0.1
+        for k in range(300):
+            env.step(np.array(first if k == 0 else (brake_control(drive, now(env)), 0.0)))
+            seen = np.minimum(
+                seen, (np.linalg.norm(env._path[:, None] - discs[:, :2], axis=2) - 0.1).min(axis=0)
+            )
+        x, y, heading = now(env)[:3]
+        com = x + drive.com_offset * math.cos(heading), y + drive.com_offset * math.sin(heading)
+        turning = np.linalg.norm(discs[:, :2] - com, axis=1) - 0.1 - drive.com_offset
+        # What is not followed to its very end is a lower bound.
+        assert ((np.minimum(seen, turning) - least) >= -1e-6).all()
+        assert ((np.minimum(seen, turning) - least) <= 2.0 * REST_M).all()
+        np.testing.assert_allclose(end, turning, atol=2.0 * REST_M)
+        np.testing.assert_allclose(
+            clearances(models, np.array(motion), *first, discs, False)[0], least, atol=REST_M
+        )
 
 
-def test_the_area_holds_the_stopping_path_while_turning():
-    env, _, drive = robot()
-    assert excursion(drive, env, yaw=2.0, speed=0.7) <= 2e-3 + 2 * drive.com_offset
-    assert excursion(drive, env, yaw=2.0, speed=0.7) <= 8e-3
+def test_no_braking_gets_farther_than_its_reach():
+    _, _, drive = robot()
+    rng, places = np.random.default_rng(6), np.empty((drive.substeps, 2))
+    for _ in range(50):
+        motion = start = random_motion(rng, yaw=0.4)
+        for _ in range(300):
+            motion = advance(drive, motion, brake_control(drive, motion), 0.0, places)
+            assert np.linalg.norm(places - start[:2], axis=1).max() <= reach(drive, start)
 
 
-@pytest.mark.parametrize("mass", [0.8, 1.2])
-@pytest.mark.parametrize("damping", [0.8, 1.2])
-def test_the_area_holds_every_machine_inside_the_uncertainty(mass, damping):
-    # The constants are the nominal ones; the machine that brakes is another.
-    drive = robot(uncertainty=0.2)[2]
-    truth = robot()[0]
-    truth.model.body_mass *= mass
-    truth.model.body_inertia *= mass
-    truth.model.dof_damping *= damping
-    mujoco.mj_setConst(truth.model, mujoco.MjData(truth.model))
-    assert excursion(drive, truth, speed=0.7) <= 4e-3
-    if mass > damping:  # and without the uncertainty it does not
-        assert excursion(robot()[2], truth, speed=0.7) > 2e-2
-
-
-# Distance to the area -----------------------------------------------------------------------------------------
-
-LENGTH = st.floats(0.0, 1.0).map(lambda v: round(v, 3))
-
-
-def polygon_distance(corners, point):
-    """Signed distance to a convex polygon by dense sampling of its sides and a half-plane test."""
-    n = len(corners)
-    sides = [np.linspace(corners[i], corners[(i + 1) % n], 2001) for i in range(n)]
-    near = min(float(np.linalg.norm(side - point, axis=1).min()) for side in sides)
-    crosses = [
-        (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])
-        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    ]
-    area = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True))
-    inside = all(c >= 0 for c in crosses) or all(c <= 0 for c in crosses)
-    return (-near if inside and abs(area) > 1e-12 else near), near
-
-
-@given(
-    LENGTH,
-    LENGTH,
-    st.floats(0, 1),
-    st.booleans(),
-    st.floats(-3, 3),
-    st.floats(-1.5, 1.5),
-    st.floats(-1.5, 1.5),
-)
-def test_distance_agrees_with_brute_force(forward, sideways, share, spread, angle, px, py):
-    # The crossing lies at or below the end, as the tangent does.
-    e, s = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
-    crossing = round(share, 3) * sideways
-    fields = dict(
-        x=0.1, y=-0.2, ex=e[0], ey=e[1], sx=s[0], sy=s[1],
-        forward=forward, sideways=sideways, crossing=crossing, spread=spread,
-    )  # fmt: skip
-    fields["radius"] = math.hypot(forward, sideways)
-    path = StoppingPath(**fields)
-    start = np.array([0.1, -0.2])
-    area = [start, start + forward * e + crossing * s, start + forward * e + sideways * s]
-    if spread:
-        area.append(start + sideways * s)
-    expected, near = polygon_distance(np.array(area), np.array([px, py]))
-    if near < 1e-3:  # on the boundary the sampling decides the sign
-        assert abs(path_distance(path, px, py)) < 2e-3
-    else:
-        assert path_distance(path, px, py) == pytest.approx(expected, abs=1e-3)
-    assert end_distance(path, px, py) == pytest.approx(np.linalg.norm(area[2] - [px, py]))
-    assert path.radius >= max(np.linalg.norm(c - start) for c in area) - 1e-12
+def random_scenes(count):
+    """What is seen and left of random scenes, as one digest."""
+    drive, rng, digest = robot()[2], np.random.default_rng(3), hashlib.sha256()
+    models, place = np.array([drive, *drive.corners(0.1)], dtype=np.float64), np.zeros(4)
+    for _ in range(count):
+        joints = rng.uniform(-1.0, 1.0, (2, 3)) * [[0.1, 0.1, 3.0], [1.0, 1.0, 2.0]]
+        discs = np.column_stack([rng.uniform(-0.9, 0.9, (6, 2)), np.full(6, 0.1)])
+        motion, _, near, *seen = look(models, *joints, place, discs, 0.004)
+        left = clearances(models, motion, *rng.uniform(-1.0, 1.0, 2), near, bool(rng.integers(2)))
+        for part in (motion, near, *seen, left):
+            digest.update(np.asarray(part, dtype=np.float64).tobytes())
+    return digest.hexdigest()
 
 
 def test_refusals_name_what_does_not_fit():

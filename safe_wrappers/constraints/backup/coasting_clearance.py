@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.constraints.backup.base import DetourClearance
+from safe_wrappers.constraints.detour import Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline, nearest_discs
 from safe_wrappers.errors import (
@@ -23,7 +23,7 @@ from safe_wrappers.errors import (
 )
 from safe_wrappers.plants.mujoco.coasting import Coasting, Course
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
-from safe_wrappers.plants.plant import Plant, Trajectory
+from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
 _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
 _WAY_OUT_M = 1e-3  # gain of clearance that is asked for where zero control leaves less than the margin
@@ -33,7 +33,7 @@ _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 
 
 @dataclass
-class CoastingClearance(DetourClearance):
+class CoastingClearance(Detour, Model):
     """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
 
     For machines that friction and damping stop within a few steps, for example on wheels. A control is forecast on
@@ -75,6 +75,8 @@ class CoastingClearance(DetourClearance):
     detour: bool = False
 
     promise = "proved"
+    smooth: ClassVar[bool] = False
+    recovery_s: ClassVar[float] = 0.0  # from inside an obstacle `leaves_clear` says what leads out
     detour_steps: ClassVar[int] = 25
 
     def __post_init__(self) -> None:
@@ -200,6 +202,10 @@ class CoastingClearance(DetourClearance):
         """Full control of all actuators together and of each alone, both ways."""
         low, high = self.plant.acting_range
         return [high, low, *(np.where(one, end, 0.0) for one in np.eye(low.size) for end in (low, high))]
+
+    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
+        """The state now and the control: its course is forecast where `h_along` needs it, once per observation."""
+        return Trajectory(control, self.plant.state[None])
 
     def h_along(self, path: Trajectory) -> Array:
         """The least clearance on the way, from inside an obstacle that at its end, m; infinite where none is near."""

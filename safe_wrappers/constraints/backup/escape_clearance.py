@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.constraints.obstacles import (
     Disc,
@@ -15,12 +14,8 @@ from safe_wrappers.constraints.obstacles import (
     distances,
     obstacles_from,
 )
-from safe_wrappers.control.backup.evasive_maneuvers import (
-    Around,
-    EvasiveManeuvers,
-    Maneuver,
-    least_left,
-)
+from safe_wrappers.control.backup.damped_axis import brake, step
+from safe_wrappers.control.backup.evasive_maneuvers import Around, least_left, ways
 from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative, positive
 from safe_wrappers.filter.constraint import Constraint, Memory
 from safe_wrappers.plants.mujoco.planar_point import nearest_first, planar_point
@@ -29,7 +24,6 @@ from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
 _EVERY = 2  # holds between the instants at which ways are checked
 _GOING_S = (0.3, 0.8)  # for how long the manoeuvres go before they brake, s
-_DIRECTIONS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 _RECOVERY_S = 0.4  # time constant, s, with which the way out of a violation must come clear
 _BLENDS = (0.2, 0.4, 0.6, 0.8)  # shares of the way from a refused control to one that leaves a way out
 _APPROACHED = 2  # how many of those are approached
@@ -87,8 +81,6 @@ class EscapeClearance(Constraint, Model):
                 obstacle.tracks(machine)
         super().setup(machine)
         self._point = point = planar_point(self.plant, np.inf, self.body)
-        # What one hold makes of a state; x and y.
-        self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
         holds = int(np.ceil(self.horizon_s / self.plant.control_dt))
         longest = max(1, round(max(_GOING_S) / self.plant.control_dt))
         if holds <= longest:
@@ -96,43 +88,43 @@ class EscapeClearance(Constraint, Model):
                 f"horizon_s = {self.horizon_s:g} s is too short for steps of {self.plant.control_dt:g} s: a "
                 f"manoeuvre takes {longest} of them before it brakes"
             )
-        bank = [Maneuver(0.0, 0.0, 0)]
-        bank += [Maneuver(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
-        self._escapes = EvasiveManeuvers(point.axes, bank, np.arange(0, holds + 1, _EVERY))
-        starts = [max(1, round(seconds / self.plant.control_dt)) for seconds in _GOING_S]
-        self._usual = [0, *(bank.index(Maneuver(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
-        self._firsts_of = [0, *(bank.index(Maneuver(x, y, 1)) for x, y in _DIRECTIONS)]
-
-    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
-        return Trajectory(control, self.plant.state[None])
+        self._instants = np.arange(0, holds + 1, _EVERY)
+        # Braking, then of each direction those that go for 1, 2, ... control steps.
+        (x, y), zero = point.axes, 0.0
+        forces = np.array([[x.high, zero], [x.low, zero], [zero, y.high], [zero, y.low]])
+        self._controls = np.concatenate([[[zero, zero]], np.repeat(forces, longest, axis=0)])
+        self._going = np.concatenate([[0], np.tile(np.arange(1, longest + 1), len(forces))])
+        starts = 1 + longest * np.arange(len(forces))
+        usual = [max(1, round(seconds / self.plant.control_dt)) for seconds in _GOING_S]
+        self._usual = [0, *(int(start) + n - 1 for start in starts for n in usual)]
 
     def observe(self, memory: Memory) -> None:
-        self._asked: list[tuple[Array, NDArray[np.intp]]] = []
-        joints = self._point.joints
-        self._position = self.plant.qpos[joints] + self._point.origin
-        going_on, asked = None, memory.get("asked", ())
-        if (
-            asked
-        ):  # the manoeuvre that is open after the executed control: of the nearest one that was asked about
-            _, _, _, _, keep, add = self._hold
-            velocity = keep * memory["velocity"] + add * self._acting(self._driven(memory["control"]))
-            led_to = np.concatenate([v for v, _ in asked])
-            best = np.concatenate([b for _, b in asked])
-            going_on = int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
-        self._going_on = going_on
-        memory["asked"] = self._asked
-        memory["velocity"] = self._velocity = self.plant.qvel[joints]
+        self._position, self._velocity = self._point.motion(self.plant)
+        control = memory.get("control")
+        # The manoeuvre that the executed control has left open goes on.
+        self._going_on = None if control is None else memory["open"].get(control.tobytes())
+        memory["open"] = {}
+
+    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
+        """The ways of all manoeuvres after a held control, shape (manoeuvres, instants, 2)."""
+        if control is None:
+            return Trajectory(None, self._position[None])
+        axes, held = self._point.axes, self._driven(control)
+        ends = [step(*at) for at in zip(axes, self._position, self._velocity, held, strict=True)]
+        place, velocity = np.array(ends).T.copy()
+        manoeuvres = self._controls[self._open], self._going[self._open]
+        return Trajectory(control, ways(axes, place, velocity, *manoeuvres, self._instants))
 
     def clearance(self) -> Array:
         """Distance now, not along a manoeuvre, from every obstacle or the bound of where it may be, m, shape (n,)."""
         which, going_on = list(self._usual), self._going_on
         if going_on is not None:
             # The same way with one hold less to go: the manoeuvres of a direction are in the order of their lengths.
-            shorter = going_on - 1 if self._escapes.manoeuvres[going_on].holds > 1 else 0
+            shorter = going_on - 1 if self._going[going_on] > 1 else 0
             which += [i for i in (going_on, shorter) if i not in which]
         self._open = np.array(which, dtype=np.intp)
         # A way after a held control begins one hold from now.
-        times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._escapes.instants])
+        times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._instants])
         parts = [self._expected(o, times) for o in self._moving]
         none = np.zeros((times.size, 0, 2))
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
@@ -175,24 +167,6 @@ class EscapeClearance(Constraint, Model):
         moved = centers + times[:, None, None] * velocity
         return moved, np.zeros_like(moved)
 
-    def _held(self, controls: Array) -> tuple[Array, Array]:
-        """Positions and velocities after held controls, shapes (..., 2)."""
-        _, _, drift, shift, keep, add = self._hold
-        held = self._acting(controls)
-        position = self._position + drift * self._velocity + shift * held
-        return position, keep * self._velocity + add * held
-
-    def _acting(self, controls: Array) -> Array:
-        return np.asarray(np.minimum(np.maximum(controls, self._hold[0]), self._hold[1]))
-
-    def _slacks(self, controls: Array) -> Array:
-        """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
-        position, velocity = self._held(controls)
-        x, y = self._escapes.paths(position, velocity, self._open)
-        left = least_left(x, y, self._around, self._wanted)
-        self._asked.append((velocity, self._open[left.argmax(axis=1)]))
-        return left
-
     def _driven(self, control: Array) -> Array:
         return np.asarray(control)[self._point.actuators]
 
@@ -200,45 +174,46 @@ class EscapeClearance(Constraint, Model):
         """What the best way out after a held control leaves, m; now the distance from what is around."""
         if path.control is None:
             return self.clearance()[None]
-        left = float(self._slacks(self._driven(path.control)[None]).max())
-        if left < 0.0:
-            left -= self._needed()
-        return np.array([[left + self.margin]])
+        left = self._left(path)
+        return np.array([[left + self.margin - (self._needed() if left < 0.0 else 0.0)]])
+
+    def _left(self, path: Trajectory) -> float:
+        """What the best way out leaves of what is wanted, m; which one it is is remembered."""
+        left, control = least_left(path.states, self._around, self._wanted), path.control
+        best = int(left.argmax())
+        assert control is not None
+        self.memory["open"][control.tobytes()] = int(self._open[best])
+        return float(left[best])
 
     def _needed(self) -> float:
         """What a way out must leave: 0, or the best that there is while new estimates use up only the margin."""
         if self._best is None:
-            self._best = float(self._slacks(self._firsts()).max())
+            self._best = max(left for _, left in self._firsts())
         return self._best if -self.margin < self._best < 0.0 else 0.0
 
-    def _backup(self) -> Array:
-        """Braking where it leaves a way out, else the first control of the one that keeps farthest away."""
-        firsts = self._firsts()
-        left = self._slacks(firsts).max(axis=1)
-        best = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
-        return self._point.control(np.zeros(self.plant.model.nu), best)
-
-    def _firsts(self) -> Array:
-        """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""
-        return np.array([self._escapes.first(i, self._velocity) for i in self._firsts_of])
+    def _firsts(self) -> list[tuple[Array, float]]:
+        """First controls of the manoeuvres, braking and each direction; and what each leaves, m."""
+        axes = self._point.axes
+        braking = [brake(axis, v) for axis, v in zip(axes, self._velocity, strict=True)]
+        pairs = [braking, *self._controls[self._going == 1]]
+        controls = [self._point.control(np.zeros(self.plant.lower.size), pair) for pair in pairs]
+        return [(control, self._left(self.rollout(control))) for control in controls]
 
     def proposals(self, control: Array | None) -> list[Array]:
-        """Admissible controls near a refused one, the nearest first."""
+        """Controls near a refused one, the nearest first; of None: braking, or what keeps farthest away."""
+        firsts = self._firsts()
+        self._best = max(left for _, left in firsts)
         if control is None:
-            return [self._backup()]
-        asked, firsts = self._driven(control), self._firsts()
-        left = self._slacks(firsts).max(axis=1)
-        self._best = float(left.max())
-        needed = self._needed()
-        good = nearest_first(firsts[left >= needed], asked)
-        if needed == 0.0 and len(good):
-            ends = good[:_APPROACHED]
-            tried = [asked + share * (end - asked) for end in ends for share in _BLENDS]
-            tried += [np.array(pair) for x, y in ends for pair in ((asked[0], y), (x, asked[1]))]
-            closer = np.array(tried)
-            closer = closer[self._slacks(closer).max(axis=1) >= 0.0]
-            good = nearest_first(np.concatenate([good, closer]), asked)
-        return [self._point.control(control, pair) for pair in good]
+            return [firsts[0][0] if firsts[0][1] >= 0.0 else max(firsts, key=lambda one: one[1])[0]]
+        asked, needed = self._driven(control), self._needed()
+        good = [self._driven(first) for first, left in firsts if left >= needed]
+        good = list(nearest_first(np.array(good).reshape(-1, 2), asked))
+        if needed == 0.0:
+            for x, y in good[:_APPROACHED]:
+                good += [asked + share * (np.array([x, y]) - asked) for share in _BLENDS]
+                good += [np.array(pair) for pair in ((asked[0], y), (x, asked[1]))]
+        pairs = nearest_first(np.array(good).reshape(-1, 2), asked)
+        return [self._point.control(control, pair) for pair in pairs]
 
 
 def _moves(obstacle: Any) -> bool:

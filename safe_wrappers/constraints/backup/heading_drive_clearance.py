@@ -1,4 +1,4 @@
-"""HeadingDriveClearance: keep the stopping path of a robot that is driven along its heading out of discs."""
+"""HeadingDriveClearance: keep a robot that is driven along its heading out of discs, until it rests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,31 +6,30 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safe_wrappers.constraints.backup.base import DetourClearance
+from safe_wrappers.constraints.detour import Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
-from safe_wrappers.control.backup import drive_among_discs as among
-from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
+from safe_wrappers.control.backup.heading_drive import clearances, look, way_to_rest
 from safe_wrappers.control.numerics.shapes import nearest_discs
 from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative
-from safe_wrappers.filter.constraint import HalfSpaces
+from safe_wrappers.filter.constraint import HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
 from safe_wrappers.plants.mujoco.plant import require_mujoco
-from safe_wrappers.plants.plant import Plant, Trajectory
+from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
 
 @dataclass
-class HeadingDriveClearance(DetourClearance):
-    """Keep the stopping path of a planar robot out of every disc.
+class HeadingDriveClearance(Detour, Model):
+    """Keep a planar robot out of every disc until it rests.
 
     The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading only.
-    The backup manoeuvre brakes along the heading and holds it; clearance is counted from the area that it sweeps
-    until rest (`control/backup/heading_drive.py`). A control is admitted if one control step of it uses up at most
-    half of the clearance; within 2 mm of a disc its physics steps, and the backup's until rest, are predicted too.
+    A trajectory is a control held for one control step, and then the backup until rest: brake along the heading, no
+    turning (`control/backup/heading_drive.py`). h is its least distance to the discs at any physics substep.
 
-    Proved: from a safe state the backup is admissible, for any number of discs, and the discs stay clear at every
-    physics substep, while mass and damping are right to within `uncertainty`, the measured position to within
-    `state_error`, discs stand still and nothing hits the robot. A motion that is faster than the actuators make it
-    is reported as unsafe.
+    Proved: from a safe state the backup is admitted, for any number of discs, and the discs stay clear at every
+    physics substep, while the model is right, the measured position is to within `state_error`, discs stand still and
+    nothing hits the robot. With `uncertainty` every executed control that is not flagged leads clear of the discs for
+    each of the models at its corners, and for the model itself; that there is one at every step, and that models
+    between them are safe, is tested and not proved.
 
     Args:
         obstacles: `Disc` and `Discs`; they stand still.
@@ -50,6 +49,8 @@ class HeadingDriveClearance(DetourClearance):
     detour: bool = False
 
     promise = "proved"
+    smooth: ClassVar[bool] = False  # a speed servo chatters
+    rounding = 1e-7  # braking is rounded to the action's dtype
     detour_steps: ClassVar[int] = 50
 
     def __post_init__(self) -> None:
@@ -61,84 +62,110 @@ class HeadingDriveClearance(DetourClearance):
 
     def setup(self, plant: Plant) -> None:
         hint = "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
-        machine = require_mujoco(plant, hint)
-        machine.named("body", self.body, "body")
-        self.frame = PlanarFrame(machine, self.body)
-        self._discs = np.zeros((0, 3))
-        self.turns_first = self.frame.turn_index == 0
-        super().setup(machine)
-        # The drive, and the bodies at the corners of its uncertainty: each must keep what is needed.
-        self.drive = heading_drive(self.plant, self.body, self.uncertainty)
-        self.models = np.array([self.drive, *self.drive.corners()], dtype=np.float64)
-        scene = self.models, np.zeros(6), np.ones((1, 3)), self.reserve
-        among.is_admitted(scene, 0.0, 0.0)  # compiled here, and not in a step
-        among.secants(scene)
-        among.way_around(scene, 0.0, 0.0, 0.0)
-        among.manoeuvre_drive(scene)
+        super().setup(require_mujoco(plant, hint))
+        self.plant.named("body", self.body, "body")
+        self._frame, self.drive = PlanarFrame(self.plant, self.body), heading_drive(self.plant, self.body)
+        self.models = np.array([self.drive, *self.drive.corners(self.uncertainty)], dtype=np.float64)
+        self._discs, self._full = np.zeros((0, 3)), self.drive.drive_limit / self.drive.drive_gain
+        # Compiled here, and not in a step.
+        joints = np.zeros(self.plant.model.nq), np.zeros(self.plant.model.nv), self._frame.place
+        look(self.models, *joints, self._discs, self.margin)
+        clearances(self.models, np.zeros(6), 0.0, 0.0, self._discs, False)
 
-    def clearance(self) -> Array:
-        """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
-        self._scene = self.models, np.empty(6), self.discs(), self.reserve
-        qpos, qvel, place = self.plant.qpos, self.plant.qvel, self.frame.place
-        value, self._in_play = among.least_clearance(qpos, qvel, place, self._scene)
-        return np.array([value])
+    def observe(self, memory: Memory) -> None:
+        super().observe(memory)
+        plant, discs = self.plant, self._all_discs()
+        self._now = look(self.models, plant.qpos, plant.qvel, self._frame.place, discs, self.margin)
+        self._least = self._now.clearances[0].min(initial=np.inf)
 
-    @property
-    def reserve(self) -> float:
-        """Margin and state error, m."""
-        return float(self.margin + self.state_error)
-
-    def discs(self) -> Array:
-        """x, y and the distance to keep from there, margin and state error in it, m, shape (n, 3)."""
+    def _all_discs(self) -> Array:
+        """Centre, and radius with the state error in it, m, shape (n, 3)."""
         centers = [obstacle.centers(self.plant)[:, :2] for obstacle in self.obstacles]
         counts = [len(group) for group in centers]
         if sum(counts) != len(self._discs):
             self._discs = np.zeros((sum(counts), 3))
-            self._discs[:, 2] = np.repeat([o.radius + self.reserve for o in self.obstacles], counts)
+            self._discs[:, 2] = np.repeat([o.radius + self.state_error for o in self.obstacles], counts)
         np.concatenate(centers, out=self._discs[:, :2])
         return self._discs
 
-    def nearest(self, neighbours: int) -> Array:
-        _, (x, y, heading, vx, vy, _), discs, *_ = self._scene
-        return nearest_discs(discs, x, y, heading, vx, vy, neighbours)
+    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
+        """The robot's motion now and the control: where they lead is followed as far as `h_along` needs it."""
+        return Trajectory(control, self._now.motion[None])
+
+    def h_along(self, path: Trajectory) -> Array:
+        """The least clearance until rest, and the one at its end, m, shape (2, k); k is 0 where no disc is near."""
+        now = self._now
+        if path.control is None:
+            return now.clearances
+        if self._least - now.loss >= self.margin:
+            return np.zeros((1, 0))
+        drive, turn = self._pair(path.control).tolist()
+        return clearances(self.models, now.motion, drive, turn, now.discs, bool(self._least < self.margin))
 
     def _pair(self, control: Array) -> Array:
         """Drive and turn, shape (2,); the same swap leads back."""
-        return control[::-1].copy() if self.turns_first else control
+        return control[::-1].copy() if self._frame.turn_index == 0 else control
 
-    def leaves_clear(self, control: Array) -> bool:
-        if not self._in_play:
-            return True
-        drive, turn = self._pair(control).tolist()
-        return among.is_admitted(self._scene, drive, turn)
+    def _left(self, drive: float, turn: float) -> Array:
+        return self.h_along(self.rollout(self._pair(np.array([drive, turn]))))
 
-    def rows(self) -> HalfSpaces:
-        """Secants of the clearance after one hold, over the acting controls, one row per disc in play."""
-        return self._half_spaces(*among.secants(self._scene))
+    def rows(self) -> HalfSpaces | None:
+        """Secants of the clearance over all controls, one per disc that one of them can come too near."""
+        if not self.margin <= self._least < self.margin + self._now.loss:
+            return None
+        low, high = (self._pair(end).tolist() for end in self.plant.acting_range)
+        brake = self._now.brake
+        push = high[0] if brake <= 0.0 else low[0]
+        ends = (brake, 0.0), (push, 0.0), (brake, low[1]), (brake, high[1])
+        braking, pushing, right, left = (self._left(*pair)[0] - self.margin for pair in ends)
+        by_drive, by_turn = (pushing - braking) / (push - brake), (left - right) / (high[1] - low[1])
+        loses = braking + np.minimum(pushing - braking, 0.0) - 0.5 * np.abs(left - right) < 0.0
+        normals = -np.column_stack([by_drive, by_turn])[loses]
+        offsets = (np.maximum(braking, 0.0) - by_drive * brake)[loses]
+        return HalfSpaces(normals[:, ::-1].copy() if self._frame.turn_index == 0 else normals, offsets)
 
-    def _half_spaces(self, normals: Array, offsets: Array) -> HalfSpaces:
-        return HalfSpaces(normals[:, ::-1].copy() if self.turns_first else normals, offsets)
+    def nearest(self, neighbours: int) -> Array:
+        x, y, heading, vx, vy, _ = self._now.motion.tolist()
+        return nearest_discs(
+            self._discs + np.array([0.0, 0.0, self.margin]), x, y, heading, vx, vy, neighbours
+        )
 
     def points(self, path: Trajectory) -> Array:
-        """Corners of the area that braking sweeps from here, m, shape (corners, 1, 2); the third is at rest."""
-        return path_corners(stopping_path(self.drive, Motion(*self._scene[1].tolist())))[:, None]
+        """Where braking leads, m, shape (instants, 1, 2)."""
+        return way_to_rest(self.drive, self._now.motion)[:, None]
 
     def proposals(self, control: Array | None) -> list[Array]:
-        """Controls that lead around the disc in the way; of None, the first of the backup manoeuvre."""
+        """Controls that lead around the disc in the way; of None, the first of the backup.
+
+        From inside a disc or its margin the backup is the drive that ends farthest out, if it leads no deeper.
+        """
+        now = self._now
         if control is None:
-            return [self._backup()]
-        if not self.detour:
-            return []
+            drives = [now.brake]
+            if self._least < self.margin:
+                ends = {
+                    drive: self._left(drive, 0.0).min(axis=1)
+                    for drive in (now.brake, self._full, -self._full)
+                }
+                drives = [drive for drive in ends if ends[drive][0] >= self._least - self.rounding] or drives
+                drives.sort(key=lambda drive: -ends[drive][1])
+            return [self._pair(np.array([drives[0], 0.0]))]
         drive, turn = self._pair(control).tolist()
-        side = among.way_around(self._scene, drive, turn, self._kept_side())
+        if not (self.detour and drive):
+            return []
+        side = self._kept_side() or self._side_of_the_nearest(drive, turn)
         if side == 0.0:
             return []
         self._keep_side(side)
         return [self._pair(np.array([ahead, side])) for ahead in (drive, 0.0)]
 
-    def _backup(self) -> Array:
-        """The control that never shrinks the clearance: brake along the heading, hold the heading.
-
-        From inside a disc it drives out, whichever way is better.
-        """
-        return self._pair(np.array([among.manoeuvre_drive(self._scene), 0.0]))
+    def _side_of_the_nearest(self, drive: float, turn: float) -> float:
+        """Where to pass the disc ahead that a control comes nearest: 1 on the left, -1 on the right; 0: none is."""
+        left, (x, y, heading) = self._left(drive, turn)[0], self._now.motion[:3].tolist()
+        ahead = np.copysign(1.0, drive) * np.array([np.cos(heading), np.sin(heading)])
+        to = self._now.discs[:, :2] - [x, y]
+        is_ahead = to @ ahead > 0.0
+        if not is_ahead.any():
+            return 0.0
+        across = to[np.where(is_ahead, left, np.inf).argmin()] @ np.array([-ahead[1], ahead[0]])
+        return 1.0 if across <= 0.0 else -1.0

@@ -1,7 +1,7 @@
-"""Positions of a point mass along evasive manoeuvres: drive in some direction, then brake to rest; and clearances.
+"""Ways of a point mass along evasive manoeuvres: drive in some direction, then brake to rest; and their clearances.
 
-A manoeuvre holds one control along each axis for some control steps (the drive phase), then brakes each axis
-separately (`damped_axis.py`). The result is exact to rounding.
+A manoeuvre holds one control along each axis for some control steps, then brakes each axis by itself
+(`damped_axis.py`). The result is exact to rounding.
 """
 
 import math
@@ -15,75 +15,35 @@ from safe_wrappers.control.compiled import compiled, hypot
 from safe_wrappers.errors import Array
 
 
-class Maneuver(NamedTuple):
-    """Controls along x and y, as shares (-1 to 1) of the limit in that direction, and how many holds they last."""
-
-    x: float
-    y: float
-    holds: int
-
-
-class EvasiveManeuvers:
-    """A set of manoeuvres along both axes.
-
-    Args:
-        axes: Constants of the motion along x and y.
-        manoeuvres: At least one.
-        instants: Numbers of holds after which positions are returned, ascending.
-    """
-
-    def __init__(
-        self, axes: tuple[DampedAxis, DampedAxis], manoeuvres: list[Maneuver], instants: NDArray[np.intp]
-    ) -> None:
-        self.manoeuvres = manoeuvres
-        self.instants = instants
-        self._axes = axes
-        shares = np.array([(m.x, m.y) for m in manoeuvres])
-        forwards, backwards = np.array([axis.high for axis in axes]), np.array([-axis.low for axis in axes])
-        self.controls = shares * np.where(shares > 0.0, forwards, backwards)
-        """Of the drive phases, shape (manoeuvres, 2)."""
-        self._going = np.array([m.holds for m in manoeuvres])
-
-    def paths(self, position: Array, velocity: Array, which: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Positions along x and along y at the instants, shape (c, m, instants) each, m.
-
-        Args:
-            position: Shape (c, 2), m.
-            velocity: Shape (c, 2), m/s.
-            which: Indices of manoeuvres, shape (m,).
-        """
-        starts, speeds, controls = (part.T.copy() for part in (position, velocity, self.controls[which]))
-        of_all = self._going[which], self.instants
-        x, y = (_ways(self._axes[i], starts[i], speeds[i], controls[i], *of_all) for i in range(2))
-        return x, y
-
-    def first(self, which: int, velocity: Array) -> Array:
-        """The control of a manoeuvre's first hold from a velocity (2,), shape (2,)."""
-        if self._going[which]:
-            return np.array(self.controls[which])
-        return np.array([brake(axis, float(v)) for axis, v in zip(self._axes, velocity, strict=True)])
-
-
 @compiled
-def _ways(
-    axis: DampedAxis,
-    starts: Array,
-    speeds: Array,
+def ways(
+    axes: tuple[DampedAxis, DampedAxis],
+    place: Array,
+    velocity: Array,
     controls: Array,
     going: NDArray[np.intp],
     instants: NDArray[np.intp],
 ) -> Array:
-    """Positions along one axis, m, from each start and by each manoeuvre at the instants, shape (c, m, instants)."""
-    ways = np.empty((len(starts), len(controls), len(instants)))
-    for c in range(len(starts)):
-        for m in range(len(controls)):
-            x, v, held = starts[c], speeds[c], 0
+    """Positions along each manoeuvre, m, shape (manoeuvres, instants, 2).
+
+    Args:
+        axes: Along x and along y.
+        place: Shape (2,), m.
+        velocity: Shape (2,), m/s.
+        controls: With which the manoeuvres go, shape (manoeuvres, 2).
+        going: For how many control steps, before they brake, shape (manoeuvres,).
+        instants: After how many control steps, ascending.
+    """
+    found = np.empty((len(going), len(instants), 2))
+    for m in range(len(going)):
+        for i in range(2):
+            x, v, held = place[i], velocity[i], 0
             for k in range(len(instants)):
                 while held < instants[k]:
-                    x, v = step(axis, x, v, controls[m] if held < going[m] else brake(axis, v))
+                    x, v = step(axes[i], x, v, controls[m, i] if held < going[m] else brake(axes[i], v))
                     held += 1
-                ways[c, m, k] = x
-    return ways
+                found[m, k, i] = x
+    return found
 
 
 class Around(NamedTuple):
@@ -126,14 +86,13 @@ def _clearance(x: float, y: float, around: Around, k: int) -> float:
 
 
 @compiled
-def least_left(x: Array, y: Array, around: Around, wanted: Array) -> Array:
+def least_left(places: Array, around: Around, wanted: Array) -> Array:
     """What is left of the clearance that is wanted at the instants, (k,), m, along every way at its worst.
 
-    The ways' coordinates have the shape (c, m, k), the result (c, m).
+    The ways have the shape (m, k, 2), the result (m,).
     """
-    left = np.full(x.shape[:2], math.inf)
-    for c in range(x.shape[0]):
-        for m in range(x.shape[1]):
-            for k in range(len(wanted)):
-                left[c, m] = _less(left[c, m], _clearance(x[c, m, k], y[c, m, k], around, k) - wanted[k])
+    left = np.full(len(places), math.inf)
+    for m in range(len(places)):
+        for k in range(len(wanted)):
+            left[m] = _less(left[m], _clearance(places[m, k, 0], places[m, k, 1], around, k) - wanted[k])
     return left

@@ -1,29 +1,26 @@
-"""A planar body driven along its heading: exact prediction of held controls, and its stopping path in closed form.
+"""A planar body driven along its heading: held controls, and braking along the heading until it rests.
 
-The body slides in the plane with linear damping and is driven along its heading only. Without drive it coasts to rest
-at `p + (m / c) v` in a straight line. With the drive braking along a fixed heading, the forward part stops after `T v
-- T v_t log(1 + v / v_t)` (T = m / c, v_t = F_max / c) while the sideways part coasts on to `T v`. The path is convex
-and lies in the triangle of p, the crossing of its tangent with the forward stop, and its end. With uncertain mass and
-damping the longest stops span a trapezoid. The distance of either from an obstacle never falls while the backup
-manoeuvre (brake along the heading, hold the heading) runs. All of this holds for MuJoCo's semi-implicit Euler step
-too.
+The body slides in the plane with linear damping; its drive pushes along the heading, a speed servo turns it. Nothing
+brakes it sideways: there it coasts. The equations are MuJoCo's physics step (semi-implicit Euler, damping implicit),
+so a predicted trajectory is that of MuJoCo to rounding. The functions are compiled.
 
-Source: appendix "Relative degree and kinetic stopping insets", for this plant. The functions are compiled.
+Source: appendix "Relative degree and kinetic stopping insets", for this plant.
 """
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from safe_wrappers.control.compiled import compiled, hypot
 from safe_wrappers.errors import Array
 
-_WANDER = 0.012
-"""Bound on the lateral deviation of the stopping path, per metre of sideways coasting: drag turns a sliding body.
-
-Measured in MuJoCo: 0.0104 at 1.3 m/s, less at lower speeds.
-"""
+REST_M: Final = 5e-4
+"""A body that cannot get farther than this is as good as at rest."""
+_LONGEST: Final = 16.0
+"""Time after which it counts as at rest, in time constants of the coasting: of 1 m, 0.1 um are left."""
+_SMALL: Final = 0.02
+"""rad; turning by less, the sine and cosine of a physics step are a few terms, exact to rounding."""
 
 
 class Motion(NamedTuple):
@@ -35,82 +32,6 @@ class Motion(NamedTuple):
     vx: float
     vy: float
     yaw_rate: float
-
-
-class StoppingPath(NamedTuple):
-    """Area that a braking body stays in, in its heading frame, mirrored so that every number is non-negative.
-
-    Attributes:
-        x, y: Position now, m.
-        ex, ey: Unit vector of the forward motion (the heading, or its opposite when moving backwards).
-        sx, sy: Unit vector of the sideways motion.
-        forward: Distance until the forward motion stops, m.
-        sideways: Distance that the sideways motion coasts, m.
-        crossing: Sideways distance at which the tangent of the motion reaches `forward`, m.
-        radius: Of a circle around the present position that contains the area and its wander, m.
-        spread: Whether the area is the trapezoid of an uncertain mass or damping.
-        wander: Bound on the deviation from the path by drag, m; subtracted from distances.
-    """
-
-    x: float
-    y: float
-    ex: float
-    ey: float
-    sx: float
-    sy: float
-    forward: float
-    sideways: float
-    crossing: float
-    radius: float
-    spread: bool
-    wander: float = 0.0
-
-
-@compiled
-def _to_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
-    ux, uy = bx - ax, by - ay
-    square = ux * ux + uy * uy
-    wx, wy = px - ax, py - ay
-    along = (wx * ux + wy * uy) / square if square > 0.0 else 0.0
-    along = 0.0 if along < 0.0 else min(along, 1.0)
-    return hypot(wx - along * ux, wy - along * uy)
-
-
-@compiled
-def path_distance(path: StoppingPath, px: float, py: float) -> float:
-    """Signed distance of a point from the area enlarged by its wander, m: negative inside."""
-    dx, dy = px - path.x, py - path.y
-    a, b = dx * path.ex + dy * path.ey, dx * path.sx + dy * path.sy
-    s, c, e = path.forward, path.crossing, path.sideways
-    near = min(_to_segment(a, b, 0.0, 0.0, s, c), _to_segment(a, b, s, c, s, e))
-    if path.spread:
-        near = min(near, _to_segment(a, b, s, e, 0.0, e), _to_segment(a, b, 0.0, e, 0.0, 0.0))
-    else:
-        near = min(near, _to_segment(a, b, s, e, 0.0, 0.0))
-    above = b * s >= c * a
-    below = b <= e if path.spread else b * s <= e * a
-    inside = 0.0 <= a <= s and above and below
-    return (-near if inside else near) - path.wander
-
-
-def path_corners(path: StoppingPath) -> Array:
-    """Corners of the area without its wander, m: where the body is, and on in its order; the third is its end.
-
-    Shape (3, 2), of a trapezoid (4, 2).
-    """
-    along, aside = (path.forward, path.forward, 0.0), (path.crossing, path.sideways, path.sideways)
-    count = 3 if path.spread else 2
-    corners = np.tile(np.array([path.x, path.y]), (count + 1, 1))
-    corners[1:] += np.outer(along[:count], (path.ex, path.ey)) + np.outer(aside[:count], (path.sx, path.sy))
-    return corners
-
-
-@compiled
-def end_distance(path: StoppingPath, px: float, py: float) -> float:
-    """Distance of a point from the rest position, less the wander, m."""
-    end_x = path.x + path.forward * path.ex + path.sideways * path.sx
-    end_y = path.y + path.forward * path.ey + path.sideways * path.sy
-    return hypot(px - end_x, py - end_y) - path.wander
 
 
 class HeadingDrive(NamedTuple):
@@ -129,8 +50,6 @@ class HeadingDrive(NamedTuple):
         yaw_limit: Largest turning torque, N m.
         timestep: Physics step, s.
         substeps: Physics steps per control step.
-        uncertainty: Relative uncertainty of mass and damping each, in [0, 1).
-        top_yaw_rate: The most that the actuators reach from rest, rad/s.
     """
 
     mass: float
@@ -145,21 +64,16 @@ class HeadingDrive(NamedTuple):
     yaw_limit: float
     timestep: float
     substeps: int
-    uncertainty: float = 0.0
-    top_yaw_rate: float = math.inf
 
-    def corners(self) -> "list[HeadingDrive]":
-        """The bodies at the corners of the uncertainty, each without uncertainty; this one if there is none."""
-        if self.uncertainty == 0.0:
-            return [self]
-        factors = (1.0 - self.uncertainty, 1.0 + self.uncertainty)
+    def corners(self, uncertainty: float) -> "list[HeadingDrive]":
+        """The bodies with mass and damping at both ends of a relative uncertainty in (0, 1); none if it is 0."""
+        factors = (1.0 - uncertainty, 1.0 + uncertainty) if uncertainty else ()
         return [
             self._replace(
                 mass=self.mass * m,
                 yaw_inertia=self.yaw_inertia * m,
                 damping=self.damping * c,
                 yaw_damping=self.yaw_damping * c,
-                uncertainty=0.0,
             )
             for m in factors
             for c in factors
@@ -167,99 +81,30 @@ class HeadingDrive(NamedTuple):
 
 
 @compiled
-def brake_distance(body: HeadingDrive, speed: float) -> float:
-    """Longest distance to a stop under full braking, m, for a forward speed >= 0 in m/s, inside the uncertainty.
-
-    The last hold brakes just enough to end at rest: at most an eighth of its speed change times the hold more.
-    """
-    control_dt = body.timestep * body.substeps
-    mass, damping = body.mass * (1.0 + body.uncertainty), body.damping * (1.0 - body.uncertainty)
-    time, terminal = mass / damping, body.drive_limit / damping
-    last = 0.125 * body.drive_limit / mass * control_dt**2
-    last = min(last, 0.5 * speed * control_dt)
-    return time * (speed - terminal * math.log1p(speed / terminal)) + last
+def _body(constants: Array) -> HeadingDrive:
+    c = constants
+    return HeadingDrive(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], int(c[11]))
 
 
 @compiled
-def brake_control(body: HeadingDrive, forward_speed: float) -> float:
-    """The drive control that brakes fully, or just to rest within one hold."""
-    control_dt = body.timestep * body.substeps
-    force = -forward_speed * body.mass / control_dt
+def _motion(m: Array) -> Motion:
+    return Motion(m[0], m[1], m[2], m[3], m[4], m[5])
+
+
+@compiled
+def brake_control(body: HeadingDrive, motion: Motion) -> float:
+    """The drive control that brakes fully, or just to rest within one control step."""
+    ahead = motion.vx * math.cos(motion.heading) + motion.vy * math.sin(motion.heading)
+    force = -ahead * body.mass / (body.timestep * body.substeps)
     return max(-body.drive_limit, min(force, body.drive_limit)) / body.drive_gain
 
 
 @compiled
-def residual_turn_angle(body: HeadingDrive, yaw_rate: float) -> float:
-    """Angle by which the body still turns while the servo brakes its rotation, rad.
+def advance(body: HeadingDrive, motion: Motion, drive: float, turn: float, places: Array) -> Motion:
+    """Motion after both controls were held for one control step.
 
-    Simulated for one control step; the oscillation of the servo about zero is left out.
+    Writes the position at the end of every physics step, m, into `places`, shape (substeps, 2).
     """
-    h, m_l = body.timestep, body.mass + body.timestep * body.damping
-    inertia = body.yaw_inertia + h * body.yaw_damping - (body.mass * body.com_offset) ** 2 / m_l
-    rate, angle, full = yaw_rate, 0.0, h * body.yaw_limit / inertia
-    for _ in range(body.substeps):
-        if abs(rate) <= full:
-            break
-        torque = max(-body.yaw_limit, min(body.yaw_feedback * rate, body.yaw_limit))
-        rate += h * (torque - body.yaw_damping * rate) / inertia
-        angle += h * rate
-    return angle
-
-
-@compiled
-def stopping_path(body: HeadingDrive, motion: Motion) -> StoppingPath:
-    """The area that the backup manoeuvre stays in."""
-    heading = motion.heading + residual_turn_angle(body, motion.yaw_rate)
-    cos, sin = math.cos(heading), math.sin(heading)
-    ahead = motion.vx * cos + motion.vy * sin
-    # Sideways the centre of mass coasts, not the turning axis: add the share of the yaw rate.
-    aside = motion.vy * cos - motion.vx * sin + body.com_offset * motion.yaw_rate
-    flip_a, flip_s = (-1.0 if ahead < 0.0 else 1.0), (-1.0 if aside < 0.0 else 1.0)
-    ahead, aside = abs(ahead), abs(aside)
-    coast = body.mass * (1.0 + body.uncertainty) / (body.damping * (1.0 - body.uncertainty))
-    forward = brake_distance(body, ahead)
-    sideways = coast * aside
-    wander = _WANDER * sideways
-    crossing = min(sideways, forward * aside / ahead) if ahead > 1e-9 else 0.0
-    radius = hypot(forward, sideways) + wander
-    return StoppingPath(
-        motion.x,
-        motion.y,
-        flip_a * cos,
-        flip_a * sin,
-        -flip_s * sin,
-        flip_s * cos,
-        forward,
-        sideways,
-        crossing,
-        radius,
-        body.uncertainty > 0.0,
-        wander,
-    )
-
-
-@compiled
-def com_speed(body: HeadingDrive, motion: Motion) -> float:
-    """Speed of the centre of mass, m/s."""
-    swing = body.com_offset * motion.yaw_rate
-    return hypot(motion.vx - swing * math.sin(motion.heading), motion.vy + swing * math.cos(motion.heading))
-
-
-@compiled
-def beyond_reach(body: HeadingDrive, motion: Motion) -> float:
-    """The share by which a motion is faster than the actuators make it from rest; at most 0 for what they reach.
-
-    The force on the centre of mass is the drive less the damping of the axis, which swings about it: its speed stays
-    below `F_max / c + r w`. The damping's torque about the axis bounds the yaw rate w: see `top_yaw_rate`.
-    """
-    slow = body.damping * (1.0 - body.uncertainty)
-    top = body.drive_limit / slow + abs(body.com_offset) * body.top_yaw_rate
-    return max(com_speed(body, motion) / top, abs(motion.yaw_rate) / body.top_yaw_rate) - 1.0
-
-
-@compiled
-def advance(body: HeadingDrive, motion: Motion, drive: float, turn: float, substeps: int) -> Motion:
-    """Motion after so many physics steps of both controls."""
     x, y, heading, vx, vy, yaw_rate = motion
     h, r, m = body.timestep, body.com_offset, body.mass
     push = max(-body.drive_limit, min(body.drive_gain * drive, body.drive_limit))
@@ -268,8 +113,8 @@ def advance(body: HeadingDrive, motion: Motion, drive: float, turn: float, subst
     scale = h / (m_l * m_w - m_c * m_c)
     limit, damping, yaw_damping = body.yaw_limit, body.damping, body.yaw_damping
     wanted, feedback = body.yaw_gain * turn, body.yaw_feedback
-    for _ in range(substeps):
-        cos, sin = math.cos(heading), math.sin(heading)
+    cos, sin = math.cos(heading), math.sin(heading)
+    for i in range(body.substeps):
         ahead, aside = vx * cos + vy * sin, vy * cos - vx * sin
         torque = max(-limit, min(wanted + feedback * yaw_rate, limit)) - yaw_damping * yaw_rate
         drag = -damping * aside
@@ -280,11 +125,163 @@ def advance(body: HeadingDrive, motion: Motion, drive: float, turn: float, subst
         vy += d_ahead * sin + d_aside * cos
         x += h * vx
         y += h * vy
-        heading += h * yaw_rate
+        angle = h * yaw_rate
+        heading += angle
+        if abs(angle) < _SMALL:
+            square = angle * angle
+            c = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square / 720.0))
+            s = angle * (1.0 - square * (1.0 / 6.0 - square / 120.0))
+            cos, sin = cos * c - sin * s, sin * c + cos * s
+        else:
+            cos, sin = math.cos(heading), math.sin(heading)
+        places[i, 0], places[i, 1] = x, y
     return Motion(x, y, heading, vx, vy, yaw_rate)
 
 
 @compiled
-def predict(body: HeadingDrive, motion: Motion, drive: float, turn: float) -> Motion:
-    """Motion after both controls were held for one control step, by semi-implicit Euler steps as in MuJoCo."""
-    return advance(body, motion, drive, turn, body.substeps)
+def _com_speed(body: HeadingDrive, motion: Motion) -> float:
+    """Speed of the centre of mass, m/s."""
+    swing = body.com_offset * motion.yaw_rate
+    return hypot(motion.vx - swing * math.sin(motion.heading), motion.vy + swing * math.cos(motion.heading))
+
+
+@compiled
+def reach(body: HeadingDrive, motion: Motion) -> float:
+    """A bound on how far the turning axis still gets while the body brakes, m.
+
+    The centre of mass coasts to rest within `m v / c`, and braking only shortens that. The axis swings about it by
+    the angle that the body still turns; the hinge's damping alone ends that within `(I w + r m v) / d`, where `r m v`
+    is what the damping of the axis does.
+    """
+    speed, r = _com_speed(body, motion), abs(body.com_offset)
+    angle = (body.yaw_inertia * abs(motion.yaw_rate) + r * body.mass * speed) / body.yaw_damping
+    return body.mass / body.damping * speed + 2.0 * r * angle
+
+
+@compiled
+def _gap(disc: Array, x: float, y: float) -> float:
+    return hypot(disc[0] - x, disc[1] - y) - disc[2]
+
+
+@compiled
+def _turning_gap(body: HeadingDrive, motion: Motion, disc: Array) -> float:
+    """What is left while the body turns in place: the axis then circles about the centre of mass."""
+    x = motion.x + body.com_offset * math.cos(motion.heading)
+    y = motion.y + body.com_offset * math.sin(motion.heading)
+    return _gap(disc, x, y) - abs(body.com_offset)
+
+
+@compiled
+def clearances(models: Array, start: Array, drive: float, turn: float, discs: Array, to_rest: bool) -> Array:
+    """What a held control, and braking after it until rest, leaves of the distance to discs, m, shape (2, n).
+
+    The first row is the least at any physics step, the present one included; the second what is left at the end. A
+    trajectory is followed as long as it can come closer to a disc than it was.
+
+    Args:
+        models: Constants of bodies, shape (c, 12): of the one by which it brakes, and of others that it may be. What
+            is counted is the least of all.
+        start: As `Motion`, shape (6,).
+        drive: Held for one control step.
+        turn: Likewise.
+        discs: Centre and radius of each, m, shape (n, 3).
+        to_rest: Whether all trajectories are followed until rest.
+    """
+    n = len(discs)
+    left, gaps, brakes = np.full((2, n), math.inf), np.empty(n), _body(models[0])
+    places = np.empty((brakes.substeps, 2))
+    for model in models:
+        body, motion, far = _body(model), _motion(start), math.inf
+        ahead, around, swivel = drive, turn, 2.0 * abs(body.com_offset)
+        for i in range(n):
+            gaps[i] = _gap(discs[i], motion.x, motion.y)
+            if not gaps[i] >= left[0, i]:  # what is not a number stays
+                left[0, i] = gaps[i]
+        holds = int(_LONGEST * body.mass / (body.damping * body.timestep * body.substeps)) + 1
+        for _ in range(holds):
+            motion = advance(body, motion, ahead, around, places)
+            moved, far, nears = far, reach(body, motion), to_rest
+            for i in range(n):
+                if gaps[i] - moved - swivel >= left[0, i]:
+                    continue
+                for k in range(body.substeps):
+                    gaps[i] = _gap(discs[i], places[k, 0], places[k, 1])
+                    if not gaps[i] >= left[0, i]:
+                        left[0, i] = gaps[i]
+                nears = nears or gaps[i] - far - swivel < left[0, i]
+            if far < REST_M or not nears:
+                break
+            ahead, around = brake_control(brakes, motion), 0.0
+        for i in range(n):
+            end = _turning_gap(body, motion, discs[i])
+            if not end >= left[1, i]:
+                left[1, i] = end
+            if not end - far >= left[0, i]:
+                left[0, i] = end - far
+    return left
+
+
+class Sight(NamedTuple):
+    """What is known at an observation.
+
+    Attributes:
+        motion: As `Motion`, shape (6,).
+        brake: The drive control that brakes.
+        discs: Those that one control step and braking after it can come near, or the nearest: shape (k, 3).
+        clearances: What braking leaves of them, shape (2, k).
+        loss: The most that another control can leave less, m.
+    """
+
+    motion: Array
+    brake: float
+    discs: Array
+    clearances: Array
+    loss: float
+
+
+@compiled
+def look(models: Array, qpos: Array, qvel: Array, place: Array, discs: Array, margin: float) -> Sight:
+    """Read the motion and find the discs that count.
+
+    Args:
+        models: As of `clearances`.
+        qpos: Of the whole model.
+        qvel: Likewise.
+        place: Indices of the body's first joint in both, and where the body is at qpos = 0, m.
+        discs: Centre and radius of each, m, shape (n, 3).
+        margin: Kept free of them, m.
+    """
+    start = np.empty(6)
+    for i in range(3):
+        start[i], start[3 + i] = qpos[int(place[0]) + i], qvel[int(place[1]) + i]
+    start[0] += place[2]
+    start[1] += place[3]
+    now, loss, farthest = _motion(start), 0.0, 0.0
+    for model in models:
+        body = _body(model)
+        control_dt, coast = body.timestep * body.substeps, body.mass / body.damping
+        change = body.drive_limit / body.mass * control_dt
+        turn = min(control_dt * body.yaw_limit / body.yaw_damping, math.pi)
+        speed = _com_speed(body, now)
+        # Full drive instead of full braking, and as much turning one way as the other.
+        loss = max(loss, 2.0 * (change * (control_dt + coast) + speed * (control_dt + turn * coast)))
+        pushed = change * (control_dt + coast) + 2.0 * abs(body.com_offset)
+        farthest = max(farthest, reach(body, now) + pushed)
+    gaps, nearest = np.empty(len(discs)), margin
+    for i in range(len(discs)):
+        gaps[i] = _gap(discs[i], now.x, now.y)
+    if len(discs):
+        nearest = max(nearest, gaps.min())
+    near = discs[~(gaps - farthest > nearest)]
+    brake = brake_control(_body(models[0]), now)
+    return Sight(start, brake, near, clearances(models, start, brake, 0.0, near, False), loss)
+
+
+def way_to_rest(body: HeadingDrive, start: Array) -> Array:
+    """Where the body is while it brakes, from a motion on, m, shape (instants, 2)."""
+    motion, places = Motion(*start.tolist()), [start[None, :2]]
+    while reach(body, motion) >= REST_M:
+        step = np.empty((body.substeps, 2))
+        motion = advance(body, motion, brake_control(body, motion), 0.0, step)
+        places.append(step)
+    return np.concatenate(places)

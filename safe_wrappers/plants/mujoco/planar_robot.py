@@ -72,7 +72,7 @@ class PlanarFrame:
         return data.qpos[q : q + 3], data.qvel[v : v + 3]
 
 
-def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> HeadingDrive:
+def heading_drive(plant: MujocoPlant, body: str) -> HeadingDrive:
     """The constants of a planar robot from a plant's model.
 
     Raises:
@@ -91,6 +91,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
     fixed = int(mujoco.mjtGain.mjGAIN_FIXED)
     problems = {
         "the slides need equal damping above zero": damping[0] != damping[1] or damping[0] <= 0.0,
+        "the hinge needs damping above zero": not m.dof_damping[dofs[2]] > 0.0,
         "the centre of mass must lie on the heading": abs(float(com[1])) > 1e-9,
         "the joints must have no armature or stiffness": m.dof_armature[dofs].any()
         or m.jnt_stiffness[frame.joints].any(),
@@ -108,7 +109,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
     gear, turn_gear = float(m.actuator_gear[a, 0]), float(m.actuator_gear[t, 0])
     gain, turn_gain = float(m.actuator_gainprm[a, 0]), float(m.actuator_gainprm[t, 0])
     yaw_clamp = float(m.actuator_forcerange[t, 1]) if m.actuator_forcelimited[t] else math.inf
-    drive = HeadingDrive(
+    return HeadingDrive(
         mass=mass,
         damping=float(damping[0]),
         com_offset=float(com[0]),
@@ -121,25 +122,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
         yaw_limit=turn_gear * yaw_clamp,
         timestep=float(m.opt.timestep),
         substeps=plant.substeps,
-        uncertainty=uncertainty,
     )
-    most = float(np.abs(m.actuator_ctrlrange[t]).max()) if m.actuator_ctrllimited[t] else math.inf
-    return drive._replace(top_yaw_rate=_top_yaw_rate(drive, most))
-
-
-def _top_yaw_rate(drive: HeadingDrive, most: float) -> float:
-    """A bound on the yaw rate that the robot reaches from rest with turning controls up to `most`, rad/s.
-
-    Where the yaw rate w is highest, the servo's torque and that of the slides' damping c about the axis, at most
-    `r c v`, balance the hinge's damping. The axis is at most `F_max / c + 2 r w` fast: `beyond_reach`.
-    """
-    slow, r = 1.0 - drive.uncertainty, abs(drive.com_offset)
-    least = drive.yaw_damping * slow - 2.0 * r * r * drive.damping * (1.0 + drive.uncertainty)
-    swing = r * drive.drive_limit * (1.0 + drive.uncertainty) / slow
-    if not least > 0.0:
-        return math.inf
-    by_servo = (drive.yaw_gain * most + swing) / (least - drive.yaw_feedback)
-    return min((drive.yaw_limit + swing) / least, by_servo)
 
 
 def _force_limit(m: mujoco.MjModel, actuator: int, gain: float) -> float:
