@@ -64,6 +64,7 @@ def test_parked_objects_leave_no_trace(make_env):
     for _ in range(30):
         observation, _, _, _, info = env.step(np.array([1.0, 0.3]))
         assert not observation[28:].any() and info["cost"] == info["cost_substep"] == 0.0
+        assert np.abs(env.data.qvel[3:]).max() < 0.05  # parked apart from each other
 
 
 @pytest.mark.parametrize(

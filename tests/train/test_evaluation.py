@@ -288,6 +288,8 @@ def test_learning_curve(fake_experiment):
     assert curve.low[-1] == pytest.approx(curve.iqm[-1] - 1)
     assert curve.high[-1] == pytest.approx(curve.iqm[-1] + 1)
     # Fewer bins where a seed has few episodes; none at all where a seed has none.
-    write_training(experiment, 0, 1, [episode(timesteps=500, cost=1), episode(timesteps=1000, cost=3)])
-    assert len(learning_curve(experiment, experiment.arms[0], "cost").steps) == 2
+    rows = [episode(timesteps=at, cost=cost) for at, cost in ((500, 1), (501, 5), (1000, 3))]
+    write_training(experiment, 0, 1, rows)
+    curve = learning_curve(experiment, experiment.arms[0], "cost")
+    assert len(curve.steps) == 2 and curve.seeds[1] == pytest.approx([1, 4])  # a bin's right end is its own
     assert learning_curve(experiment, experiment.arms[1], "cost") is None

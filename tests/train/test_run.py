@@ -123,17 +123,24 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     assert 370 < trained_at[0] <= 384 and finish(folder)["timesteps"] == 400
 
 
-def test_random_states_go_on_where_they_stood(finished):
+def test_random_states_are_those_of_the_checkpoint(finished):
+    """Not those of the run's seed, with which SB3 seeds everything when it loads a model."""
     experiment = finished()
     folder = experiment.run_folder(experiment.arms[1], 0)
-
-    def drawn():
-        resumed(experiment.arms[1], folder)
-        return random.random(), np.random.normal(), torch.rand(1).item()
-
-    first = drawn()
-    random.seed(1), np.random.seed(1), torch.manual_seed(1)
-    assert drawn() == first and len(set(first)) == 3
+    of_python, of_numpy, of_torch = (
+        random.Random(5),
+        np.random.RandomState(5),
+        torch.Generator().manual_seed(5),
+    )
+    numbers = of_numpy.get_state(legacy=False)
+    numbers["state"]["key"] = numbers["state"]["key"].tolist()
+    states = {"python": of_python.getstate(), "numpy": numbers, "torch": of_torch.get_state().tolist()}
+    path = latest_checkpoint(folder / "checkpoints").folder / "random.json"
+    assert json.loads(path.read_text()).keys() == states.keys()
+    path.write_text(json.dumps(states))
+    resumed(experiment.arms[1], folder)
+    assert random.random() == of_python.random() and np.random.normal() == of_numpy.normal()
+    assert torch.equal(torch.rand(3), torch.rand(3, generator=of_torch))
 
 
 def test_a_run_that_is_to_stop_saves_after_its_rollout_and_goes_on(fake_experiment):
