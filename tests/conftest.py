@@ -30,9 +30,8 @@ BEGIN = (
     "test_wrappers_in_vector_envs",
     "test_protect",
     "test_vector_cbf_action_filter",
-    "test_pictures",
-    "test_report",
-    "test_parallel",
+    "test_algorithms",
+    "test_run",
     "test_pages",
     "test_rendering",
 )

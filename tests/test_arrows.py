@@ -1,6 +1,7 @@
-"""The floors of the library: every module imports from its own folder and from lower floors alone."""
+"""The floors of the library, by its imports; and the appendix's systems, whose formulas are used as the page says."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -135,3 +136,47 @@ for name in sys.argv[2:]:
         [sys.executable, "-c", code, folder, *names], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+# The appendix's systems: every row's formulas are used by what it says --------------------------------------------
+
+PAGE = (ROOT / "docs" / "systems.md").read_text()
+ROWS = [re.split(r"\s*\|\s*", line.strip("| \n")) for line in PAGE.splitlines() if re.match(r"\| S\d", line)]
+
+
+def modules_by_import():
+    """Module -> the modules of the package that it imports, without the package's name."""
+    package, graph = ROOT / "safe_wrappers", {}
+    for path in package.rglob("*.py"):
+        parts = path.relative_to(package).with_suffix("").parts
+        found = imports(path, ".".join(["safe_wrappers", *parts[:-1]]))
+        found |= {name.rpartition(".")[0] for name in found}  # of `from module import name`
+        graph[".".join(parts)] = {one.removeprefix("safe_wrappers.") for one in found}
+    return graph
+
+
+GRAPH = modules_by_import()
+
+
+def reached(start):
+    """All modules that a module imports, directly or not; packages only re-export, and are not followed."""
+    seen, left = set(), [start]
+    while left:
+        new = (GRAPH[left.pop()] & GRAPH.keys()) - seen
+        seen |= new
+        left += new
+    return seen
+
+
+def test_the_formulas_of_every_system_are_used_by_what_the_table_says():
+    assert [row[0] for row in ROWS] == [f"S{number}" for number in range(1, 27)]
+    for row in ROWS:
+        (formulas,), (user,) = (re.findall(r"`([\w.]+)`", cell) for cell in row[2:4])
+        assert formulas.startswith(("control.", "filter.")) and not user.startswith("control.")
+        assert formulas in GRAPH and formulas in reached(user), row
+
+
+def test_no_module_of_control_is_on_the_shelf():
+    used = set().union(*(reached(name) for name in GRAPH if not name.startswith("control.")))
+    files = {name for name in GRAPH if name.startswith("control.") and not name.endswith("__init__")}
+    assert files <= used, files - used

@@ -44,15 +44,11 @@ KNOWN = {
     "HandReach-v3": [sw.constraints.JointSpeedLimit],
     **{f"AdroitHand{task}-v1": [sw.constraints.JointSpeedLimit] for task in ("Pen", "Hammer")},
     **{f"AdroitHand{task}-v1": [sw.constraints.JointSpeedLimit] * 2 for task in ("Door", "Relocate")},
-    **{f"{robot}-{version}": [sw.constraints.SpeedLimit] for robot in RUNNERS for version in ("v4", "v5")},
+    **{f"{robot}-v5": [sw.constraints.SpeedLimit] for robot in RUNNERS},
     **{f"Safe{robot}Velocity-v0": [sw.constraints.SpeedLimit] for robot in RUNNERS},
 }
 TOUCHING = ("FetchPush", "FetchSlide")
 """Their own resets put the fingers 3 mm into the table."""
-known = pytest.mark.parametrize("env_id", KNOWN)
-newest = pytest.mark.parametrize(
-    "env_id", [env_id for env_id in KNOWN if not env_id.endswith("-v4") or "Fetch" in env_id]
-)
 
 
 def make(env_id, **options):
@@ -63,51 +59,41 @@ def make(env_id, **options):
         return gym.make(env_id, **options)
 
 
-@known
-def test_known_envs_get_their_recipe_and_run(env_id):
-    env = sw.protect(make(env_id, disable_env_checker=True))
+@pytest.mark.parametrize("env_id", KNOWN)
+def test_known_envs_get_their_recipe_pass_gymnasiums_checks_and_run(env_id):
+    env = sw.protect(make(env_id))
     assert isinstance(env, sw.CBFActionFilter)
     assert [type(c) for c in env.constraints] == KNOWN[env_id]
-    rng = np.random.default_rng(0)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()), disable_env_checker=True)
+    assert isinstance(again, sw.CBFActionFilter) and again.constraints == env.constraints
+    assert again.constraint_names == env.constraint_names
     starts_unsafe = env_id.startswith(TOUCHING)
-    with pytest.warns(UnsafeStateWarning) if starts_unsafe else contextlib.nullcontext():
-        _, first = env.reset(seed=0)
-    ours = {*keys.CBF_BOOLS, *keys.CBF_FLOATS, keys.CBF_REFUSED, keys.PROPOSED_ACTION, keys.EXECUTED_ACTION}
-    for _ in range(200):
-        action = rng.uniform(env.action_space.low, env.action_space.high).astype(env.action_space.dtype)
-        *_, terminated, truncated, info = env.step(action)
-        assert ours <= info.keys() and ours <= first.keys()
-        assert all(type(info[key]) is bool for key in keys.CBF_BOOLS)
-        assert all(type(info[key]) is float and np.isfinite(info[key]) for key in keys.CBF_FLOATS)
-        for key, shape in ((keys.PROPOSED_ACTION, action.shape), (keys.EXECUTED_ACTION, action.shape)):
-            assert info[key].shape == shape and info[key].dtype == np.float64
-        assert info[keys.CBF_REFUSED].shape == (len(env.constraints),)
-        assert env.action_space.contains(info[keys.EXECUTED_ACTION].astype(env.action_space.dtype))
-        assert not info[keys.CBF_INFEASIBLE]  # random actions are no attack
-        assert not info[keys.CBF_UNSAFE] or starts_unsafe
-        if terminated or truncated:
-            env.reset()
-
-
-@newest
-def test_a_protected_env_passes_gymnasiums_checks(env_id):
-    env = sw.protect(make(env_id))
     with warnings.catch_warnings(action="error"):
         expected = (
             "A Box observation space|is different from the unwrapped|symmetric and normalized|out of date"
         )
-        if env_id.startswith(TOUCHING):
+        if starts_unsafe:
             expected += "|outside the safe set"
         warnings.filterwarnings("ignore", message=f".*({expected})")
         check_env(env, skip_render_check=True)
-
-
-@newest
-def test_protect_is_recorded_in_the_spec_and_in_json(env_id):
-    env = sw.protect(make(env_id))
-    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    assert isinstance(again, sw.CBFActionFilter) and again.constraints == env.constraints
-    assert again.constraint_names == env.constraint_names
+    rng = np.random.default_rng(0)
+    with pytest.warns(UnsafeStateWarning) if starts_unsafe else contextlib.nullcontext():
+        _, first = again.reset(seed=0)
+    ours = {*keys.CBF_BOOLS, *keys.CBF_FLOATS, keys.CBF_REFUSED, keys.PROPOSED_ACTION, keys.EXECUTED_ACTION}
+    for _ in range(80):
+        action = rng.uniform(again.action_space.low, again.action_space.high).astype(again.action_space.dtype)
+        *_, terminated, truncated, info = again.step(action)
+        assert ours <= info.keys() and ours <= first.keys()
+        assert all(type(info[key]) is bool for key in keys.CBF_BOOLS)
+        assert all(type(info[key]) is float and np.isfinite(info[key]) for key in keys.CBF_FLOATS)
+        for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION):
+            assert info[key].shape == action.shape and info[key].dtype == np.float64
+        assert info[keys.CBF_REFUSED].shape == (len(env.constraints),)
+        assert again.action_space.contains(info[keys.EXECUTED_ACTION].astype(action.dtype))
+        assert not info[keys.CBF_INFEASIBLE]  # random actions are no attack
+        assert not info[keys.CBF_UNSAFE] or starts_unsafe
+        if terminated or truncated:
+            again.reset()
 
 
 @pytest.mark.parametrize("robot", RUNNERS)
@@ -174,7 +160,7 @@ def test_options_reach_the_filter():
     assert env.plant is plant
 
 
-@pytest.mark.parametrize("options", [{"fallbak": "zero"}, {"detour": True}, {"constraints": []}])
+@pytest.mark.parametrize("options", [{"fallbak": "zero"}, {"constraints": []}])
 def test_unknown_options_are_refused_with_the_list(options):
     with pytest.raises(UnknownNameError, match=f"no option {next(iter(options))!r}.*fallback.*margin"):
         sw.protect(gym.make("Reacher-v5"), **options)
@@ -289,8 +275,8 @@ def test_dm_control_tasks_are_protected_through_shimmy(task):
 
 
 @pytest.mark.parametrize(("env_id", "joints"), [
-    ("HandReachDense-v3", 24), ("AdroitHandPen-v1", 24), ("AdroitHandHammer-v1", 26),
-    ("AdroitHandDoorSparse-v1", 28), ("AdroitHandRelocate-v1", 30),
+    ("HandReachDense-v3", 24), ("AdroitHandHammer-v1", 26), ("AdroitHandDoorSparse-v1", 28),
+    ("AdroitHandRelocate-v1", 30),
 ])  # fmt: skip
 def test_hands_are_protected_in_all_of_their_joints(env_id, joints):
     gym.register_envs(pytest.importorskip("gymnasium_robotics"))
@@ -375,7 +361,7 @@ def test_a_cart_that_balances_its_poles_stays_on_the_rail(env_id):
     raw, gains = env.unwrapped, balancing(env.unwrapped)
     judge = mujoco.MjData(raw.model)
     farthest, intervened = 0.0, 0
-    for seed in range(6):
+    for seed in range(3):
         env.reset(seed=seed)
         target = (-1.0) ** seed * (1.0 + 0.4 * seed)
         for k in range(200):

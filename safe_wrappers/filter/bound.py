@@ -58,9 +58,8 @@ class Bound:
         self.spec.report, self.spec.memory = {}, {}
         self.spec.setup(self.plant)
         self.model, self._blank = self.spec.model, dict(self.spec.report)
-        self._model_version = (
-            self.plant.model_version
-        )  # last: what does not fit is refused at every observation
+        # Last: what does not fit is refused at every observation.
+        self._model_version = self.plant.model_version
 
     def forget_report(self) -> None:
         """Put the info keys of the constraint back to those of a state about which nothing is known."""
@@ -198,9 +197,8 @@ class Bound:
         Left out are those of the control intervals after the last one in which a bound is violated most.
         """
         plant, needed, left = self.plant, self.spec.horizon, self.slacks(control)
-        if (
-            not self._is_outside and left.size % needed == 0
-        ):  # a model of one's own may not count the intervals
+        # A model of one's own may not count the intervals.
+        if not self._is_outside and left.size % needed == 0:
             left = left.reshape(needed, -1)
             needed = int(np.where(left.min(axis=0) < 0.0, left.argmin(axis=0), 0).max()) + 1
         box = plant.lower, plant.upper
@@ -222,11 +220,7 @@ class Bound:
             rows = self.rows()
             if not keeps_rows(control, rows.normals, rows.offsets, self.plant.lower, self.plant.upper):
                 return False
-        return (
-            not self.predicts
-            or self._far
-            or bool(self.slacks(control).min(initial=0.0) >= -self.spec.rounding)
-        )
+        return not self.predicts or self._far or self.slack(control) >= -self.spec.rounding
 
     def keeps_limit(self, control: Array) -> bool:
         """Inside the margin: whether a refused control keeps the limit, and loses no more of the margin.

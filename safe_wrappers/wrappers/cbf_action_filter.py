@@ -216,7 +216,7 @@ class CBFActionFilter(LayerWrapper):
                 # What fails least may be the proposal itself, and a change may be lost in rounding.
                 intervened &= bool((executed != np.clip(proposed, self._low, self._high)).any())
         self.filter.executed(executed)
-        none = np.zeros(len(self.filter.bound), dtype=bool)
+        refused = decision.refused
         return sent, {
             keys.CBF_INTERVENED: intervened,
             keys.CBF_INFEASIBLE: decision.infeasible,
@@ -224,7 +224,7 @@ class CBFActionFilter(LayerWrapper):
             keys.CBF_NONFINITE: not finite,
             keys.CBF_UNSAFE: unsafe,
             keys.CBF_MISMATCH: False,
-            keys.CBF_REFUSED: none if decision.refused is None else decision.refused,
+            keys.CBF_REFUSED: np.zeros(len(self.filter.bound), dtype=bool) if refused is None else refused,
             keys.CBF_CORRECTION: correction,
             keys.CBF_MARGIN: margin,
             keys.PROPOSED_ACTION: proposed,

@@ -1,4 +1,4 @@
-"""Every page's code runs, and prints what the page says; every link leads somewhere."""
+"""Every page's code runs and prints what the page says, what it promises holds, and every link leads somewhere."""
 
 import re
 import runpy
@@ -6,6 +6,7 @@ from pathlib import Path
 from unittest import mock
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 import safe_wrappers as sw
@@ -22,7 +23,8 @@ OPTIONAL = {
 """What a page may import beyond the library's own dependencies, and what has to be there for it."""
 
 
-@pytest.mark.filterwarnings("error::UserWarning")
+# A simulator that is checked for two seconds says how far it came, which a busy machine decides.
+@pytest.mark.filterwarnings("error::UserWarning", "ignore:the simulation of .* was compared")
 @pytest.mark.parametrize("page", PAGES["pages"]())
 def test_a_page_s_code_runs_and_prints_what_the_page_says(page, tmp_path, monkeypatch):
     for module in OPTIONAL:
@@ -33,12 +35,12 @@ def test_a_page_s_code_runs_and_prints_what_the_page_says(page, tmp_path, monkey
         PAGES["run"](page)
 
 
-@pytest.mark.parametrize("page", PAGES["pages"]())
-def test_every_python_block_of_a_page_is_run_and_fits_on_it(page):
-    text = (DOCS / page).read_text(encoding="utf-8")
-    found = PAGES["blocks"](page)
-    assert len(found) == len(re.findall(r"^\s*`{3,}\s*(python|pycon|py)\b", text, re.MULTILINE))
-    assert max(len(line) for block in found for line in block.code.splitlines()) <= 88
+def test_every_python_block_of_every_page_is_run():
+    for page in PAGES["pages"]():
+        text = (DOCS / page).read_text(encoding="utf-8")
+        assert len(PAGES["blocks"](page)) == len(
+            re.findall(r"^\s*`{3,}\s*(python|pycon|py)\b", text, re.MULTILINE)
+        )
 
 
 def anchors(page: Path) -> set[str]:
@@ -49,24 +51,20 @@ def anchors(page: Path) -> set[str]:
     return made | set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
 
 
-WITH_LINKS = [
-    *sorted(DOCS.rglob("*.md")),
-    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "examples/README.md")),
-]
-
-
-@pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_link_and_every_included_file_is_there(page):
-    text = page.read_text(encoding="utf-8")
-    for link in re.findall(r"\]\(([^)\s]+)\)", text):
-        path, _, anchor = link.partition("#")
-        if "://" in link:
-            continue
-        target = (page.parent / path).resolve() if path else page
-        assert target.exists(), link
-        assert not anchor or target.suffix != ".md" or anchor in anchors(target), link
-    for name in re.findall(r"\{(?:include|image)\} (\S+)", text):
-        assert (page.parent / name).exists(), name
+def test_every_link_and_every_included_file_is_there():
+    others = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "examples/README.md")
+    missing = []
+    for page in (*sorted(DOCS.rglob("*.md")), *(ROOT / name for name in others)):
+        text = page.read_text(encoding="utf-8")
+        for link in re.findall(r"\]\(([^)\s]+)\)", text):
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve() if path else page
+            of_page = anchor and target.suffix == ".md"
+            if "://" not in link and not (target.exists() and (not of_page or anchor in anchors(target))):
+                missing.append((page, link))
+        named = re.findall(r"\{(?:include|image)\} (\S+)", text)
+        missing += [(page, name) for name in named if not (page.parent / name).exists()]
+    assert missing == []
 
 
 @pytest.mark.parametrize("folder", ["constraints", "wrappers"])
@@ -82,5 +80,38 @@ def test_every_constraint_and_wrapper_has_a_heading_of_its_own(folder):
     assert {name for name, x in things.items() if isinstance(x, type) and issubclass(x, kind)} <= headings
 
 
-def test_the_readme_is_one_page():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
+# The examples for envs without MuJoCo, in closed loop, against hostile drivers --------------------------------------
+
+DRIVERS = {
+    "random": lambda rng, k, angle, speed: rng.uniform(-2.0, 2.0),
+    "bang-bang": lambda rng, k, angle, speed: 2.0 if k // 7 % 2 else -2.0,
+    "faster": lambda rng, k, angle, speed: np.copysign(2.0, speed),
+}
+
+
+def drive(env, driver, seed):
+    """Speeds after every step of one episode, and how many of its steps were flagged."""
+    env.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    speeds, flagged, truncated, k = [], 0, False, 0
+    while not truncated:
+        action = np.array([DRIVERS[driver](rng, k, *env.unwrapped.state)], np.float32)
+        *_, truncated, info = env.step(action)
+        speeds.append(abs(env.unwrapped.state[1]))
+        flagged += bool(info.get("cbf/infeasible") or info.get("cbf/fallback"))
+        k += 1
+    return np.array(speeds), flagged
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize(
+    ("page", "until", "limit"), [("quickstart.md", "plant", 2.0), ("../README.md", "slow", 6.0)]
+)
+def test_the_limit_of_the_first_example_holds(driver, page, until, limit):
+    filtered, violated = PAGES["run"](page, until=until)["env"], 0
+    free = gym.make(filtered.unwrapped.spec.id, **filtered.unwrapped.spec.kwargs)
+    for seed in range(2):
+        speeds, flagged = drive(filtered, driver, seed)
+        assert (speeds.max(), flagged) <= (limit, 0) and len(speeds) == 200
+        violated += (drive(free, driver, seed)[0] > limit).sum()
+    assert violated > 20 or driver == "random"

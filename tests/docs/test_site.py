@@ -1,8 +1,9 @@
-"""The built site: complete, without warnings, and nothing in it comes from elsewhere."""
+"""The built site and its pictures: complete, without warnings, and nothing in them comes from elsewhere."""
 
 import html.parser
 import inspect
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -14,7 +15,6 @@ import pytest
 import safe_wrappers as sw
 from safe_wrappers import info as interventions
 
-pytestmark = pytest.mark.slow
 DOCS = Path(__file__).parents[2] / "docs"
 LOADED = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src"), ("source", "src")}
 
@@ -54,28 +54,23 @@ def pages(site):
     return {path: Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")}
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded_from_elsewhere(site, pages):
     for path, page in pages.items():
         for address in page.loaded:
             assert not urlsplit(address).scheme and not address.startswith("//"), (path, address)
-            assert (path.parent / unquote(urlsplit(address).states)).exists(), (path, address)
+            assert (path.parent / unquote(urlsplit(address).path)).exists(), (path, address)
     for sheet in site.rglob("*.css"):
         text = sheet.read_text(encoding="utf-8")
         assert "@import" not in text and "url(http" not in text and "url(//" not in text, sheet
 
 
+@pytest.mark.slow
 def test_every_info_key_is_explained(site):
     shown = (site / "info.html").read_text(encoding="utf-8")
     constants = {k: v for k, v in vars(interventions).items() if k.isupper() and isinstance(v, str)}
     keys = {v for k, v in constants.items() if not k.endswith("PREFIX")}
     assert {key for key in keys if f">{key}<" not in shown} == set()
-
-
-def test_every_key_of_a_config_is_in_a_table(site):
-    shown = (site / "config.html").read_text(encoding="utf-8")
-    keys = runpy.run_path(str(DOCS / "config_keys.py"))["keys"]
-    names = [key.name for key in (*keys("ExperimentConfig"), *keys("ArmConfig"), *keys("EnvConfig", "env."))]
-    assert len(names) > 20 and [name for name in names if f">{name}<" not in shown] == []
 
 
 PUBLIC = {f"safe_wrappers.{name}": getattr(sw, name) for name in sw.__all__}
@@ -86,6 +81,7 @@ PUBLIC |= {
 """Every public name and what it stands for: those at the top, and those of the modules by topic."""
 
 
+@pytest.mark.slow
 def test_every_public_name_is_in_the_api(pages):
     documented = {
         i.split(".")[-1] for page in pages.values() for i in page.ids if i.startswith("safe_wrappers.")
@@ -94,3 +90,36 @@ def test_every_public_name_is_in_the_api(pages):
         name.split(".")[-1] for name, thing in PUBLIC.items() if isinstance(thing, type) or callable(thing)
     }
     assert public - documented == set()
+
+
+# Pictures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def drawing():
+    pytest.importorskip("matplotlib")
+    return runpy.run_path(str(DOCS / "figures" / "draw.py"))
+
+
+def test_every_picture_is_shown_and_every_shown_picture_exists(drawing):
+    shown = {
+        name
+        for page in DOCS.rglob("*.md")
+        for name in re.findall(r"^```\{drawn\} (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert set(drawing["names"]()) == shown
+
+
+@pytest.mark.slow
+def test_a_picture_is_the_same_every_time_in_the_page_s_colours_with_nothing_from_elsewhere(drawing):
+    for module in ("stable_baselines3", "gymnasium_robotics"):
+        pytest.importorskip(module)
+    for name in drawing["names"]():
+        picture = drawing["svg"](name)
+        assert picture == drawing["svg"](name)
+        colours = set(re.findall(r"(?:fill|stroke): ([^;\"]+)", picture))
+        assert {c for c in colours if not c.startswith("var(--drawn-")} <= {"none"}
+        assert "var(--drawn-ink" in picture
+        links = re.findall(r"(?:href|src)=\"([^\"]+)\"|url\(([^)]+)\)", picture)
+        assert all((a or b).startswith("#") for a, b in links)
+        assert re.search(r"<(script|image|style>[^<]*@import)", picture) is None

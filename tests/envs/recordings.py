@@ -66,8 +66,6 @@ class StepErrors:
     lidar: float
     reward: float
     cost: float
-    goal_met: bool
-    over: bool
     touched: bool
 
 
@@ -76,12 +74,9 @@ def replay(env, recording, monkeypatch, touching, mj_step=mujoco.mj_step):
 
     A step counts as touched if `touching(env)` was true after one of its substeps.
     """
-    layout = {
-        "goal": recording.goal[0],
-        "hazards": recording.hazards,
-        "vases": recording.vases(0),
-    }
+    layout = {"goal": recording.goal[0], "hazards": recording.hazards, "vases": recording.vases(0)}
     env.reset(seed=0, options={"layout": layout})
+    assert len(recording) == 300
     touched = []
 
     def watched_step(model, data):
@@ -96,7 +91,8 @@ def replay(env, recording, monkeypatch, touching, mj_step=mujoco.mj_step):
         env.set_state(recording.qpos[t], recording.qvel[t])
         env.data.qacc_warmstart[:] = recording.warmstart[t]
         _, reward, terminated, truncated, info = env.step(recording.action[t])
-        assert len(touched) == env.frame_skip
+        assert len(touched) == env.frame_skip and not (terminated or truncated)
+        assert info["goal_met"] == recording.goal_met[t]
         env.place_goal(recording.goal[t + 1])  # ours draws another new goal: look at theirs instead
         error = np.abs(env.observe() - recording.obs[t + 1])
         errors.append(
@@ -107,8 +103,6 @@ def replay(env, recording, monkeypatch, touching, mj_step=mujoco.mj_step):
                 lidar=error[env.robot.n_sensors :].max(),
                 reward=abs(reward - recording.reward[t]),
                 cost=abs(info["cost"] - recording.cost[t]),
-                goal_met=info["goal_met"] == recording.goal_met[t],
-                over=terminated or truncated,
                 touched=any(touched) or touching(env),
             )
         )

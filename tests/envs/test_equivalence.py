@@ -19,7 +19,6 @@ of the worst errors are in docs/tasks/equivalence.md. What is left, and why:
 """
 
 import mujoco
-import numpy as np
 import pytest
 from recordings import (
     EPISODES,
@@ -53,63 +52,12 @@ def assert_within(errors, limits):
         assert error <= limits[name], f"{name}: {error:.3g} > {limits[name]:.3g}"
 
 
-def split(level, episode, errors):
-    """Steps without and with a nose on a vase; the singular ones are in neither."""
-    regular = [e for t, e in enumerate(errors) if (level, episode, t) not in SINGULAR]
-    return [e for e in regular if not e.touched], [e for e in regular if e.touched]
-
-
 def nose_on_vase(env):
     """Whether the robot's box and a vase are in contact now."""
     nose = env.model.geom("pointarrow").id
     vase = env.model.geom_bodyid >= env.model.body("vase0").id
     pairs = env.data.contact.geom
     return bool(((pairs == nose).any(axis=1) & vase[pairs].any(axis=1)).any())
-
-
-@pytest.mark.parametrize(("level", "episode"), EPISODES)
-def test_every_recorded_step(make_env, monkeypatch, level, episode):
-    errors = replay(make_env(level), Recording.load(level, episode), monkeypatch, nose_on_vase)
-    assert len(errors) == 300
-    assert all(e.goal_met for e in errors)
-    assert not any(e.over for e in errors)
-    free, touching = split(level, episode, errors)
-    assert len(free) >= (300 if level == 1 else 270)
-    assert_within(free, FREE)
-    other = OTHER.get((level, episode), set())
-    assert_within([e for t, e in enumerate(errors) if t not in other], TOUCHING)
-    assert_within([errors[t] for t in other], CORNERS)
-    assert len(touching) == (0 if level == 1 else len(errors) - len(free) - (2 if episode == 2 else 0))
-
-
-@pytest.mark.parametrize("episode", [1, 2])
-def test_penetration_depth_explains_all_contact_steps(make_env, monkeypatch, episode):
-    """With 2.3.3's box-box penetration put back, contact steps agree as well as all others."""
-    monkeypatch.setattr(mujoco, "mj_forward", forward_as_2_3_3)
-    errors = replay(make_env(2), Recording.load(2, episode), monkeypatch, nose_on_vase, step_as_2_3_3)
-    assert len(split(2, episode, errors)[1]) >= 25
-    left_out = OTHER.get((2, episode), set()) | {t for level, e, t in SINGULAR if (level, e) == (2, episode)}
-    assert_within([e for t, e in enumerate(errors) if t not in left_out], FREE)
-
-
-def test_robot_alone_agrees_to_rounding(make_env):
-    """Where only the robot moves, the dynamics are the same sums in another order."""
-    recording = Recording.load(1, 1)
-    env = make_env(1)
-    env.reset(
-        seed=0,
-        options={
-            "layout": {"goal": recording.goal[0], "hazards": recording.hazards, "vases": [[50.0, 50.0]]}
-        },
-    )
-    at_rest = env.data.qpos.copy()
-    for t in range(len(recording)):
-        at_rest[:3] = recording.qpos[t, :3]
-        env.set_state(at_rest, np.r_[recording.qvel[t, :3], np.zeros(6)])
-        observation, *_ = env.step(recording.action[t])
-        np.testing.assert_allclose(env.data.qpos[:3], recording.qpos[t + 1, :3], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(env.data.qvel[:3], recording.qvel[t + 1, :3], rtol=0, atol=1e-10)
-        np.testing.assert_allclose(observation[:12], recording.obs[t + 1, :12], rtol=0, atol=1e-8)
 
 
 # The car: what is left there, and why.
@@ -165,27 +113,46 @@ def vase_touched(env):
 
 
 @pytest.mark.parametrize(("level", "episode"), EPISODES)
-def test_every_recorded_step_of_the_car(make_car, monkeypatch, level, episode):
+def test_every_recorded_step_of_the_point(make_env, monkeypatch, level, episode):
+    errors = replay(make_env("Point", level), Recording.load(level, episode), monkeypatch, nose_on_vase)
+    regular = [e for t, e in enumerate(errors) if (level, episode, t) not in SINGULAR]
+    free = [e for e in regular if not e.touched]
+    other = OTHER.get((level, episode), set())
+    assert len(free) >= (300 if level == 1 else 270)
+    assert_within(free, FREE)
+    assert_within([e for t, e in enumerate(errors) if t not in other], TOUCHING)
+    assert_within([errors[t] for t in other], CORNERS)
+
+
+@pytest.mark.parametrize("episode", [1, 2])
+def test_penetration_depth_explains_the_steps_of_the_point_at_a_vase(make_env, monkeypatch, episode):
+    """With 2.3.3's box-box penetration put back, contact steps agree as well as all others."""
+    monkeypatch.setattr(mujoco, "mj_forward", forward_as_2_3_3)
+    env = make_env("Point", 2)
+    errors = replay(env, Recording.load(2, episode), monkeypatch, nose_on_vase, step_as_2_3_3)
+    left_out = OTHER.get((2, episode), set()) | {t for level, e, t in SINGULAR if (level, e) == (2, episode)}
+    assert sum(e.touched for e in errors) >= 25
+    assert_within([e for t, e in enumerate(errors) if t not in left_out], FREE)
+
+
+@pytest.mark.parametrize(("level", "episode"), EPISODES)
+def test_every_recorded_step_of_the_car(make_env, monkeypatch, level, episode):
     recording = Recording.load(level, episode, "car")
-    errors = replay(make_car(level), recording, monkeypatch, vase_touched)
-    assert len(errors) == 300
-    assert all(e.goal_met for e in errors)
-    assert not any(e.over for e in errors)
+    errors = replay(make_env("Car", level), recording, monkeypatch, vase_touched)
     regular = [(t, e) for t, e in enumerate(errors) if (level, episode, t) != CAR_SINGULAR]
-    early = STOPPED_EARLY.get((level, episode), set())
+    early, other = STOPPED_EARLY.get((level, episode), set()), CAR_OTHER.get((level, episode), set())
     free = [e for t, e in regular if not e.touched and t not in early]
     assert len(free) == {(1, 1): 300, (1, 2): 220, (2, 1): 299, (2, 2): 100}[level, episode]
     assert_within(free, AGREE)
     assert_within([e for _, e in regular if not e.touched], STOPPED)
-    other = CAR_OTHER.get((level, episode), set())
     assert_within([e for t, e in regular if t not in other], CAR_TOUCHED)
     assert_within([errors[t] for t in other], CAR_CORNERS)
 
 
 @pytest.mark.parametrize("level", [1, 2])
-def test_other_contacts_explain_the_steps_that_touch_a_vase(make_car, monkeypatch, level):
+def test_other_contacts_explain_the_steps_of_the_car_at_a_vase(make_env, monkeypatch, level):
     """With 2.3.3's contacts put back, these steps agree as well as all others."""
-    env = make_car(level)
+    env = make_env("Car", level)
     for name in ("mjDSBL_NATIVECCD", "mjDSBL_MULTICCD"):  # the latter is a flag to enable, up to 3.3
         if hasattr(mujoco.mjtDisableBit, name):
             env.model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, name))
@@ -204,20 +171,3 @@ def test_other_contacts_explain_the_steps_that_touch_a_vase(make_car, monkeypatc
     for t in parallel & set(touched):
         assert touched[t].velocity < 0.5
         assert touched[t].sensors < (4e-3 if OTHER_CORNERS else 1e-4)  # the car's own
-
-
-def test_car_alone_agrees_to_rounding(make_car):
-    """Where only the car moves, the dynamics are the same sums in another order."""
-    recording = Recording.load(1, 1, "car")
-    env = make_car(1)
-    layout = {"goal": recording.goal[0], "hazards": recording.hazards, "vases": [[50.0, 50.0]]}
-    env.reset(seed=0, options={"layout": layout})
-    at_rest = env.data.qpos.copy()
-    for t in range(len(recording)):
-        at_rest[:13] = recording.qpos[t, :13]
-        env.set_state(at_rest, np.r_[recording.qvel[t, :11], np.zeros(6)])
-        env.data.qacc_warmstart[:] = recording.warmstart[t]
-        observation, *_ = env.step(recording.action[t])
-        np.testing.assert_allclose(env.data.qpos[:13], recording.qpos[t + 1, :13], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(env.data.qvel[:11], recording.qvel[t + 1, :11], rtol=0, atol=1e-10)
-        np.testing.assert_allclose(observation[:24], recording.obs[t + 1, :24], rtol=0, atol=1e-10)

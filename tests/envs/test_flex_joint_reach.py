@@ -14,7 +14,7 @@ from scipy.stats import kstest
 from safe_wrappers.envs.flex_joint_reach import TORQUE_RATING
 
 MOTORS, SPRINGS = [0, 2], [1, 3]
-ELBOWS = [0.0, 0.7, 1.5, 2.4, math.pi]
+ELBOWS = [0.0, 1.5, math.pi]
 
 
 @pytest.fixture
@@ -111,12 +111,6 @@ def test_resonances_and_damping_measured_are_those_declared(bare, elbow, which):
     assert 0.005 < ratio < 0.02
 
 
-def test_the_integrator_damps_nothing(bare):
-    bare.model.dof_damping[:] = 0.0
-    _, ratio, _ = mode(bare, 0.0, 1)  # the fastest there is
-    assert abs(ratio) < 1e-6
-
-
 def test_vibration_energy_is_the_boundary_layers(bare):
     rng = np.random.default_rng(2)
     states = [random_state(rng) for _ in range(50)]
@@ -152,8 +146,7 @@ def test_info_judges_every_substep(env, bare):
     assert seen == {(False, False), (True, False), (True, True)}
 
 
-@pytest.mark.parametrize("elbow", ELBOWS)
-@pytest.mark.parametrize("torque", [(3.0, 0.0), (0.0, 1.0), (2.0, -1.0)])
+@pytest.mark.parametrize(("elbow", "torque"), [(0.0, (3.0, 0.0)), (1.5, (2.0, -1.0)), (math.pi, (0.0, 1.0))])
 def test_a_torque_step_injects_what_the_formula_says(bare, elbow, torque):
     m = pose(bare, elbow)
     info = bare.step(np.array(torque))[4]
@@ -184,7 +177,7 @@ def test_observation_and_reward(bare):
 
 def test_a_start_is_at_rest_and_targets_fill_the_ring(env, bare):
     radii, angles = [], []
-    for seed in range(2000):
+    for seed in range(1000):
         observation, info = env.reset(seed=seed)
         assert info["vibration_energy"] == info["deflection"] == info["cost"] == info["reward_dist"] == 0.0
         np.testing.assert_array_equal(bare.data.qvel, 0.0)

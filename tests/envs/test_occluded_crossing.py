@@ -1,4 +1,4 @@
-"""The crossing: judged against replays, its eye against trigonometry, its robot against closed forms."""
+"""The crossing: judged against replays, its robot against closed forms, its cars against their own equations."""
 
 import copy
 import math
@@ -9,8 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
-from safe_wrappers.envs.traffic import CAR_MEAN_SPEED, CAR_SPEED_STD, noise_covariance, transition
+from safe_wrappers.envs.traffic import (
+    CAR_ACCELERATION_NOISE,
+    CAR_MEAN_SPEED,
+    CAR_SPEED_STD,
+    CAR_TIME_CONSTANT_S,
+    Traffic,
+    noise_covariance,
+    transition,
+)
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError
 
 FAR = 60.0
@@ -45,35 +55,22 @@ def towards_goal(env, rng, noise=0.3):
     return np.clip(np.append(2.0 * to_goal, 0.0) + rng.normal(0.0, noise, 3), -1.0, 1.0)
 
 
-@given(speed=st.floats(0.05, 2.0), heading=st.floats(-3.0, 3.0))
-def test_it_brakes_with_four_metres_per_second_squared_at_any_speed(speed, heading):
-    env = _open_field()
-    qvel = np.zeros(9)
-    qvel[0] = speed
-    env.set_state(np.array([0.0, 0.0, heading, *[FAR] * 6]), qvel)
+def test_it_brakes_with_four_metres_per_second_squared_at_any_speed(env):
     env.frame_skip = 1
-    before = speed
-    while before > 0.0:
-        env.step(push(-1.0))
-        now = env.agent_velocity[0]
-        assert (before - now) / 0.01 >= 4.0 - 1e-9
-        before = now
-    assert env.agent_position[0] <= speed**2 / 8.0
+    for speed, heading in ((0.05, 3.0), (0.8, -1.0), (2.0, 0.5)):
+        start(env, pillars=[[FAR, FAR]] * 4)
+        qvel = np.zeros(9)
+        qvel[0] = before = speed
+        env.set_state(np.array([0.0, 0.0, heading, *[FAR] * 6]), qvel)
+        while before > 0.0:
+            env.step(push(-1.0))
+            now = env.agent_velocity[0]
+            assert (before - now) / 0.01 >= 4.0 - 1e-9
+            before = now
+        assert env.agent_position[0] <= speed**2 / 8.0
 
 
-_KEPT = {}
-
-
-def _open_field():
-    """One env for all of hypothesis's examples, far from everything."""
-    if not _KEPT:
-        _KEPT["env"] = gym.make("OccludedCrossing-v0").unwrapped
-    env = _KEPT["env"]
-    start(env, pillars=[[FAR, FAR]] * 4)
-    return env
-
-
-@pytest.mark.parametrize("angle", np.linspace(0.0, 2.0 * np.pi, 9)[:-1] + 0.2)
+@pytest.mark.parametrize("angle", [0.2, 1.8, 4.1])
 def test_pillars_are_solid_and_frictionless(env, angle):
     """Run into one at the largest speed and on with full force, from all sides; then past it, off its centre."""
     along = np.array([math.cos(angle), math.sin(angle)])
@@ -103,7 +100,7 @@ def test_pillars_are_solid_and_frictionless(env, angle):
 def test_camera_and_site_look_ahead_from_their_place_on_the_turning_robot(env):
     rng = np.random.default_rng(1)
     env.reset(seed=1)
-    for _ in range(60):
+    for _ in range(20):
         env.step(rng.uniform(-1.0, 1.0, 3))
         x, y, heading = env.data.qpos[:3]
         ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
@@ -142,14 +139,13 @@ def test_cost_and_collisions_count_every_substep(env):
     other = gym.make("OccludedCrossing-v0").unwrapped
     rng = np.random.default_rng(2)
     costs = between = begun = 0
-    for seed in range(16):
+    for seed in range(10):
         fast = cars_at([-4.0, 25.0], [-9.0, 15.0], [-2.5, 2.0], [6.0, -30.0], [8.0, -10.0])
         layout = {**OPEN, "agent": [0.0, -1.5, 0.0], "cars": fast}
         actions = np.repeat(rng.uniform([-0.4, -0.2, -1.0], [0.4, 0.8, 1.0], (10, 3)), 12, axis=0)
         robots, cars = replayed(other, seed, actions, layout)
         touching = np.linalg.norm(cars - robots[:, None], axis=2) <= 0.6
         _, info = env.reset(seed=seed, options={"layout": layout})
-        assert info["cost"] == info["collisions"] == 0
         was = np.zeros(6, dtype=bool)
         for k, action in enumerate(actions):
             info = env.step(action)[4]
@@ -165,7 +161,7 @@ def test_cost_and_collisions_count_every_substep(env):
             costs += now.any()
             between += now.any() and not now[-1].any()
             begun += count
-    assert between > 3
+    assert between > 2
     assert 10 < begun < costs
 
 
@@ -183,22 +179,21 @@ def test_a_contact_that_lasts_is_one_collision_and_a_start_in_one_counts(env):
 
 def test_the_seed_alone_decides_the_cars_way(env):
     paths, goals = [], []
-    for driver in range(3):
-        rng = np.random.default_rng(driver)
+    for drives in (False, True):
+        rng = np.random.default_rng(1)
         env.reset(seed=3)
         path = []
         for _ in range(400):
-            info = env.step(towards_goal(env, rng, noise=0.2 * driver) if driver else push())[4]
+            info = env.step(towards_goal(env, rng, noise=0.2) if drives else push())[4]
             path.append(np.append(env.car_positions, env.car_velocities))
         paths.append(path)
         goals.append(info["goals_reached"])
-    np.testing.assert_array_equal(paths[1], paths[0])
-    np.testing.assert_array_equal(paths[2], paths[0])
+    np.testing.assert_array_equal(*paths)
     assert goals[0] == 0 < goals[1]
 
 
-def test_cars_start_upstream_and_drive_along_their_lanes(env):
-    speeds, arrivals, driven = [], [], []
+def test_cars_start_upstream_in_their_lanes_at_their_stationary_speed(env):
+    speeds, arrivals = [], []
     for seed in range(40):
         env.reset(seed=seed)
         positions, velocities = env.car_positions, env.car_velocities
@@ -211,19 +206,11 @@ def test_cars_start_upstream_and_drive_along_their_lanes(env):
         assert np.diff(back, axis=1).max() <= 8.0
         speeds.append(velocities[:, 0] * [1, 1, 1, -1, -1, -1])
         arrivals.append(back.ravel())
-        for _ in range(500):
-            env.step(push())
-        driven.append((env.car_positions - positions)[:, 0])
     z = (np.ravel(speeds) - CAR_MEAN_SPEED) / CAR_SPEED_STD
     assert abs(z.mean()) < 4.5 / math.sqrt(240)
     assert abs(z.var() - 1.0) < 4.5 * math.sqrt(2.0 / 240)
     spread = np.histogram(arrivals, bins=[2, 7, 14, 21])[0]
     assert spread.min() > 40  # over the whole episode
-    # Var p(T) = std^2 2 tau (T - tau (1 - exp(-T / tau))) from a stationary start: 1.27 m over 20 s.
-    deviation = CAR_SPEED_STD * math.sqrt(4.0 * (20.0 - 2.0 * (1.0 - math.exp(-10.0))))
-    z = (np.array(driven) - 20.0 * CAR_MEAN_SPEED * np.repeat([1.0, -1.0], 3)) / deviation
-    assert np.abs(z.mean(axis=0)).max() < 4.5 / math.sqrt(40)
-    assert abs(z.var() - 1.0) < 4.5 * math.sqrt(2.0 / 240)
 
 
 def test_the_cars_tracks_are_their_true_states_and_their_true_law(env):
@@ -265,7 +252,7 @@ def test_observation_is_what_it_says_and_knows_no_cars(env):
 
 def test_goals_change_sides_and_pay_for_the_distance(env):
     goals = 0
-    for seed in range(3):
+    for seed in range(2):
         env.reset(seed=seed)
         rng = np.random.default_rng(seed)
         goal = env.goal_position
@@ -285,11 +272,11 @@ def test_goals_change_sides_and_pay_for_the_distance(env):
                 now = math.dist(goal, env.agent_position)
             distance = now
         goals += info["goals_reached"]
-    assert goals >= 6
+    assert goals >= 4
 
 
 def test_layouts_are_sampled_apart(env):
-    for seed in range(100):
+    for seed in range(40):
         env.reset(seed=seed)
         agent, goal, pillars = env.agent_position, env.goal_position, env.pillar_positions
         assert agent[1] == -2.9
@@ -334,10 +321,8 @@ def test_a_given_layout_is_kept_and_the_rest_is_sampled_beside_it(env):
     [
         ({"hazards": []}, UnknownNameError, "agent, goal, cars, pillars"),
         ({"agent": [0, 3.4, 0]}, ConfigurationError, r"\|y\| <= 3.3"),
-        ({"agent": [-3.9, 0, 0]}, ConfigurationError, r"\|x\| <= 3.8"),
         ({"agent": [-2.2, -1.9, 0], "pillars": PILLARS}, ConfigurationError, "in a pillar"),
         ({"cars": [[0, 1]] * 5}, ConfigurationError, "6 cars"),
-        ({"pillars": PILLARS[:3]}, ConfigurationError, "4 pillars"),
         ({"pillars": [[x, -2.9] for x in (-1.5, -0.5, 0.5, 1.5)]}, ConfigurationError, "no room"),
     ],
 )
@@ -346,12 +331,74 @@ def test_bad_layouts_are_refused_with_the_reason(env, layout, error, match):
         env.reset(seed=0, options={"layout": layout})
 
 
-@pytest.mark.parametrize("entry", [0, 2, 5])
-def test_a_state_that_is_not_finite_is_said(env, entry):
+def test_a_state_that_is_not_finite_is_said(env):
     env.reset(seed=9)
     qpos = env.data.qpos.copy()
-    qpos[entry] = np.nan
+    qpos[5] = np.nan
     with warnings.catch_warnings(action="ignore"):
         env.set_state(qpos, env.data.qvel.copy())
         with pytest.raises(SafeWrappersError, match="not finite"):
             env.step(push())
+
+
+# The cars' motion ------------------------------------------------------------------------------------------------
+
+A = np.array([[0.0, 1.0], [0.0, -1.0 / CAR_TIME_CONSTANT_S]])
+Q = np.diag([0.0, CAR_ACCELERATION_NOISE])
+CARS = 4000
+
+
+@given(time_s=st.floats(0.01, 20.0))
+def test_a_step_is_van_loans(time_s):
+    block = expm(np.block([[-A, Q], [np.zeros((2, 2)), A.T]]) * time_s)
+    flow = block[2:, 2:].T
+    np.testing.assert_allclose(transition(time_s), flow, rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(noise_covariance(time_s), flow @ block[:2, 2:], rtol=1e-6, atol=1e-14)
+
+
+def drawn(rng, step_s, steps, times, position, velocity, mean=CAR_MEAN_SPEED):
+    """States of many cars at the times, shape (times, 2, CARS)."""
+    traffic = Traffic(np.full(CARS, mean), step_s, steps)
+    state = np.stack(np.broadcast_arrays(position, velocity, np.zeros(CARS))[:2])
+    found, now = [], 0
+    for time in times:
+        while now < round(time / step_s):
+            path = traffic.drive(rng, *state)
+            state = path[-1]
+            now += steps
+        found.append(state)
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("step_s", "steps", "mean"), [(0.01, 4, 1.0), (0.5, 2, -1.0)])
+def test_means_and_covariances_follow_the_moment_equations(step_s, steps, mean):
+    """4,000 cars from one state, against the numerically integrated moments: every z-score within 4.5."""
+    times, start = [1.0, 4.0, 10.0], np.array([-3.0, mean * 1.4])
+
+    def rates(_, y):
+        p = y[2:].reshape(2, 2)
+        return [*(A @ y[:2] + [0.0, mean / CAR_TIME_CONSTANT_S]), *(A @ p + p @ A.T + Q).ravel()]
+
+    moments = solve_ivp(rates, (0, 10.0), [*start, 0, 0, 0, 0], t_eval=times, rtol=1e-10, atol=1e-12).y.T
+    states = drawn(np.random.default_rng(1), step_s, steps, times, *start, mean)
+    for state, moment in zip(states, moments, strict=True):
+        expected, covariance = moment[:2], moment[2:].reshape(2, 2)
+        z_mean = (state.mean(axis=1) - expected) / np.sqrt(np.diag(covariance) / CARS)
+        sample = np.cov(state)
+        # Standard error of a normal sample's covariance entry: sqrt((P_ii P_jj + P_ij^2) / (n - 1)).
+        variances = np.diag(covariance)
+        error = np.sqrt((np.outer(variances, variances) + covariance**2) / (CARS - 1))
+        assert np.abs(z_mean).max() < 4.5
+        assert np.abs((sample - covariance) / error).max() < 4.5
+
+
+def test_drawing_several_steps_at_once_is_drawing_them_one_by_one():
+    means = np.array([1.0, -1.0, 1.0])
+    position, velocity = np.array([-3.0, 5.0, 0.0]), np.array([0.7, -1.2, 30.0])
+    together = Traffic(means, 0.01, 4).drive(np.random.default_rng(3), position, velocity)
+    assert together.shape == (4, 2, 3)
+    rng, single = np.random.default_rng(3), Traffic(means, 0.01, 1)
+    for state in together:
+        position, velocity = single.drive(rng, position, velocity)[0]
+        np.testing.assert_allclose(state, [position, velocity], rtol=1e-13)
+    assert rng.bit_generator.state["state"] != np.random.default_rng(3).bit_generator.state["state"]

@@ -39,7 +39,7 @@ def test_physics_observations_rewards_and_goals_are_point_mazes():
     goals = set()
     for seed in (3, None):
         (one, _), (other, _) = ours.reset(seed=seed), theirs.reset(seed=seed)
-        for _ in range(600):
+        for _ in range(400):
             for key in one:
                 assert np.array_equal(one[key], other[key]), key
             goals.add(tuple(one["desired_goal"]))
@@ -48,7 +48,7 @@ def test_physics_observations_rewards_and_goals_are_point_mazes():
             one, reward, *ends, _ = ours.step(action.astype(np.float32))
             other, expected, *others, _ = theirs.step(action.astype(np.float32))
             assert (reward, ends) == (expected, others)
-    assert len(goals) > 2
+    assert len(goals) > 1
 
 
 def patrol_path(seed, steps=400, action=(0.0, 0.0)):
@@ -63,7 +63,7 @@ def patrol_path(seed, steps=400, action=(0.0, 0.0)):
 
 def test_a_patrol_keeps_to_its_way_turns_at_its_ends_and_its_velocity_is_that_of_its_position():
     turned = 0
-    for seed in range(4):
+    for seed in range(3):
         where, velocity = patrol_path(seed)
         assert (where[:, 0, 1] == 1.0).all() and (where[:, 1, 1] == -1.0).all()
         assert (np.abs(where[:, :, 0]) <= 1.0).all() and (velocity[:, :, 1] == 0.0).all()
@@ -75,7 +75,7 @@ def test_a_patrol_keeps_to_its_way_turns_at_its_ends_and_its_velocity_is_that_of
         near_an_end = np.abs(where[1:, :, 0][turns]) > 0.99
         assert near_an_end.all() and np.abs(between).max() < 1.5
         turned += int(turns.sum())
-    assert turned > 5
+    assert turned > 3
 
 
 def test_the_seed_alone_decides_the_way_whatever_the_ball_does():
@@ -123,7 +123,7 @@ def test_contact_that_lasts_costs_every_step_and_is_one_collision():
 
 def test_no_patrol_starts_at_the_ball():
     env, gaps = shared(), []
-    for seed in range(200):
+    for seed in range(80):
         _, info = env.reset(seed=seed)
         assert info["cost"] == 0.0 and info["collisions"] == 0
         gaps.append(np.linalg.norm(env.patrol_positions - env.agent_position, axis=1).min())
@@ -141,7 +141,7 @@ def test_walls_hide_patrols():
     env = patrolled(gym.make("PatrolledPointMaze-v0"))
     raw, rng, seen = env.unwrapped, np.random.default_rng(0), []
     env.reset(seed=0)
-    for _ in range(150):
+    for _ in range(120):
         ball = (rng.uniform(-1.3, 1.3), rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.3))
         ball = (1.0 + rng.uniform(-0.3, 0.3), rng.uniform(-1.0, 1.0)) if rng.random() < 0.4 else ball
         place(raw, ball, (0.0, 0.0), rng.uniform(0.0, 4.0, 2), [0.5, 0.5])
@@ -150,7 +150,7 @@ def test_walls_hide_patrols():
             hidden, grazing = blocked(raw.agent_position, patrol)
             assert grazing or sees == (not hidden), (ball, patrol)
             seen.append(bool(sees))
-    assert 50 < sum(seen) < len(seen) - 50
+    assert 40 < sum(seen) < len(seen) - 40
 
 
 def test_protect_knows_it():
@@ -170,34 +170,25 @@ def test_protect_knows_it():
         sw.protect(gym.make("PatrolledPointMaze-v0"), patrols="all")
 
 
-def drive(driver, steps, patrols=None, sigmas=3.0, seed=0):
-    """Collisions with patrols, those in a step not flagged, and steps flagged and changed."""
+def driven(patrols):
+    """Collisions of a driver that seeks patrols, those in a step not flagged, and steps changed, of 1,200."""
     env = patrolled(gym.make("PatrolledPointMaze-v0"))
     if patrols is not None:
-        env = sw.protect(env, patrols=patrols, sigmas=sigmas)
-    raw = env.unwrapped
-    act, total, done, episode = driver(raw, np.random.default_rng(seed)), dict.fromkeys(COUNTED, 0), True, 0
-    for _ in range(steps):
+        env = sw.protect(env, patrols=patrols)
+    act = patrol_seeking(env.unwrapped, np.random.default_rng(0))
+    collisions, unflagged, changed, done = 0, 0, 0, True
+    for step in range(1200):
         if done:
-            env.reset(seed=1000 * seed + episode)
-            episode += 1
+            env.reset(seed=step)
         *_, terminated, truncated, info = env.step(act().astype(np.float32))
         done = terminated or truncated
-        flagged = patrols is not None and any(info[f"cbf/{k}"] for k in ("infeasible", "fallback", "unsafe"))
-        total["collisions"] += info["collisions"]
-        total["unflagged"] += info["collisions"] * (not flagged)
-        total["flagged"] += flagged
-        total["changed"] += patrols is not None and bool(info["cbf/intervened"])
-    return {name: int(count) for name, count in total.items()}
-
-
-COUNTED = ("collisions", "unflagged", "flagged", "changed")
+        flagged = any(info.get(f"cbf/{key}") for key in ("infeasible", "fallback", "unsafe"))
+        collisions += info["collisions"]
+        unflagged += info["collisions"] * (not flagged)
+        changed += bool(info.get("cbf/intervened"))
+    return collisions, unflagged, changed
 
 
 def test_the_estimate_keeps_a_driver_clear_that_collides_without():
-    off, on = drive(patrol_seeking, 1200), drive(patrol_seeking, 1200, "estimated")
-    assert off["collisions"] > 5 and on["unflagged"] == 0 and 5 * on["collisions"] <= off["collisions"], (
-        off,
-        on,
-    )
-    assert on["changed"] > 100
+    (off, _, _), (on, unflagged, changed) = driven(None), driven("estimated")
+    assert off > 5 and unflagged == 0 and 5 * on <= off and changed > 100, (off, on, unflagged, changed)

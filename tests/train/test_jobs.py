@@ -1,16 +1,29 @@
-"""Jobs side by side: what is shown of them, how they fail, and signals."""
+"""Jobs side by side, on this machine and on a Ray cluster: what is shown of them, how they fail, and signals."""
 
+import importlib.util
 import io
 import multiprocessing
 import os
 import signal
+import threading
+import time
+from pathlib import Path
 
 import fake_task
 import pytest
 from rich.console import Console
+from running import episodes, finish
+from stable_baselines3.common.save_util import load_from_zip_file
 
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.train.config import read_config
+from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
 from safe_wrappers.train.processes import Interrupted, Job
-from safe_wrappers.train.processes.parallel import RunsFailedError, _noted_signals, run_jobs
+from safe_wrappers.train.processes.on_ray import check_place
+from safe_wrappers.train.processes.parallel import RunsFailedError, run_jobs
+from safe_wrappers.train.sweep import sweep_experiment
+
+FAKE = Path(__file__).parent / "fake.yaml"
 
 
 def job(name, call, *arguments):
@@ -52,38 +65,148 @@ class Signals(io.StringIO):
 
     def write(self, text):
         if any(f": {word}" in text for word in ("working", "goes on")):
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGHUP)  # ignored
+            for _ in range(2):  # at once: of one sender
+                os.kill(os.getpid(), signal.SIGTERM)
         return super().write(text)
 
 
 def test_a_signal_asks_jobs_to_stop_and_the_rest_do_not_begin():
-    text = Signals()
+    text, before = Signals(), signal.signal(signal.SIGHUP, signal.SIG_IGN)
     jobs = [job("waits", fake_task.until_stopped), job("unwanted", fake_task.fail)]
-    with pytest.raises(Interrupted) as stopped:
-        run_jobs(jobs, 1, Console(file=text, width=100), "Waiting")
+    try:
+        with pytest.raises(Interrupted) as stopped:
+            run_jobs(jobs, 1, Console(file=text, width=100), "Waiting")
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # stays ignored, and the others are put back
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
     assert stopped.value.signum == signal.SIGTERM
     assert "waits: stopped" in text.getvalue()
     assert "unwanted" not in text.getvalue()
 
 
 def test_a_second_signal_waits_for_nobody():
-    text = Signals()
+    text, before = Signals(), signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with pytest.raises(Interrupted):
         run_jobs([job("deaf", fake_task.never_stopped)], 1, Console(file=text, width=100), "Waiting")
     assert "deaf: goes on" in text.getvalue() and "deaf: stopped" not in text.getvalue()
     assert not multiprocessing.active_children()
+    signal.signal(signal.SIGHUP, before)
 
 
-def test_what_is_ignored_stays_ignored_and_all_is_put_back():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+# A Ray cluster of two nodes on this machine ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cluster():
+    """A head that runs no tasks, and two nodes of one CPU."""
+    ray = pytest.importorskip("ray", reason="ray is not installed: pip install 'safe-wrappers[ray]'")
+    from ray.cluster_utils import Cluster
+
+    memory = 100 * 1024**2
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "object_store_memory": memory})
     try:
-        with _noted_signals() as noted:
-            os.kill(os.getpid(), signal.SIGHUP)
-            assert not noted
-            os.kill(os.getpid(), signal.SIGTERM)
-            os.kill(os.getpid(), signal.SIGTERM)  # at once: of one sender
-            assert noted == [signal.SIGTERM]
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+        nodes = [made.add_node(num_cpus=1, object_store_memory=memory) for _ in range(2)]
+        ray.init(address=made.address, log_to_driver=False, logging_level="ERROR")
+        made.wait_for_nodes()
+        yield made, nodes
     finally:
-        signal.signal(signal.SIGHUP, before)
+        ray.shutdown()
+        made.shutdown()
+
+
+def console():
+    return Console(file=io.StringIO(), width=100)
+
+
+def learned(experiment):
+    """All that was learned and what it came to, of every run."""
+    found = {}
+    for arm in experiment.arms:
+        for seed in experiment.seeds:
+            folder = experiment.run_folder(arm, seed)
+            found[arm.name, seed] = (
+                load_from_zip_file(folder / "policy" / "model.zip")[1]["policy"][
+                    "action_net.weight"
+                ].tolist(),
+                (folder / "episodes.csv").read_text(),
+                (folder / "evaluation" / "filter_on.csv").read_text(),
+            )
+    return found
+
+
+@pytest.mark.slow
+def test_a_cluster_learns_what_one_machine_learns_bit_for_bit(cluster, fake_experiment, tmp_path):
+    there = fake_experiment("seeds=[0]", "workers=2", f"output={tmp_path}/there")
+    here = fake_experiment("seeds=[0]", "workers=2", f"output={tmp_path}/here")
+    for experiment, on in ((there, "ray"), (here, None)):
+        train_experiment(experiment, console(), on)
+        evaluate_experiment(experiment, console(), on)
+    assert learned(there) == learned(here)
+
+
+@pytest.mark.slow
+def test_a_node_is_lost_and_its_run_goes_on_from_its_checkpoint_elsewhere(cluster, fake_experiment):
+    made, nodes = cluster
+    experiment = fake_experiment("total_steps=8192", "checkpoint_every=256", "seeds=[0]")
+    folders = [experiment.run_folder(arm, 0) for arm in experiment.arms]
+    kept = {}
+
+    def lose_a_node():
+        end = time.monotonic() + 240.0
+        while not all(list(folder.glob("checkpoints/step_*/state.json")) for folder in folders):
+            if time.monotonic() > end:
+                return  # nothing is kept: the test fails
+            time.sleep(0.1)
+        for folder in folders:
+            at = max(int(path.name[5:]) for path in folder.glob("checkpoints/step_*"))
+            kept[folder] = [row for row in episodes(folder) if row["timesteps"] <= at]
+        made.remove_node(nodes[0], allow_graceful=False)
+
+    loses = threading.Thread(target=lose_a_node, daemon=True)
+    loses.start()
+    train_experiment(experiment, console(), "ray")
+    loses.join()
+    assert set(kept) == set(folders)
+    for folder in folders:
+        assert finish(folder)["timesteps"] == 8192
+        rows = episodes(folder)
+        assert kept[folder] and rows[: len(kept[folder])] == kept[folder]  # nothing done is done again
+        steps = [row["timesteps"] for row in rows]
+        assert steps == sorted(steps)
+        assert sum(row["length"] for row in rows) <= 8192
+
+
+def test_failures_and_messages_come_back(cluster):
+    jobs = [job("good", fake_task.count, 10), job("bad", fake_task.fail)]
+    told = console()
+    with pytest.raises(RunsFailedError, match="bad: too hot"):
+        run_jobs(jobs, 2, told, "Counting", on="ray")
+    assert "good: a line to read" in told.file.getvalue()
+    assert "good: done" in told.file.getvalue()
+
+
+@pytest.mark.slow
+def test_a_sweep_tries_on_a_cluster_what_it_tries_here(cluster, tmp_path):
+    pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")
+    overrides = ["total_steps=128", "seeds=[0]", "evaluation.episodes=1", "workers=2"]
+    rate = {"hyperparameters.learning_rate": {"low": 1e-5, "high": 1e-2, "log": True}}
+    searched = {
+        **read_config(FAKE, overrides),
+        "sweep": {"parameters": rate, "trials": 4, "at_once": 2},
+    }
+    tables = []
+    for name, on in (("there", "ray"), ("here", None)):
+        sweep_experiment({**searched, "output": str(tmp_path / name)}, FAKE, (), console(), on)
+        tables.append((tmp_path / name / "fake" / "sweep" / "sweep.csv").read_text())
+    assert tables[0] == tables[1] and tables[0].count("at cost zero") == 4
+
+
+def test_places_that_cannot_be_are_refused(monkeypatch):
+    for on in ("slurm", "ray:", "rays"):
+        with pytest.raises(ConfigurationError, match="--on: expected ray or ray:ADDRESS"):
+            check_place(on)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'safe-wrappers\[ray\]'"):
+        check_place("ray")

@@ -1,77 +1,92 @@
 """What a config puts around the task and beside the learning: each layer in its place, in training and evaluation."""
 
+import csv
+import io
+import json
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from rich.console import Console
+from running import SILENT, evaluated, finish, trained
 from stable_baselines3.common.callbacks import BaseCallback
-from test_run import Reports
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import safe_wrappers as sw
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.env_checks import wrappers_of
-from safe_wrappers.train.config import EnvConfig, EvaluationConfig, FilterConfig, parse_experiment
+from safe_wrappers.train.config import (
+    EnvConfig,
+    EvaluationConfig,
+    FilterConfig,
+    LearnerConfig,
+    parse_experiment,
+)
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
+from safe_wrappers.train.evaluation.summary import summarize, write_summary
 from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.report import comparison_table, verdict, write_report
 from safe_wrappers.train.run import train_run, training
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
 from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack, make_vec_env
 from safe_wrappers.train.run.training import finished_checkpoint
 
-QUIET = Reports().progress
-OUTAGES = {"mean_between_s": 0.2, "mean_length_s": 0.2}
 LEASE = {"budget": {"closing_speed": 3.0}, "min_lease_s": 0.02}
+POINT = EnvConfig("SafePointGoal1-v0")
 
 
-def parsed(env="SafePointGoal1-v0", output="runs", **arms):
-    common = {"name": "x", "algorithm": "PPO", "total_steps": 10, "seeds": [0], "output": str(output)}
-    return parse_experiment({**common, "env": env, "arms": arms})
-
-
-@pytest.mark.parametrize(
-    ("env", "filter_", "error", "words"),
-    [
-        ("Reacher-v5", {"lease": LEASE}, ConfigurationError, "beside it"),
-        ("Reacher-v5", {"escape": {}}, ConfigurationError, "escape"),
-        ({"id": "Reacher-v5", "observation": "constraints"}, "none", ConfigurationError, "no filter whose"),
-    ],
-)
-def test_what_cannot_be_is_refused_by_name(env, filter_, error, words):
-    with pytest.raises(error, match=words):
-        parsed(env=env, a={"filter": filter_})
-
-
-def test_arguments_that_are_missing_or_wrong_are_named():
-    with pytest.raises(UnknownNameError, match=r"env.faults: unknown name 'Outage'. Did you mean 'Outages'"):
-        make_stack(EnvConfig("Reacher-v5", {}, {"Outage": {}}), FilterConfig())
-    with pytest.raises(ConfigurationError, match=r"env.faults.Outages.*mean_between_s"):
-        make_stack(EnvConfig("Reacher-v5", {}, {"Outages": {}}), FilterConfig())
-    with pytest.raises(ConfigurationError, match=r"env.occlusion.*tracks"):
-        make_stack(EnvConfig("OccludedCrossing-v0", {}, {}, {}), FilterConfig())
-    with pytest.raises(ConfigurationError, match="closing"):
-        lease = {"budget": {"closing": 1.0}}
-        make_stack(EnvConfig("SafePointGoal1-v0"), FilterConfig(protect={}, lease=lease))
-    with pytest.raises(ConfigurationError, match="2 constraints; say which one"):
-        make_stack(EnvConfig("Pusher-v5"), FilterConfig(protect={}, lease=LEASE))
+# Layers ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_stack_has_every_layer_in_its_place():
-    faults = {"Outages": OUTAGES, "RepeatedCommands": {"share": 0.1}}
-    filtered = FilterConfig(protect={}, lease=LEASE, escape={"progress": 0.1})
-    stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), filtered)
+    outages = {"mean_between_s": 0.2, "mean_length_s": 0.2}
+    faults = {"Outages": outages, "RepeatedCommands": {"share": 0.1}}
+    filtered = FilterConfig(protect={"margin": 0.1}, lease=LEASE, escape={"progress": 0.1})
+    learner = LearnerConfig("adaption_penalty", penalty=2.0, per_correction=0.5)
+    stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), filtered, learner)
+    assert (stack.penalty, stack.per_correction) == (2.0, 0.5)
     kinds = [type(wrapper).__name__ for wrapper in wrappers_of(stack)]
-    order = [
-        "RepeatedCommands",
-        "Outages",
-        "RecordInterventions",
-        "StuckEscape",
-        "LeaseExpiry",
-        "CBFActionFilter",
-    ]
+    order = ["AdaptionPenalty", "Monitor", "RepeatedCommands", "Outages", "RecordInterventions"]
+    order += ["StuckEscape", "LeaseExpiry", "CBFActionFilter"]
     assert [kind for kind in kinds if kind in order] == order
     stack.reset(seed=0)
     infos = [stack.step(np.array([0.3, 0.1], np.float32))[4] for _ in range(100)]
     assert any(i["fault/active"] for i in infos) and any(i["lease/remaining_s"] > 0.02 for i in infos)
     assert not any(i["cost"] for i in infos)
+    assert stack.get_wrapper_attr("filter_time_us") > 0
+    (clearance,) = stack.get_wrapper_attr("filter").constraints
+    assert clearance.margin == pytest.approx(
+        sw.protect(gym.make("SafePointGoal1-v0")).constraints[0].margin + 0.1
+    )
+
+
+@pytest.mark.parametrize(
+    ("env", "used", "message"),
+    [
+        (
+            EnvConfig("Reacher-v5", {}, {"Outage": {}}),
+            {},
+            "env.faults: .*'Outage'. Did you mean 'Outages'",
+        ),
+        (EnvConfig("Reacher-v5", {}, {"Outages": {}}), {}, "env.faults.Outages.*mean_between_s"),
+        (EnvConfig("OccludedCrossing-v0", {}, {}, {}), {}, "env.occlusion.*tracks"),
+        (POINT, {"protect": {}, "lease": {"budget": {"closing": 1.0}}}, "closing"),
+        (EnvConfig("Pusher-v5"), {"protect": {}, "lease": LEASE}, "2 constraints; say which one"),
+    ],
+)
+def test_arguments_of_layers_that_are_missing_or_wrong_are_named(env, used, message):
+    with pytest.raises((ConfigurationError, UnknownNameError), match=message):
+        make_stack(env, FilterConfig(**used))
+
+
+def test_a_penalty_needs_a_filter_of_ours():
+    learner = LearnerConfig("adaption_penalty", penalty=1.0)
+    with pytest.raises(ConfigurationError, match="AdaptionPenalty needs a CBFActionFilter inside"):
+        make_stack(EnvConfig("fake_task:FakeGoal-v0"), FilterConfig(factory="fake_task:shield"), learner)
 
 
 @pytest.mark.slow
@@ -95,8 +110,6 @@ def test_the_occlusion_penalty_is_inside_the_filter_and_the_recorder_counts_what
     assert info["interventions"]["return"] > total and "collisions" in info["interventions"]
 
 
-# Observations and held actions ------------------------------------------------------------------------------------
-
 SEEN = {
     "name": "seen",
     "env": {"id": "SafePointGoal1-v0", "observation": "constraints", "kwargs": {"max_episode_steps": 50}},
@@ -110,13 +123,10 @@ SEEN = {
 
 
 def test_all_arms_observe_the_same_features():
-    arms = parse_experiment(SEEN).arms
-    seen = [
-        make_stack(arm.env, used).reset(seed=3)[0] for arm in arms for used in (arm.filter, FilterConfig())
-    ]
     alone = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0"))).reset(seed=3)[0]
-    for observation in seen:
-        np.testing.assert_array_equal(observation, alone)
+    for arm in parse_experiment(SEEN).arms:
+        for used in (arm.filter, FilterConfig()):
+            np.testing.assert_array_equal(make_stack(arm.env, used).reset(seed=3)[0], alone)
 
 
 def test_a_policy_acts_in_evaluation_as_it_was_trained(tmp_path):
@@ -126,8 +136,8 @@ def test_a_policy_acts_in_evaluation_as_it_was_trained(tmp_path):
     envs.reset()
     dones = [envs.step(np.zeros((1, 2), dtype=np.float32))[2][0] for _ in range(13)]
     assert dones[-1] and not any(dones[:-1])  # its steps are the policy's
-    train_run(arm, 0, tmp_path, QUIET)
-    evaluate_run(arm, 0, tmp_path, EvaluationConfig(episodes=2, seed=7), arm.filter, QUIET)
+    train_run(arm, 0, tmp_path, SILENT)
+    evaluate_run(arm, 0, tmp_path, EvaluationConfig(episodes=2, seed=7), arm.filter, SILENT)
     rows = read_rows(evaluation_folder(tmp_path) / "filter_on.csv")
     policy = TrainedPolicy(arm, finished_checkpoint(arm, 0, tmp_path).folder)
     env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=50)))
@@ -149,51 +159,195 @@ def test_a_policy_acts_in_evaluation_as_it_was_trained(tmp_path):
     assert not np.array_equal(policy(observation), first)
 
 
-# A price that changes in training -----------------------------------------------------------------------
+def test_fetch_reach_is_trained_and_evaluated_by_its_plain_id(fake_experiment):
+    pytest.importorskip("gymnasium_robotics")
+    experiment = fake_experiment(
+        "env=FetchReach-v4",
+        "arms={filtered: {filter: {protect: {}}}}",
+        "hyperparameters={n_steps: 50, batch_size: 50, n_epochs: 1}",
+        "total_steps=100",
+        "evaluation.episodes=1",
+    )
+    folder = trained(experiment, 0)
+    (row,) = read_rows(evaluated(experiment, 0) / "filter_on.csv")
+    assert finish(folder)["timesteps"] == 100 and row["length"] == 50
+    model = load_model(latest_checkpoint(folder / "checkpoints").folder, "PPO", "cpu")
+    assert type(model.policy).__name__ == "MultiInputActorCriticPolicy"  # its observations are dicts
+    code = (  # a new process registers the id when it is asked for
+        "import gymnasium as gym; from safe_wrappers.train.config import check_env_id;"
+        "assert 'FetchReach-v4' not in gym.registry; check_env_id('FetchReach-v4');"
+        "assert 'FetchReach-v4' in gym.registry"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+# A price on cost that changes in training -------------------------------------------------------------------------
 
 LIMIT = "arms.unfiltered.learner={cost_limit: 0, multiplier_rate: 0.01}"
 
 
-@pytest.fixture
-def seen(monkeypatch):
-    """By the run's steps: the price on cost."""
+def test_the_price_on_cost_rises_where_there_is_a_limit_and_goes_on_from_a_checkpoint(
+    fake_experiment, monkeypatch
+):
     found = {}
 
     class Watch(BaseCallback):
         def _on_step(self):
-            found[self.num_timesteps] = getattr(self.model, "lagrangian_multiplier", 0.0)
+            found[self.num_timesteps] = self.model.lagrangian_multiplier
             return True
 
     made = training.learner_callbacks
     monkeypatch.setattr(training, "learner_callbacks", lambda arm: [*made(arm), Watch()])
-    return found
-
-
-def run(experiment):
-    arm = experiment.arms[0]
-    train_run(arm, 0, experiment.run_folder(arm, 0), QUIET)
-    return arm, experiment.run_folder(arm, 0)
-
-
-def test_the_price_on_cost_rises_where_there_is_a_limit_and_goes_on_from_a_checkpoint(fake_experiment, seen):
-    run(fake_experiment(LIMIT))
-    stood = seen[max(seen)]
+    trained(fake_experiment(LIMIT, "total_steps=384"), 0)
+    stood = found[max(found)]
     assert stood > 0.0
-    seen.clear()
-    run(fake_experiment(LIMIT, "total_steps=1024"))
-    assert seen[min(seen)] == stood
-    seen.clear()
-    run(fake_experiment("name=without"))
-    assert set(seen.values()) == {0.0}
+    found.clear()
+    trained(fake_experiment(LIMIT, "total_steps=512"), 0)
+    assert found[min(found)] == stood
+
+
+# Who judges a task that reports no cost: nobody, a function, or the filter's own limits ----------------------------
+
+
+def slow_joints(env, mass=1.0, delay_s=0.0):
+    plant = sw.MujocoPlant(delay_s=delay_s)
+    plant.perturb(mass=mass)
+    return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0)], plant=plant, margin=0.5)
+
+
+def slow_pendulum(env, delay_s=0.0):
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.array([x[1], 15 * np.sin(x[0])]),
+        g=lambda x: np.array([[0.0], [3.0]]),
+        state=lambda env: env.state,
+        control_dt=0.05,
+        delay_s=delay_s,
+    )
+    constraint = sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
+    return sw.CBFActionFilter(env, [constraint], plant=plant)
+
+
+class RowsOnly(sw.Constraint):
+    """A constraint without an h."""
+
+    def rows(self):
+        return None
+
+
+def without_h(env):
+    return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0), RowsOnly()])
+
+
+def judged(env_id, factory, **kwargs):
+    judge = FilterConfig(factory=factory if ":" in factory else f"{__name__}:{factory}", kwargs=kwargs)
+    return make_stack(EnvConfig(env_id, judge=judge), FilterConfig())
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("env_id", "factory", "kwargs", "limit"),
     [
-        ("arms.unfiltered.learner={cost_limit: -1}", "cost_limit"),
-        ("arms.unfiltered={algorithm: SAC, learner: {cost_limit: 1}}", "leave normalize out"),
+        # To the limit itself, the filter's margin not taken off; whatever model and delay the filter has.
+        ("Reacher-v5", "slow_joints", {"mass": 2.0, "delay_s": 0.02}, 4.0),
+        ("Pendulum-v1", "slow_pendulum", {}, 2.0),  # through the plant of the user
     ],
 )
-def test_what_would_change_nothing_is_refused(fake_experiment, given, words):
-    with pytest.raises(ConfigurationError, match=words):
-        fake_experiment(given)
+def test_the_filters_limits_judge_the_true_state_in_the_unfiltered_arm(env_id, factory, kwargs, limit):
+    env = judged(env_id, factory, **kwargs)
+    env.reset(seed=0)
+    rng, seen = np.random.default_rng(0), []
+    for _ in range(50):
+        cost = env.step(rng.choice([env.action_space.low, env.action_space.high]))[4][keys.COST]
+        task = env.unwrapped
+        speeds = task.state[1:] if env_id == "Pendulum-v1" else task.data.qvel[:2]
+        assert type(cost) is float and cost == float((np.abs(speeds) > limit + 1e-6).any())
+        seen.append(cost)
+    assert set(seen) == {0.0, 1.0}
+
+
+def test_a_judge_that_reads_the_observation_is_given_it():
+    env = make_stack(EnvConfig("Pendulum-v1", judge=FilterConfig(protect={})), FilterConfig())
+    env.reset(seed=0)
+    for _ in range(25):  # full torque one way takes it beyond the recipe's 6 rad/s
+        observation, *_, info = env.step(np.array([2.0], np.float32))
+        assert info[keys.COST] == float(abs(observation[2]) > 6.0)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "factory", "kwargs", "message"),
+    [
+        ("Reacher-v5", "without_h", {}, r"env.judge: RowsOnly has no h .* cannot judge; use env.cost"),
+        (
+            "Pendulum-v1",
+            "slow_pendulum",
+            {"delay_s": 0.05},
+            "env.judge: the filter's plant looks 0.05 s ahead",
+        ),
+        ("Pendulum-v1", "gymnasium:Wrapper", {}, "env.judge: the filter has no constraints and plant"),
+    ],
+)
+def test_what_cannot_judge_is_refused(env_id, factory, kwargs, message):
+    with pytest.raises(sw.SafeWrappersError, match=message):
+        judged(env_id, factory, **kwargs)
+
+
+def reported(experiment):
+    """An experiment's summary, its table on the terminal, and its page, once it has run."""
+    for at in range(len(experiment.arms)):
+        trained(experiment, at)
+        evaluated(experiment, at)
+    summary = summarize(experiment)
+    write_summary(summary, experiment.folder)
+    console = Console(file=io.StringIO(), width=200)
+    console.print(comparison_table(experiment, summary))
+    return summary, " ".join(console.file.getvalue().split()), write_report(experiment, summary).read_text()
+
+
+SHORT = ("seeds=[0]", "total_steps=128", "evaluation.episodes=2")
+
+
+def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
+    experiment = fake_experiment("env=fake_task:SilentGoal-v0", *SHORT)
+    summary, table, page = reported(experiment)
+    for arm in experiment.arms:
+        folder = experiment.run_folder(arm, 0)
+        for path in (folder / "episodes.csv", folder / "evaluation" / "filter_off.csv"):
+            for row in read_rows(path):
+                assert not {"cost", "cost_substep", "violations", "collisions", "spin_outs"} & row.keys()
+                assert not {"lease_refused", "lease_braking"} & row.keys() and row["length"] == 20
+        events = EventAccumulator(str(folder / "tensorboard"))
+        events.Reload()
+        written = {
+            tag for tag in events.Tags()["scalars"] if tag.startswith(("interventions/", "evaluation"))
+        }
+        assert {"interventions/goals_reached", "evaluation_filter_off/return"} <= written
+        assert not [tag for tag in written if "cost" in tag or "violations" in tag or "lease" in tag]
+        assert ("interventions/infeasible" in written) == (arm.name == "filtered")
+        assert "evaluation_filter_on/infeasible" in written
+        assert (
+            not {f"evaluation_filter_off/{key}" for key in ("infeasible", "unsafe", "correction_mean")}
+            & written
+        )
+    with (experiment.folder / "per_seed.csv").open() as file:
+        assert all(row["violations"] == row["cost"] == "" for row in csv.DictReader(file))
+    text = (experiment.folder / "summary.json").read_text()
+    assert "cost" not in text and "NaN" not in text and json.loads(text)
+    assert "Steps in violation, total │ not judged │ not judged" in table and not summary.judged
+    said = "Violations are not judged: the task reports no cost."
+    assert said in table and said in page and said in " ".join(verdict(experiment, summary))
+    assert "of 40 steps in violation" not in page
+
+
+def test_a_cost_function_judges_training_and_evaluation_as_the_task_would(fake_experiment):
+    only = "arms={unfiltered: {filter: none}}"
+    own = fake_experiment("name=own", only, *SHORT)
+    silent = "{id: 'fake_task:SilentGoal-v0', cost: 'fake_task:in_hazard'}"
+    given = fake_experiment("name=given", f"env={silent}", only, *SHORT)
+    (expected, _, page), (summary, table, own_page) = reported(own), reported(given)
+    names = ("violations", "violations_per_1000", "cost", "return")
+    for condition in ("training", "filter_off"):
+        cell, there = summary.table["unfiltered"][condition], expected.table["unfiltered"][condition]
+        assert [cell[name] for name in names] == [there[name] for name in names]
+    assert sum(row["violations"] for row in summary.per_seed) > 0
+    assert "Cost in substeps" not in table and "not judged" not in table  # it judges the ends of steps
+    label = "Violations are judged by fake_task:in_hazard at the end of each step"
+    assert label in table and label in own_page and label not in page

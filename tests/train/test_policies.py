@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_run import Reports
+from running import SILENT
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, RunStateError
@@ -18,6 +18,7 @@ from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import parse_experiment, stored_arm
 from safe_wrappers.train.files import write_rows
 from safe_wrappers.train.policies import load_policy, write_card
+from safe_wrappers.train.run.data_pickles import read_pickle
 from safe_wrappers.train.run.training import train_run
 
 SHIPPED = Path(__file__).parents[2] / "configs" / "policies"
@@ -48,7 +49,7 @@ def trained(settings, tmp_path):
     """The folder of a finished run."""
     (arm,) = parse_experiment({**REACHER, **settings}).arms
     folder = tmp_path / "seed_0"
-    train_run(arm, 0, folder, Reports().progress)
+    train_run(arm, 0, folder, SILENT)
     return folder
 
 
@@ -63,9 +64,9 @@ def policy(reacher, tmp_path):
     return shutil.copytree(reacher / "policy", tmp_path / "policy")
 
 
-@pytest.mark.parametrize("settings", [PPO, SAC, DQN], ids=["PPO", "SAC", "DQN"])
-def test_its_folder_acts_as_the_run_does(settings, tmp_path):
-    run = trained(settings, tmp_path)
+@pytest.mark.parametrize("settings", [None, SAC, DQN], ids=["PPO", "SAC", "DQN"])
+def test_its_folder_acts_as_the_run_does(settings, reacher, tmp_path):
+    run = reacher if settings is None else trained(settings, tmp_path)
     of_run, of_folder = load_policy(run), load_policy(str(run / "policy"))
     assert of_folder.arm.fingerprint() == of_run.arm.fingerprint()
     env = of_run.make_env()
@@ -81,7 +82,7 @@ def test_it_sees_scaled_observations_and_has_its_filter(reacher):
     env, bare = trained.make_env(), trained.make_env("none")
     assert env.has_wrapper_attr("filter") and not bare.has_wrapper_attr("filter")
     observation, _ = env.reset(seed=0)
-    scaling = trained._normalize
+    scaling = read_pickle(reacher / "policy" / "vecnormalize.pkl")
     seen = np.clip((observation - scaling.obs_rms.mean) / np.sqrt(scaling.obs_rms.var + 1e-8), -10, 10)
     proposed = trained.model.predict(seen, deterministic=True)[0]
     assert np.array_equal(trained(observation), proposed) and np.any(proposed)

@@ -1,36 +1,25 @@
-"""The page: whole, alone, in words for everybody, and of what was measured."""
+"""The report: whole, alone, of what was measured, and in words that say no more than the numbers."""
 
+import base64
+import json
 import re
 from html.parser import HTMLParser
-from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from made_up import SILENT as JUDGES_NOTHING
-from made_up import fill, steps
+from made_up import episode, fill, steps, write_evaluation
+from running import SILENT, trained
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train import videos
-from safe_wrappers.train.config import parse_experiment, read_config
-from safe_wrappers.train.evaluation.evaluate import evaluate_run
-from safe_wrappers.train.evaluation.summary import summarize
-from safe_wrappers.train.report import write_report
-from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.videos import record_videos
-
-HERE = Path(__file__).parent
-SILENT = Progress(lambda steps: None, pytest.fail)
-
-
-def run_all(experiment, evaluate=True):
-    """Trains and evaluates in this process; returns the report's path."""
-    for arm in experiment.arms:
-        for seed in experiment.seeds:
-            folder = experiment.run_folder(arm, seed)
-            train_run(arm, seed, folder, SILENT)
-            if evaluate:
-                evaluate_run(arm, seed, folder, experiment.evaluation, experiment.evaluation_filter, SILENT)
-    return write_report(experiment, summarize(experiment))
+from safe_wrappers.train.evaluation.summary import Curve, summarize
+from safe_wrappers.train.policies import write_card
+from safe_wrappers.train.report import verdict, write_report
+from safe_wrappers.train.report.figures import curve_picture, place_pictures, refusals, telling_pair
 
 
 class Page(HTMLParser):
@@ -67,53 +56,33 @@ def reported(experiment):
     return words(write_report(experiment, summarize(experiment)))
 
 
-@pytest.fixture(scope="module")
-def report(tmp_path_factory):
-    """The fake experiment's page with films; trained once for all tests that only look at it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(HERE))
-        patch.setattr(videos, "run_jobs", lambda jobs, *_: [job.call(*job.arguments, SILENT) for job in jobs])
-        overrides = [f"output={tmp_path_factory.mktemp('report')}", "env=fake_task:FilmedGoal-v0"]
-        experiment = parse_experiment(read_config(HERE / "fake.yaml", overrides))
-        run_all(experiment)
-        record_videos(experiment, None)
-        yield write_report(experiment, summarize(experiment), "safe-wrappers compare a&b.yaml")
+# The page ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_page_is_whole_and_asks_for_nothing_from_outside(report):
-    page = Page(report.read_text())
+def test_the_page_is_whole_alone_and_of_what_was_measured(finished, monkeypatch):
+    experiment = finished()
+    monkeypatch.setattr(
+        videos, "run_jobs", lambda jobs, *_: [job.call(*job.arguments, SILENT) for job in jobs]
+    )
+    videos.record_videos(experiment, None)
+    path = write_report(experiment, summarize(experiment), "safe-wrappers compare a&b.yaml")
+    page = Page(path.read_text())
     links = [attrs[key] for _, attrs in page.tags for key in ("href", "src", "srcset") if key in attrs]
     assert links and all(link.startswith("data:") for link in links)
-    assert not re.search(r"https?://|@import|<script", report.read_text())
-
-
-def test_every_picture_has_words_for_those_who_cannot_see_it(report):
-    alts = [attrs["alt"] for tag, attrs in Page(report.read_text()).tags if tag == "img"]
-    assert len(alts) == 4 + 3  # films, curves
+    assert not re.search(r"https?://|@import|<script", path.read_text())
+    alts = [attrs["alt"] for tag, attrs in page.tags if tag == "img"]  # for those who cannot see
+    assert len(alts) == len(set(alts)) >= 4 + 3  # films, curves
     assert all(len(text) > 30 and text.endswith(".") for text in alts)
-    assert len(set(alts)) == len(alts)
-
-
-def test_what_the_page_says(report):
-    said = words(report)
+    said = words(path)
     for expected in (
         "PPO on fake_task:FilmedGoal-v0, 512 steps, 2 seeds; evaluation on 3 episodes",
-        "With the filter on, films show what it knows",
         "of 1,080 steps",
-        "Trained without the filter, filter on",
-        "Of 1,080 steps with it 0 steps were infeasible and 0 ran the fallback.",
         "mean over 2 seeds [their range, not an interval]",
-        "trained through the filter, learner naive",
         "policies of training seed 0: ",
-        "changed. Shown 0.5 times as fast as real.",
-        "Which constraint refused",
-        "Faint lines are seeds, the band is the range over them.",
         "by the names of Krasowski et al., TMLR 2023: filtered naive",
         "safe-wrappers compare a&b.yaml",
         "learning_rate: 0.001",
-        "Evaluation, filter on",
         "Cost in substeps / episode",
-        "Control steps in which the task itself reports a cost",
     ):
         assert expected in said, expected
     parts = (
@@ -127,19 +96,15 @@ def test_what_the_page_says(report):
     assert order == sorted(order)
 
 
-def test_one_seed_no_interval(fake_experiment):
-    said = words(run_all(fake_experiment("seeds=[0]")))
-    assert "[n/a]" in said and "one seed says little" in said and "over them" not in said
-
-
-def test_training_alone_and_a_task_without_a_filter(fake_experiment):
+def test_training_alone_with_one_seed_and_without_a_filter(fake_experiment):
     experiment = fake_experiment("seeds=[0]", "env=InvertedPendulum-v5", "arms={unfiltered: {filter: none}}")
-    said = words(run_all(experiment, evaluate=False))
-    assert "There is no filter to compare with yet." in said
+    with pytest.raises(RunStateError, match=r"Nothing to report in .* yet; run `safe-wrappers compare`"):
+        reported(experiment)
+    trained(experiment, 0)
+    said = reported(experiment)
+    assert "There is no filter to compare with yet." in said and "[n/a]" in said and "over them" not in said
     assert "Violations are not judged: the task reports no cost." in said and "0 of" not in said
-    assert "Training, all episodes" in said
-    assert "No recorded steps with a filter on." in said
-    assert "No videos. Nothing has been filmed yet" in said
+    assert "No recorded steps with a filter on." in said and "No videos." in said
 
 
 def test_constraints_places_and_what_was_left_out(fake_experiment):
@@ -159,8 +124,6 @@ def test_constraints_places_and_what_was_left_out(fake_experiment):
         "Where violations were: unfiltered, filter off",
         "Where the filter stepped in: filtered",
         "From the first 20,000 steps of each run; 28 more were evaluated but not kept.",
-        "Of 2,400 steps with it 24 steps were infeasible and 24 ran the fallback.",
-        "filtered trained through the filter, learner adaption_penalty",
         "TMLR 2023: filtered adaption_penalty",
     ):
         assert expected in said, expected
@@ -170,17 +133,241 @@ def test_a_task_without_a_cost_shows_none(fake_experiment):
     experiment = fake_experiment()
     fill(experiment, JUDGES_NOTHING | {"return": 20}, JUDGES_NOTHING | {"return": 10})
     said = reported(experiment)
-    assert "Violations are not judged: the task reports no cost." in said
     table = said.partition("In numbers")[2].partition("The same episode")[0]
     assert (
         table.count("not judged") == 1 + 2 * 6
     )  # the note; cost and violations of two arms in three conditions
-    assert "Steps in violation, total not judged not judged" in said.partition("Every metric")[2]
     for left_out in ("cost per episode", "0 of 1,000"):
         assert left_out not in said.partition("How to read this")[0], left_out
 
 
-def test_nothing_to_report_yet(fake_experiment):
+HOSTILE = "\"'><script>alert(1)<b onload=x a='\n```&amp;|# "
+
+
+def renamed(fake_experiment, word):
+    """A comparison that was never run, whose every name and text has the word in it, also if a config refuses it."""
+    experiment = fake_experiment(f"name=of_{len(word)}", "seeds=[0]")
+    for part in (experiment, *experiment.arms, *(arm.env for arm in experiment.arms)):
+        at = "id" if hasattr(part, "id") else "name"
+        object.__setattr__(part, at, f"{getattr(part, at)}{word}")
+    for arm in experiment.arms:
+        for options in (arm.env.kwargs, arm.hyperparameters, arm.filter.kwargs):
+            options[word] = word
+        object.__setattr__(arm.filter, "factory", f"module:{word}")
+        object.__setattr__(arm.env, "cost", f"module:{word}")
+        object.__setattr__(arm, "trackers", [word])
+    log = steps(
+        intervened=np.ones(200, dtype=bool),
+        refused=np.ones((200, 1), dtype=bool),
+        constraint_names=np.array([f"constraint{word}"]),
+        coordinate_names=np.array([f"{axis}{word} (m)" for axis in "xyz"]),
+    )
+    fill(experiment, {"violations": 5, "cost": 50, "return": 20}, {"return": 10}, log, log)
+    start = json.dumps({"from": word, "timesteps": 10})
+    (experiment.run_folder(experiment.arms[1], 0) / "start.json").write_text(start)
+    return experiment
+
+
+def test_no_word_becomes_markup(fake_experiment, tmp_path):
+    pages, markup = [], []
+    for word in (HOSTILE, "plain\n"):  # also in two lines, which are drawn as two
+        experiment = renamed(fake_experiment, word)
+        pages.append(write_report(experiment, summarize(experiment), word).read_text())
+        markup.append({(tag, *sorted(attributes)) for tag, attributes in Page(pages[-1]).tags})
+    assert "script&gt;alert(1)" in pages[0] and markup[0] == markup[1]
+    assert re.findall(r".{,60}<(?:script|b onload)", pages[0]) == []
+
+    policy = tmp_path / "policy"  # and in the card of a policy
+    policy.mkdir()
+    config = {"timesteps": 10, "versions": {HOSTILE: HOSTILE}, "constraints": [HOSTILE]}
+    (policy / "config.json").write_text(json.dumps(config))
+    write_card(renamed(fake_experiment, HOSTILE).arms[1], 0, tmp_path)
+    outside = card = (policy / "README.md").read_text()
+    code = re.findall(r"^`[^`\n]+`", card) + re.findall(r"(?<!`)`[^`\n]+`(?!`)", card)
+    for part in code:
+        outside = outside.replace(part, "")
+    told = outside.splitlines()
+    assert told[0] == "---" == told[3] and "\n# PPO on " in card  # what is between them is JSON
+    assert "<" not in "".join(told[4:]) and "script" in "".join(code)
+    assert "```" not in "".join(told[4:]).replace("```python", "", 1).replace("```", "", 1)
+
+
+# The verdict. Training: 10 episodes of 100 steps for each of 2 seeds; evaluation 2 each: 2,400 steps a side -------
+
+
+@pytest.mark.parametrize(
+    ("off", "on", "sentence"),
+    [
+        (
+            {"violations": 5, "return": 20},
+            {"return": 10},
+            "With the filter none of 2,400 steps was in violation; without it 120 of 2,400 steps (5 %) were.",
+        ),
+        (
+            {"violations": 5},
+            {"violations": 1},
+            "lowered violations without removing them: 24 of 2,400 steps (1 %) with it, 120 of 2,400 steps (5 %)",
+        ),
+        (
+            {"violations": 1},
+            {"violations": 1},
+            "The filter did not lower violations: 24 of 2,400 steps (1 %) with",
+        ),
+        ({"return": 10}, {"return": 12}, "none without it: the task did not put it to the test."),
+        (
+            {"violations": 1},
+            {"intervention_rate": 0.25, "infeasible": 2, "fallback": 3},
+            "The filter changed 25 % of the evaluation steps. Of 2,400 steps with it 48 steps were infeasible and"
+            " 72 ran the fallback.",
+        ),
+        ({"violations": 1}, {"intervention_rate": 1e-5}, "changed less than 0.01 % of the evaluation steps."),
+        (
+            JUDGES_NOTHING,
+            JUDGES_NOTHING | {"unsafe": 3},
+            "72 of 2,400 steps with it began outside the safe set.",
+        ),
+    ],
+)
+def test_the_verdict_says_what_the_numbers_say(fake_experiment, off, on, sentence):
     experiment = fake_experiment()
-    with pytest.raises(RunStateError, match=r"Nothing to report in .* yet; run `safe-wrappers compare`"):
-        write_report(experiment, summarize(experiment))
+    fill(experiment, off, on)
+    said = " ".join(verdict(experiment, summarize(experiment)))
+    assert sentence in said
+    if off is JUDGES_NOTHING:
+        assert said.startswith("Violations are not judged") and "in violation" not in said
+
+
+@pytest.mark.parametrize(
+    ("seeds", "spread", "surely"),
+    [
+        ("[0]", 0.0, "one seed says little"),
+        ("[0, 1]", 0.1, "2 seeds say little"),
+        ("[0, 1, 2]", 0.1, "the intervals over 3 seeds lie apart"),
+        ("[0, 1, 2]", 9.0, "the intervals over 3 seeds overlap"),
+    ],
+)
+def test_the_verdict_names_what_either_policy_returns_and_how_surely(fake_experiment, seeds, spread, surely):
+    experiment = fake_experiment(f"seeds={seeds}")
+    for seed in experiment.seeds:
+        off = spread * (seed - (len(experiment.seeds) - 1) / 2)
+        for arm, condition, returns, violations in (
+            (0, "filter_off", 21.1, 5),
+            (0, "filter_on", 12.7, 0),
+            (1, "filter_off", 9.4, 3),
+            (1, "filter_on", 5.03, 0),
+        ):
+            row = episode(**{"return": returns + off, "violations": violations})
+            write_evaluation(experiment, arm, seed, condition, [row])
+    safety, returns, choice, *_ = verdict(experiment, summarize(experiment))
+    n = len(experiment.seeds)
+    assert f"none of {100 * n} steps was in violation; without it {5 * n} of {100 * n} steps (5 %)" in safety
+    means = [float(each) for each in re.findall(r"filter (?:off|on) (-?[\d.]+) \[", returns)]
+    assert means == pytest.approx([21.1, 12.7, 9.4, 5.03], abs=0.06)
+    assert (
+        f"filter off 9.4 [{'n/a' if n < 2 else ''}" in returns
+        and f"with {3 * n} of {100 * n} steps" in returns
+    )
+    assert f"trained without it returned more ({surely})." in choice
+    assert n > 2 or not re.search("lie apart|overlap|95 %", choice)
+
+
+@pytest.mark.parametrize(
+    ("arms", "compared"),
+    [
+        # Without an arm that has none the filter is switched off; policies of several tasks are all compared.
+        ("{a: {filter: {factory: 'fake_task:shield'}}, b: {filter: {factory: 'fake_task:shield'}}}", 400),
+        ("{a: {filter: none}, b: {filter: none, env: Pendulum-v1}}", 800),
+    ],
+)
+def test_where_policies_are_the_same_their_evaluation_alone_is_compared(fake_experiment, arms, compared):
+    experiment = fake_experiment(f"arms={arms}", "evaluation.filter={factory: 'fake_task:shield'}")
+    fill(experiment, {"violations": 5}, {})
+    said = " ".join(verdict(experiment, summarize(experiment)))
+    assert (
+        f"none of {compared} steps was in violation; without it {compared // 20} of {compared} steps (5 %)"
+        in said
+    )
+
+
+# Pictures: their sentences against planted numbers, and what they are drawn from -----------------------------------
+
+
+def texts(picture):
+    """What is written in a drawing."""
+    kind, data = picture.image.split(",")
+    assert kind == "data:image/svg+xml;base64"
+    root = ElementTree.fromstring(base64.b64decode(data))
+    return {"".join(node.itertext()) for node in root.iter() if node.tag.endswith("text")}
+
+
+def flags(count, *where):
+    chosen = np.zeros(count, dtype=bool)
+    for part in where:
+        chosen[part] = True
+    return chosen
+
+
+def test_which_constraint_refused_and_how_much():
+    refused = np.column_stack([flags(200, slice(0, 20)), flags(200, slice(10, 50)), flags(200)])
+    names = np.array(["JointSpeedLimit", "Clearance<2>", "Workspace"])
+    sizes = np.where(flags(200, slice(0, 50)), np.linspace(0.1, 2.0, 200), 0).astype(np.float32)
+    log = steps(refused=refused, constraint_names=names, intervened=sizes > 0, correction=sizes)
+    said = refusals({"safe": log}).reading
+    assert "of 200 actions refused by Clearance<2> 20 %, JointSpeedLimit 10 %. Never acted: Work" in said
+    half, most = np.median(sizes[:50]), sizes[:50].max()
+    assert f"Half of its 50 corrections were below {half:.3g}, the largest {most:.3g}" in said
+    assert "refused by no constraint. Never acted: Clearance" in refusals({"safe": steps()}).reading
+
+
+def test_where_in_state_space():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-1, 1, (4000, 3)).astype(np.float32)
+    away = np.hypot(places[:, 0] - 0.5, places[:, 2])  # from x = 0.5, speed = 0
+    log = steps(4000, coordinates=places, intervened=away < 0.2)
+    bare = steps(4000, coordinates=places, violated=away < 0.1)
+    hurt, picture = place_pictures("safe", log, "bare", bare)
+    x, _, speed = np.median(places[away < 0.2], axis=0)
+    share = f"{100 * log.intervened.mean():.2g} % of 4,000 steps were changed"
+    assert picture.reading == f"{share}; in the middle of them ({x:.2g}, {speed:.2g})."
+    assert hurt.title == "Where violations were: bare, filter off" and "were in violation" in hurt.reading
+    assert {"x (m)", "speed (m/s)", "share of steps changed"} <= texts(picture)
+    flat = {"coordinates": np.zeros((200, 2)), "coordinate_names": np.array(["x", "y"])}
+    narrow = {"coordinates": np.zeros((200, 1)), "coordinate_names": np.array(["x"])}
+    for log, reading in (
+        (steps(), "Nowhere: none of 200 steps"),
+        (steps(intervened=flags(200, slice(None))), "Everywhere: all of 200 steps"),
+        (steps(intervened=flags(200, 0), **narrow), "fewer than two coordinates"),
+        (steps(intervened=flags(200, 0), **flat), "0.5 % of 200 steps"),
+    ):
+        assert reading in place_pictures("safe", log, "bare", None)[0].reading
+
+
+NOISE = np.random.default_rng(1).normal(size=(3000, 6))
+PLANTED = {
+    "a ring": lambda a, b: np.abs(np.hypot(a, b) - 1.0) < 0.25,
+    "opposite corners": lambda a, b: a * b > 0.5,
+    "a corner": lambda a, b: (a > 1.0) & (b < -0.5),
+}
+
+
+@pytest.mark.parametrize("planted", PLANTED)
+@settings(max_examples=5)
+@given(columns=st.permutations(range(6)))
+def test_the_planted_pair_is_found_wherever_it_is_in_any_unit(planted, columns):
+    a, b = columns[:2]
+    chosen = PLANTED[planted](NOISE[:, a], NOISE[:, b])
+    assert telling_pair(np.exp(NOISE) * 1e4, chosen) == (min(a, b), max(a, b))
+
+
+def test_many_steps_are_thinned_but_rare_flags_are_kept():
+    coordinates = np.random.default_rng(0).normal(size=(60_000, 2))
+    assert telling_pair(coordinates, flags(60_000, 1)) == (0, 1)  # thinning by three would leave none
+
+
+def test_a_learning_curve():
+    seeds = np.array([np.linspace(0, 10, 20), np.linspace(0, 30, 20)])
+    curve = Curve(np.arange(20.0), seeds.mean(axis=0), seeds[0], seeds[1], seeds)
+    picture = curve_picture("Return", "return", {"bare": curve, "safe": None}, ["bare", "safe"])
+    assert picture.reading == "From the first to the last tenth of training: “bare” 0.526 to 19.5."
+    assert {"bare", "training steps", "return"} <= texts(picture)
+    assert curve_picture("Return", "return", {"safe": None}, ["bare", "safe"]).image == ""

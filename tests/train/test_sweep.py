@@ -81,7 +81,7 @@ def test_the_command_searches_and_its_trials_are_ordinary_experiments(tmp_path, 
     assert rows(tmp_path) == found
 
 
-@pytest.mark.parametrize("stop", [1, 4, 6])
+@pytest.mark.parametrize("stop", [4, 6])
 def test_a_sweep_that_was_stopped_tries_the_same_as_one_that_was_not(tmp_path, in_process, stop):
     whole, cut = settings(tmp_path / "a", trials=4, at_once=2), settings(tmp_path / "b", trials=4, at_once=2)
     sweep_experiment(whole, FAKE, (), QUIET)
@@ -104,7 +104,7 @@ def test_a_study_of_other_settings_is_refused_but_for_more_trials(tmp_path, in_p
     assert len(rows(tmp_path)) == 2
 
 
-def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_process, monkeypatch):
+def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_process, monkeypatch, capsys):
     run = sweep.run_jobs
 
     def failing(jobs, *_, **__):
@@ -117,17 +117,14 @@ def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_proces
     sweep_experiment(settings(tmp_path, trials=2, at_once=2), FAKE, (), QUIET)
     assert [row["state"] for row in rows(tmp_path)] == ["fail", "at cost zero"]
     assert rows(tmp_path)[0]["return"] == ""
-
-
-def test_values_that_the_task_refuses_fail_their_trial(tmp_path, in_process, capsys):
-    given = settings(tmp_path, trials=1)
+    # So is one whose values the task refuses.
+    given = settings(tmp_path / "other", trials=1)
     given["env"] = {"id": "fake_task:FakeGoal-v0"}
     given["sweep"]["parameters"] = {"env.kwargs.colour": {"choices": ["red", "blue"]}}
     sweep_experiment(given, FAKE, (), Console())
-    assert [row["state"] for row in rows(tmp_path)] == ["fail"]
+    assert [row["state"] for row in rows(tmp_path / "other")] == ["fail"]
     told = capsys.readouterr().out
-    assert "trial_0000: " in told and "colour" in told
-    assert "none is recommended" in told
+    assert "trial_0000: " in told and "colour" in told and "none is recommended" in told
 
 
 def test_a_task_that_reports_no_cost_is_refused(tmp_path):
@@ -163,16 +160,12 @@ def space(parameters, *overrides, **given):
     return Space({**read_config(FAKE, overrides), "sweep": {"parameters": parameters, **given}})
 
 
-ENVS = {"n_envs": {"low": 1, "high": 2}}
-
-
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
         ({"hyperparameters.gama": {"low": 0.9, "high": 0.99}}, r"gamma"),
         ({"arms.filterd.filter": {"choices": ["none", "protect"]}}, r"Did you mean 'filtered'"),
         ({MARGIN: {"low": 0.1}}, r"expected .*low"),
-        ({MARGIN: {"low": 0, "high": 1, "log": True}}, r"expected .*low"),
         ({MARGIN: {"low": 0, "high": 4, "step": 0}}, r"expected .*low"),
         ({MARGIN: {"low": 0, "high": 4, "step": "x"}}, r"expected .*low"),
         ({"total_steps": {"low": 100, "high": 500}}, r"compared at the same steps"),

@@ -1,53 +1,38 @@
+"""Films: of the episode that was evaluated, evenly, as fast as they say, with robot and filter in sight."""
+
 import io
 import os
-import shutil
+from types import SimpleNamespace
 
+import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
+from running import SILENT, evaluated, trained
 
+import safe_wrappers  # noqa: F401  (registers its envs)
+from safe_wrappers import info as keys
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train import videos
-from safe_wrappers.train.evaluation.evaluate import (
-    evaluate_run,
-    evaluated_steps,
-    evaluation_folder,
-    shown_episode,
-)
+from safe_wrappers.train.evaluation.evaluate import evaluated_steps, evaluation_folder, shown_episode
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.processes.parallel import RunsFailedError
-from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.videos import HEIGHT, load_video, record_videos, video_path
-
-SILENT = Progress(lambda steps: None, pytest.fail)
-ENV = "env=fake_task:FilmedGoal-v0"
+from safe_wrappers.train.videos import HEIGHT, STRIP, WIDTH, film_episode, for_film, load_video, video_path
+from safe_wrappers.wrappers.safety_overlay import find_renderer
 
 
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory):
-    """Where the experiment without overrides is kept, once it has been trained."""
-    return tmp_path_factory.mktemp("evaluated") / "experiment"
-
-
-@pytest.fixture
-def evaluated(fake_experiment, kept):
-    """The fake experiment with a task that draws frames, trained and evaluated, one seed."""
-
-    def make(*overrides):
-        experiment = fake_experiment(ENV, "seeds=[0]", "normalize.observation=false", *overrides)
-        if not overrides and kept.exists():
-            shutil.copytree(kept, experiment.folder)
-            return experiment
-        for arm in experiment.arms:
-            folder = experiment.run_folder(arm, 0)
-            train_run(arm, 0, folder, SILENT)
-            evaluate_run(arm, 0, folder, experiment.evaluation, experiment.evaluation_filter, SILENT)
-        if not overrides:
-            shutil.copytree(experiment.folder, kept)
-        return experiment
-
-    return make
+def frames_of(data):
+    """A film's frames and how long each is shown, ms."""
+    picture = Image.open(io.BytesIO(data))
+    frames, durations = [], []
+    for at in range(picture.n_frames):
+        picture.seek(at)
+        picture.load()
+        frames.append(np.asarray(picture.convert("RGB"), dtype=int))
+        durations.append(picture.info["duration"])
+    return frames, durations
 
 
 @pytest.fixture
@@ -61,53 +46,49 @@ def inline(monkeypatch):
             job.call(*job.arguments, SILENT)
 
     monkeypatch.setattr(videos, "run_jobs", run)
+    monkeypatch.setenv("MUJOCO_GL", "disabled")  # the task paints its frames blue under EGL
     return names
 
 
 def said(experiment):
     console = Console(file=io.StringIO(), width=400)
-    record_videos(experiment, console)
+    videos.record_videos(experiment, console)
     return console.file.getvalue()
 
 
-def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(evaluated, inline, monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "disabled")  # the task paints its frames blue under EGL
-    experiment = evaluated("arms.filtered.filter.kwargs.margin=0.6")  # so wide that it acts at once
+def test_every_arm_is_filmed_in_the_same_episode_once_and_again_for_another(finished, inline, monkeypatch):
+    def fake_filter(env):
+        return next((inner for inner in wrappers_of(env) if type(inner).__name__ == "FakeFilter"), None)
+
+    monkeypatch.setattr(videos, "filter_inside", fake_filter)
+    experiment = finished()
     assert said(experiment) == ""
-    shown = shown_episode(experiment)
-    changed = 0
-    assert sorted(inline) == [
-        f"video {arm} filter {state}" for arm in ("filtered", "unfiltered") for state in ("off", "on")
-    ]
+    names = [f"video {arm} filter {state}" for arm in ("filtered", "unfiltered") for state in ("off", "on")]
+    assert sorted(inline) == names
+    seed, changed = shown_episode(experiment).episode_seed, 0
     for arm in experiment.arms:
+        folder, lower = experiment.run_folder(arm, 0), []
         for condition in ("filter_off", "filter_on"):
-            animation, said_of = load_video(video_path(experiment, arm, condition))
-            rows = read_rows(evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.csv")
-            frames = Image.open(io.BytesIO(animation))
-            log = evaluated_steps(experiment.run_folder(arm, 0), condition)
-            seed = shown.episode_seed
+            animation, told = load_video(video_path(experiment, arm, condition))
+            rows = read_rows(evaluation_folder(folder) / f"{condition}.csv")
+            log = evaluated_steps(folder, condition)
             (row,) = [row for row in rows if row["episode_seed"] == seed]
             # The film is of the very episode that was evaluated.
             count = round(row.get("intervention_rate", 0) * row["length"])
-            told = f"of {row['length']:.0f} steps {row['violations']:.0f} in violation, {count} changed."
-            assert said_of.startswith(f"Episode {seed}, return {row['return']:.1f}: {told}")
-            assert said_of.endswith("Shown 0.5 times as fast as real.")  # 20 steps at 10 a second: 2 s in 4
+            of_steps = f"of {row['length']:.0f} steps {row['violations']:.0f} in violation, {count} changed."
+            assert told.startswith(f"Episode {seed}, return {row['return']:.1f}: {of_steps}")
+            assert told.endswith("Shown 0.5 times as fast as real.")  # 20 steps at 10 a second: 2 s in 4
             changed += count
-            pixels = np.asarray(frames.convert("RGB"), dtype=int)[:HEIGHT]
-            dot = np.argwhere(pixels[..., 0] - pixels[..., 1] > 100).mean(axis=0)[::-1]
+            frames, _ = frames_of(animation)
+            dot = np.argwhere(frames[0][:HEIGHT, :, 0] - frames[0][:HEIGHT, :, 1] > 100).mean(axis=0)[::-1]
             # Where this episode starts, to half a pixel of the task's.
             start = log.coordinates[log.episode_seed == seed][0, :2] * (20, 15) + (40, 30)
             assert dot == pytest.approx((start.astype(int) + 0.5) * HEIGHT / 60, abs=4)
-            assert frames.n_frames == 20
-            frames.seek(19)
-            background = np.asarray(frames.convert("RGB"), dtype=int)[10, 10]
-            assert background == pytest.approx([5 * 19] * 3, abs=6)
+            assert len(frames) == 20 and frames[19][10, 10] == pytest.approx([5 * 19] * 3, abs=6)
+            lower.append(frames[19][290:320, 225:260].mean())
+        assert lower[1] < 0.5 * lower[0]  # what a filter knows is drawn into its film, and into no other
     assert changed > 0
 
-
-def test_a_film_is_made_once_and_again_for_another_episode(evaluated, inline):
-    experiment = evaluated()
-    said(experiment)
     inline.clear()
     said(experiment)
     assert inline == []
@@ -115,65 +96,161 @@ def test_a_film_is_made_once_and_again_for_another_episode(evaluated, inline):
     said(experiment)
     assert inline == ["video unfiltered filter on"]
     inline.clear()
-    said(evaluated("evaluation.seed=500"))
-    assert len(inline) == 4
+    other = finished("evaluation.seed=500", "seeds=[0]")
+    for arm in (0, 1):
+        evaluated(other, arm)
+    said(other)
+    assert sorted(inline) == names
 
-
-def test_a_task_without_frames_is_not_asked_for_any(evaluated, inline):
-    experiment = evaluated("env=fake_task:FakeGoal-v0")
-    line = "fake_task:FakeGoal-v0 draws no frames (it has no render mode rgb_array)."
-    assert said(experiment) == f"No videos: {line}\n"
-    assert inline == []
-
-
-def test_where_mujoco_may_not_draw_one_line_says_so_and_nothing_is_tried(evaluated, inline, monkeypatch):
-    experiment = evaluated()
-    monkeypatch.setattr(videos, "find_renderer", lambda env: object())
-    monkeypatch.delattr("mujoco.GLContext", raising=False)
-    monkeypatch.setenv("MUJOCO_GL", "disabled")
-    assert said(experiment) == "No videos: MUJOCO_GL=disabled has MuJoCo draw nothing.\n"
-    assert inline == []
-
-
-def test_a_crash_while_filming_does_not_fail_the_evaluation(evaluated, inline, monkeypatch):
-    experiment = evaluated()
-    said(experiment)
-
-    def crash(jobs, workers, console, title):
+    def crash(jobs, workers, console, title):  # which does not fail the evaluation
         raise RunsFailedError("Videos: 1 of 4 failed.\nvideo: its process was killed")
 
     monkeypatch.setattr(videos, "run_jobs", crash)
-    again = evaluated("evaluation.seed=500")
-    assert said(again).startswith("No videos: filming failed: video: its process was killed")
+    for arm in (0, 1):
+        evaluated(experiment, arm)
+    assert said(experiment).startswith("No videos: filming failed: video: its process was killed")
     # Films of another episode are gone even where none can be made.
-    assert load_video(video_path(again, again.arms[0], "filter_off")) is None
+    assert load_video(video_path(experiment, experiment.arms[0], "filter_off")) is None
+
+
+def test_where_nothing_can_be_drawn_one_line_says_so_and_nothing_is_tried(finished, inline, monkeypatch):
+    experiment = finished()
+    monkeypatch.setattr(videos, "find_renderer", lambda env: object())
+    monkeypatch.delattr("mujoco.GLContext", raising=False)
+    assert said(experiment) == "No videos: MUJOCO_GL=disabled has MuJoCo draw nothing.\n"
+    monkeypatch.setattr(videos, "make_env", lambda *_: gym.make("fake_task:FakeGoal-v0"))
+    assert "draws no frames (it has no render mode rgb_array)" in said(experiment)
+    assert inline == []
 
 
 @pytest.mark.slow
-def test_in_processes_of_its_own_without_a_screen(evaluated, monkeypatch):
-    experiment = evaluated("arms={unfiltered: {filter: none}}")
+def test_in_processes_of_its_own_without_a_screen(fake_experiment, monkeypatch):
+    experiment = fake_experiment(
+        "env=fake_task:FilmedGoal-v0", "arms={unfiltered: {filter: none}}", "seeds=[0]"
+    )
+    trained(experiment, 0)
+    evaluated(experiment, 0)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     assert "video unfiltered filter off: done" in said(experiment)
     animation, _ = load_video(video_path(experiment, experiment.arms[0], "filter_off"))
-    pixel = np.asarray(Image.open(io.BytesIO(animation)).convert("RGB"))[10, 10]
+    pixel = frames_of(animation)[0][0][10, 10]
     assert pixel[2] > 200 > 50 > pixel[0]  # black, but for the blue of a process without a screen
     assert "MUJOCO_GL" not in os.environ
 
 
-def test_what_a_filter_knows_is_drawn_into_its_film_and_into_no_other(evaluated, inline, monkeypatch):
-    def fake_filter(env):
-        return next((inner for inner in wrappers_of(env) if type(inner).__name__ == "FakeFilter"), None)
+# One film ---------------------------------------------------------------------------------------------------------
 
-    monkeypatch.setattr(videos, "filter_inside", fake_filter)
-    experiment = evaluated()
-    said(experiment)
-    for arm in experiment.arms:
-        lower = {}
-        for condition in ("filter_off", "filter_on"):
-            animation, _ = load_video(video_path(experiment, arm, condition))
-            frames = Image.open(io.BytesIO(animation))
-            frames.seek(19)
-            lower[condition] = np.asarray(frames.convert("RGB"))[
-                290:320, 225:260
-            ].mean()  # of the lowest fifth
-        assert lower["filter_on"] < 0.5 * lower["filter_off"]
+
+class Shot(gym.Env):
+    """Frames as bright as their step's number; the filter acts and the task is hurt at chosen steps."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, steps, changed=(), violated=()):
+        self.steps, self.changed, self.violated = steps, changed, violated
+
+    def reset(self, *, seed=None, options=None):
+        self.at = 0
+        return 0, {}
+
+    def render(self):
+        return np.full((60, 80, 3), self.at % 200, np.uint8)
+
+    def step(self, action):
+        info = {keys.CBF_INTERVENED: self.at in self.changed, keys.COST: float(self.at in self.violated)}
+        info[keys.EPISODE_SUMMARY] = {"return": 1.0, "violations": len(self.violated)}
+        self.at += 1
+        return 0, 0.0, False, self.at >= self.steps, info
+
+
+class Still:
+    """A policy."""
+
+    def reset(self):
+        pass
+
+    def __call__(self, observation):
+        return 0
+
+
+def played(env):
+    """Frames and durations of the env's film, and what is said of it."""
+    data, told = film_episode(Still(), env, 0)
+    return *frames_of(data), told
+
+
+@pytest.mark.parametrize(("steps", "shown_s"), [(60, 6.0), (1000, 10.0), (7, 4.0)])
+def test_the_frames_are_evenly_spaced_not_too_many_and_as_fast_as_is_said(steps, shown_s):
+    frames, durations, told = played(Shot(steps, violated=[501]))
+    assert min(steps, videos.MOST_FRAMES / 2) <= len(frames) <= videos.MOST_FRAMES
+    stride = -(-steps // len(frames))
+    shown = [frame[HEIGHT // 2, WIDTH // 2].mean() for frame in frames]
+    assert shown == pytest.approx([stride * at % 200 for at in range(len(frames))], abs=12)
+    assert sum(durations) == pytest.approx(1000 * shown_s, rel=0.1)
+    assert f"of {steps:,} steps" in told and f"Shown {steps / 10 / shown_s:.1f} times" in told
+    # One step that hurt is seen in a long episode.
+    red = frames[0][HEIGHT + STRIP // 2]
+    assert ((red[:, 0] > 150) & (red[:, 1] < 90)).any() == (steps == 1000)
+
+
+def test_the_strip_shows_when_the_filter_acted_and_where_it_is_now():
+    frames, _, told = played(Shot(80, changed=range(32, 48), violated=[64]))
+    assert frames[0].shape == (HEIGHT + STRIP, WIDTH, 3) and "1 in violation, 16 changed" in told
+
+    def strip(frame, step):
+        red, green, blue = frames[frame][HEIGHT + STRIP // 2, int((step + 0.5) * WIDTH / 80)]
+        if min(red, green, blue) > 200:
+            return "now"
+        return "violated" if red > green + 120 else "changed" if red > blue + 120 else "bare"
+
+    seen = [strip(0, step) for step in (16, 33, 40, 46, 52, 64)]
+    assert seen == ["bare", "changed", "changed", "changed", "bare", "violated"]
+    assert strip(0, 0) == strip(24, 24) == "now" and strip(24, 40) == "changed"
+
+
+# The robot is inside the picture, by MuJoCo's own camera, wherever it goes -----------------------------------------
+
+ROBOTS = {
+    "SafePointGoal1-v0": "agent",
+    "SafeRover-v0": "rover",
+    "PatrolledPointMaze-v0": "particle",
+    "SafeHalfCheetahVelocity-v0": "torso",
+}
+
+
+@pytest.mark.parametrize("env_id", ROBOTS)
+def test_the_robot_stays_in_sight_wherever_it_goes(env_id, monkeypatch):
+    if "Maze" in env_id:
+        pytest.importorskip("gymnasium_robotics")
+    env = for_film(gym.make(env_id, render_mode="rgb_array"))
+    renderer = find_renderer(env)
+    model, data, camera = renderer.model, renderer.data, mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    for key, value in (renderer.default_cam_config or {}).items():
+        if key != "type":
+            setattr(camera, key, value)
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE  # as Gymnasium's renderer has it
+    scene, body, places = mujoco.MjvScene(model, 1000), model.body(ROBOTS[env_id]).id, []
+
+    def render(mode):
+        """Without GL: where the frame has the robot, from -1 to 1 both ways."""
+        whole = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, whole, scene)
+        left, right = scene.camera
+        seen = data.xpos[body] - (np.array(left.pos) + right.pos) / 2.0
+        forward, up = np.array(left.forward), np.array(left.up)
+        height = left.frustum_top / left.frustum_near * (seen @ forward)
+        width = height * renderer.width / renderer.height
+        places.append(np.array([seen @ np.cross(forward, up) / width, seen @ up / height]))
+        return np.zeros((renderer.height, renderer.width, 3), dtype=np.uint8)
+
+    monkeypatch.setattr(renderer, "_get_viewer", lambda mode: SimpleNamespace(cam=camera, scn=scene))
+    monkeypatch.setattr(renderer, "render", render)
+    env.reset(seed=0)
+    start = data.qpos[0]
+    for away in (0.0, 3.0, -8.0, 20.0):
+        data.qpos[0] = start + away
+        mujoco.mj_forward(model, data)
+        env.render()
+        assert (np.abs(places[-1]) < 0.8).all()
+    env.close()

@@ -1,0 +1,188 @@
+"""Checkpoints: whole whatever kills the process, and read without running what a pickle in them says."""
+
+import base64
+import json
+import os
+import pickle
+import shutil
+import signal
+import sys
+import zipfile
+from pathlib import Path
+
+import fake_task
+import pytest
+import torch
+from rich.console import Console
+from running import resumed, trained
+from stable_baselines3 import SAC
+
+from safe_wrappers import info as keys
+from safe_wrappers.errors import RunStateError
+from safe_wrappers.train.acting import enjoy_command
+from safe_wrappers.train.files import only_writer
+from safe_wrappers.train.policies import load_policy
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, save_checkpoint
+from safe_wrappers.train.run.data_pickles import read_pickle
+
+# SIGKILL at every file operation: there is a whole one afterwards, no older one than before -----------------------
+
+OPERATIONS = ("open", "os.", "shutil.")
+"""Audit events of the interpreter: each file operation is announced before it is made."""
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    small = {"buffer_size": 8, "policy_kwargs": {"net_arch": [2]}}
+    return SAC("MlpPolicy", fake_task.FakeGoal(), device="cpu", **small)
+
+
+def save(model, root, step, final=False):
+    model.num_timesteps = step
+    save_checkpoint(root, model, {"timesteps": step, "elapsed_s": 1.0}, final)
+
+
+def killed_at(operation, root, work):
+    """Does work in a forked process, and whether it was killed before its end."""
+    child = os.fork()
+    if child:
+        return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    left = operation
+
+    def kill(event, arguments):
+        nonlocal left
+        if event.startswith(OPERATIONS) and any(str(root) in str(argument) for argument in arguments):
+            left -= 1
+            if left < 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(kill)
+    work()
+    os._exit(0)
+
+
+def reached(root):
+    found = latest_checkpoint(root)
+    if found is None:
+        return 0
+    assert load_model(found.folder, "SAC", "cpu").num_timesteps == found.timesteps
+    return found.timesteps
+
+
+@pytest.mark.parametrize(("before", "final"), [((), False), ((64, 128), False), ((64, 128), True)])
+def test_a_kill_at_any_file_operation_loses_no_checkpoint(tmp_path, model, before, final):
+    whole, step = tmp_path / "whole", 192
+    whole.mkdir()
+    for each in before:
+        save(model, whole / "checkpoints", each)
+    for operation in range(1000):
+        run = tmp_path / "run"
+        shutil.rmtree(run, ignore_errors=True)
+        shutil.copytree(whole, run)
+        root = run / "checkpoints"
+        killed = killed_at(operation, root, lambda root=root: save(model, root, step, final))
+        first = reached(root)
+        assert first in {max(before, default=0), step}
+        if killed and operation % 7 == 3:  # the same command goes on, and is killed, too
+            killed_at(operation, root, lambda root=root: save(model, root, step, final))
+            assert first <= reached(root)
+        save(model, root, step, final)
+        names = sorted(path.name for path in root.iterdir())
+        kept = sorted({*(() if final else before), step})[-2:]
+        assert names == [f"step_{each:012d}" for each in kept]
+        if not killed:
+            break
+    assert operation > 10
+
+
+def test_a_killed_process_holds_no_folder(tmp_path):
+    hold = only_writer(tmp_path)
+    child = os.fork()
+    if not child:
+        hold.__enter__()
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    with only_writer(tmp_path):
+        pass
+
+
+# Pickles that would run something: it is not run, by no way in which they are read --------------------------------
+
+
+class Touch:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def poison(checkpoint, name, payload):
+    """The payload inside of a checkpoint's file."""
+    path = checkpoint / name
+    if name == "model.zip":
+        with zipfile.ZipFile(path) as archive:
+            parts = {part: archive.read(part) for part in archive.namelist()}
+        data = json.loads(parts["data"])
+        data["lr_schedule"][":serialized:"] = base64.b64encode(pickle.dumps(payload)).decode()
+        parts["data"] = json.dumps(data)
+        with zipfile.ZipFile(path, "w") as archive:
+            for part, content in parts.items():
+                archive.writestr(part, content)
+    else:
+        path.write_bytes(pickle.dumps(payload))
+
+
+@pytest.mark.parametrize("name", ["model.zip", "vecnormalize.pkl", "replay_buffer.pkl"])
+def test_a_checkpoint_that_would_run_something_is_refused(finished, fake_experiment, tmp_path, name):
+    experiment, longer = finished(), finished("total_steps=640")  # the run would go on
+    folder = experiment.run_folder(experiment.arms[1], 0)
+    (checkpoint,) = (folder / "checkpoints").iterdir()
+    uses = [
+        lambda: load_policy(folder),
+        lambda: enjoy_command(str(folder), 1, "trained", False, None, Console(quiet=True)),
+        lambda: trained(longer),
+    ]
+    if name == "replay_buffer.pkl":
+        learner = "hyperparameters={learning_starts: 16, batch_size: 8, policy_kwargs: {net_arch: [8]}}"
+        sac = fake_experiment("name=sac", "algorithm=SAC", learner, "total_steps=32")
+        folder = trained(sac)
+        (checkpoint,) = (folder / "checkpoints").iterdir()
+        uses = [lambda: resumed(sac.arms[1], folder)]
+    poison(checkpoint, name, Touch(tmp_path / "made"))
+    for use in uses:
+        with pytest.raises(RunStateError, match=rf"{name}' is refused: its pickle names pathlib\.Path"):
+            use()
+    assert not (tmp_path / "made").exists()
+    pickle.loads(pickle.dumps(Touch(tmp_path / "made")))
+    assert (tmp_path / "made").exists()  # it would have been
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"cposix\nsystem\n.",
+        b"cbuiltins\neval\n.",
+        b"cnumpy\nf2py.os.system\n.",
+        b"\x80\x04\x8c\x05torch\x8c\x17serialization.os.system\x93.",
+        b"cstable_baselines3.common.save_util\nload_from_pkl\n.",
+        b"cstable_baselines3.common.monitor\nResultsWriter\n.",
+        b"csafe_wrappers.train.run.checkpoint\nshutil\n.",
+        b"cnumpy\nload\n.",
+        b"ctorch.storage\n_load_from_bytes\n.",
+        b"cantigravity\nfly\n.",
+    ],
+    ids=str,
+)
+def test_only_data_is_found(tmp_path, text):
+    (tmp_path / "x.pkl").write_bytes(text)
+    with pytest.raises(RunStateError, match=r"x\.pkl' is refused: its pickle names"):
+        read_pickle(tmp_path / "x.pkl")
+
+
+def test_what_nobody_judged_is_found(tmp_path):
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(keys.NOT_JUDGED))
+    assert read_pickle(tmp_path / "x.pkl") is keys.NOT_JUDGED

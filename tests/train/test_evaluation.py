@@ -1,0 +1,293 @@
+"""Paired evaluation: the same episodes for every arm, what is recorded of their steps, and what it comes to."""
+
+import csv
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from made_up import episode, steps, write_evaluation, write_training
+from running import evaluated
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import safe_wrappers as sw
+from safe_wrappers import info as keys
+from safe_wrappers.errors import RunStateError
+from safe_wrappers.train.evaluation import step_log
+from safe_wrappers.train.evaluation.evaluate import compared_pairs, evaluated_steps, shown_episode
+from safe_wrappers.train.evaluation.step_log import StepRecorder, coordinates_of, load_steps, pool, save_steps
+from safe_wrappers.train.evaluation.summary import (
+    Estimate,
+    estimate,
+    interquartile_mean,
+    learning_curve,
+    summarize,
+    write_summary,
+)
+from safe_wrappers.train.files import read_rows
+from safe_wrappers.train.run import Progress
+
+
+def test_every_arm_sees_the_same_episodes_and_the_steps_agree_with_the_table(kept):
+    starts, changed = [], 0
+    for arm in kept.arms:
+        folder = kept.run_folder(arm, 0)
+        for condition in ("filter_off", "filter_on"):
+            rows = read_rows(folder / "evaluation" / f"{condition}.csv")
+            log = evaluated_steps(folder, condition)
+            assert [row["episode_seed"] for row in rows] == [100, 101, 102]
+            assert len(log) == sum(row["length"] for row in rows)
+            assert all(("intervention_rate" in row) == (condition == "filter_on") for row in rows)
+            for row in rows:
+                at = log.episode_seed == row["episode_seed"]
+                assert log.step[at].tolist() == list(range(int(row["length"])))
+                assert log.intervened[at].mean() == pytest.approx(row.get("intervention_rate", 0))
+                assert log.correction[at].mean() == pytest.approx(row.get("correction_mean", 0))
+                assert log.violated[at].sum() == row["violations"]
+                changed += log.intervened[at].sum()
+            assert condition == "filter_off" or not log.violated.any()
+            starts.append(log.coordinates[log.step == 0].tolist())
+    assert starts == [starts[0]] * 4 and len({tuple(start) for start in starts[0]}) == 3
+    assert changed > 0
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    assert "evaluation_filter_off/cost" in events.Tags()["scalars"]
+    (event,) = events.Scalars("evaluation_filter_on/return")
+    assert (event.step, event.value) == (512, pytest.approx(np.mean([row["return"] for row in rows])))
+
+
+def test_it_is_done_once_and_again_when_its_settings_change_or_a_kill_left_a_half(finished):
+    folder = evaluated(finished())
+    before = (folder / "filter_on.csv").stat().st_mtime_ns
+    evaluated(finished())
+    assert (folder / "filter_on.csv").stat().st_mtime_ns == before
+
+    def kill(done):
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # between the conditions
+        evaluated(finished("evaluation.episodes=4"), progress=Progress(kill, pytest.fail))
+    evaluated(finished())  # the first settings again: their rows are gone, so they are made anew
+    assert len(read_rows(folder / "filter_off.csv")) == len(read_rows(folder / "filter_on.csv")) == 3
+    evaluated(finished("evaluation.episodes=4"))
+    assert len(read_rows(folder / "filter_on.csv")) == 4
+    assert json.loads((folder / "evaluation.json").read_text())["settings"]["episodes"] == 4
+
+
+def test_an_untrained_run_is_refused(fake_experiment):
+    with pytest.raises(RunStateError, match="is not trained to its end"):
+        evaluated(fake_experiment())
+
+
+# What is recorded of a step ---------------------------------------------------------------------------------------
+
+
+def record(env, actions, seed=0):
+    """Runs the actions; returns the log and the infos."""
+    recorder, infos = StepRecorder(env), []
+    observation, _ = env.reset(seed=seed)
+    recorder.begin(seed)
+    for action in actions:
+        recorder.before(observation)
+        observation, _, _, _, info = env.step(action)
+        recorder.after(action, info)
+        infos.append(info)
+    return recorder.finish(), infos
+
+
+def test_the_filters_word_is_taken_down_step_by_step(tmp_path):
+    limits = [sw.constraints.JointSpeedLimit(limit=4.0), sw.constraints.JointSpeedLimit(limit=2.0)]
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
+    actions = np.random.default_rng(0).uniform(-1, 1, (40, 2)).astype(np.float32)
+    log, infos = record(sw.RecordInterventions(env), actions)
+    save_steps(tmp_path / "steps.npz", log)
+    log = load_steps(tmp_path / "steps.npz")
+    assert list(log.constraint_names) == env.constraint_names
+    for name, key in (
+        ("intervened", keys.CBF_INTERVENED),
+        ("refused", keys.CBF_REFUSED),
+        ("proposed", keys.PROPOSED_ACTION),
+        ("correction", keys.CBF_CORRECTION),
+    ):
+        assert getattr(log, name) == pytest.approx(np.array([info[key] for info in infos])), name
+    # The tighter limit refuses whatever the wider one refuses, and more.
+    assert log.refused.shape == (40, 2) and log.refused[:, 1].sum() > log.refused[:, 0].sum()
+    assert (log.refused.any(axis=1) == log.intervened).all()
+    # The state in which the step began, not the one after it.
+    assert log.coordinates[0, 4:6] == pytest.approx(env.unwrapped.init_qvel[:2], abs=0.01)
+    assert (tmp_path / "steps.npz").stat().st_size < 20_000
+
+
+def test_without_a_filter_nothing_was_done_and_what_is_beyond_the_cap_is_counted(monkeypatch):
+    monkeypatch.setattr(step_log, "MOST_STEPS", 3)
+    log, _ = record(gym.make("SafePointGoal1-v0"), np.full((5, 2), 0.5, np.float32))
+    assert (len(log), log.left_out) == (3, 2)
+    assert not (log.intervened.any() or log.violated.any()) and (log.proposed == 0.5).all()
+    assert log.refused.shape == (3, 0) and len(log.constraint_names) == 0
+
+
+def test_seeds_are_pooled_and_different_tasks_are_not():
+    one, two = steps(10), steps(20, left_out=5)
+    both = pool([one, two])
+    assert (len(both), both.left_out) == (30, 5)
+    assert both.coordinates[10:] == pytest.approx(two.coordinates)
+    assert pool([]) is None
+    assert pool([one, steps(10, coordinate_names=np.array(["a", "b", "c"]))]) is None
+    assert pool([one, steps(10, constraint_names=np.array(["Other"]))]) is None
+
+
+def test_coordinates_are_joints_by_name_with_the_turns_taken_off():
+    env = gym.make("Reacher-v5")
+    observation, _ = env.reset(seed=0)
+    names, read = coordinates_of(env)
+    positions = ["joint0, position (rad)", "joint1, position (rad)", "target_x, position (m)"]
+    speeds = ["joint0, speed (rad/s)", "joint1, speed (rad/s)", "target_x, speed (m/s)"]
+    assert (names[:3], names[4:7]) == (positions, speeds)
+    qpos = np.array([0.3 + 4 * np.pi, 2.9, 0.1, -0.1])
+    env.unwrapped.set_state(qpos, np.array([7.0, -3.0, 0.0, 0.0]))
+    # joint1 has limits, so its angle stays as it is; joint0 has gone round twice.
+    assert read(observation) == pytest.approx([0.3, 2.9, 0.1, -0.1, 7.0, -3.0, 0.0, 0.0])
+    assert env.unwrapped.data.qpos == pytest.approx(qpos)  # looked at, not touched
+
+    env = gym.make("Ant-v5")  # on a free joint, which is named part by part
+    observation, _ = env.reset(seed=0)
+    names, read = coordinates_of(env)
+    values, data = dict(zip(names, read(observation), strict=True)), env.unwrapped.data
+    assert len(values) == len(data.qpos) + len(data.qvel)
+    assert values["root, position 2"] == data.qpos[2] and values["root, speed 5"] == data.qvel[5]
+    assert values["hip_1, position (rad)"] == data.qpos[7]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "expected"),
+    [
+        ("SafePointGoal1-v0", ["x (m)", "y (m)"]),
+        ("Pendulum-v1", [f"observation {i}" for i in range(3)]),
+        ("FrozenLake-v1", []),
+    ],
+)
+def test_coordinates_of_other_envs_are_a_place_the_observation_or_nothing(env_id, expected):
+    env = gym.make(env_id)
+    observation, _ = env.reset(seed=0)
+    names, read = coordinates_of(env)
+    values = env.unwrapped.agent_position[:2] if "Goal" in env_id else observation if expected else []
+    assert names == expected and read(observation) == pytest.approx(np.asarray(values, float))
+
+
+# What is shown of it ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("returns", "typical"), [((1.0, 9.0, 5.0), 102), ((4.0, 3.0, 1.0, 2.0), 103), ((2.0, 2.0), 100)]
+)
+def test_the_episode_with_the_median_return_is_shown(fake_experiment, returns, typical):
+    rows = [{**episode(), "return": value} for value in returns]
+    experiment = fake_experiment()
+    write_evaluation(experiment, 1, 0, "filter_on", rows)
+    shown = shown_episode(experiment)
+    assert (shown.seed, shown.episode_seed) == (
+        0,
+        typical,
+    ) and "“filtered” with the filter on" in shown.reason
+    bare = fake_experiment("name=bare", "arms={one: {filter: none}, two: {filter: none}}")
+    write_evaluation(bare, 0, 0, "filter_off", rows)
+    assert shown_episode(bare).episode_seed == typical
+
+
+def test_the_headline_compares_arms_of_one_env(fake_experiment):
+    def names(*overrides):
+        pairs = compared_pairs(fake_experiment(*overrides))
+        return [(pair.bare.name, pair.filtered.name) for pair in pairs]
+
+    bare = "arms={one: {filter: none}, two: {filter: none}}"
+    assert names() == [("unfiltered", "filtered")]
+    assert names("arms.unfiltered.env=Pendulum-v1") == [("filtered", "filtered")]
+    assert names(bare) == []
+    assert names(bare, "evaluation.filter={factory: 'fake_task:shield'}") == [("one", "one"), ("two", "two")]
+
+
+# Numbers over seeds -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([3.0], 3.0),
+        ([0.0, 1.0, 8.0], 3.0),  # too few to cut: the plain mean
+        ([-100.0, 1.0, 3.0, 100.0], 2.0),
+        ([0.0] * 2 + [4.0] * 4 + [99.0] * 2, 4.0),
+    ],
+)
+def test_interquartile_mean(values, expected):
+    assert interquartile_mean(values) == pytest.approx(expected)
+    assert interquartile_mean(np.array([values, values]), axis=1) == pytest.approx([expected] * 2)
+
+
+def test_intervals_of_three_seeds_and_more_the_range_of_two_and_none_of_one():
+    assert estimate([3.0]) == Estimate(3.0, None, None, 1) and str(estimate([3.0])) == "3 [n/a]"
+    two = estimate([1.0, 2.0])
+    assert (two.iqm, two.low, two.high) == (1.5, 1.0, 2.0) and str(two) == "1.5 [1, 2]"
+    assert estimate([0.0, 0.0, 0.0]) == Estimate(0.0, 0.0, 0.0, 3)
+    five = estimate([1.0, 2.0, 3.0, 4.0, 5.0])
+    assert five.iqm == 3.0 and 1.0 <= five.low < 3.0 < five.high <= 5.0
+    assert five == estimate([1.0, 2.0, 3.0, 4.0, 5.0])  # not another interval at each look
+
+
+def test_the_interval_covers_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    hits = [i.low <= 0 <= i.high for i in (estimate(list(rng.normal(size=20))) for _ in range(60))]
+    assert 0.82 <= np.mean(hits) <= 1.0
+
+
+def test_summary_of_rows(fake_experiment):
+    experiment = fake_experiment()
+    ten = {"length": 10}
+    for seed, cost in ((0, 2.0), (1, 4.0)):
+        rows = [
+            episode(cost=cost, violations=3, timesteps=10, **ten),
+            episode(violations=1, timesteps=20, **ten),
+        ]
+        write_training(experiment, 0, seed, rows)
+        write_training(experiment, 1, seed, [episode(intervention_rate=0.5, timesteps=10, **ten)])
+    write_evaluation(experiment, 0, 0, "filter_on", [episode(**{"return": 7})])
+    summary = summarize(experiment)
+    bare, filtered = summary.table["unfiltered"], summary.table["filtered"]
+    assert bare["training"]["cost"] == Estimate(1.5, 1.0, 2.0, 2)  # mean over episodes, then over seeds
+    assert bare["training"]["violations"].iqm == 4.0  # a total
+    assert bare["training"]["violations_per_1000"].iqm == 1000.0 * 4 / 20  # over all steps, not over episodes
+    assert not {"intervention_rate", "infeasible_per_1000"} & bare["training"].keys()  # no filter was on
+    assert filtered["training"]["infeasible_per_1000"].iqm == 0.0
+    assert filtered["training"]["intervention_rate"].iqm == 0.5
+    assert bare["filter_on"]["return"] == Estimate(7.0, None, None, 1)
+    assert filtered["filter_on"] == bare["filter_off"] == {}
+
+    write_summary(summary, experiment.folder)
+    with (experiment.folder / "per_seed.csv").open() as file:
+        per_seed = list(csv.DictReader(file))
+    assert [(row["arm"], row["seed"], row["condition"]) for row in per_seed] == [
+        ("unfiltered", "0", "training"),
+        ("unfiltered", "1", "training"),
+        ("unfiltered", "0", "filter_on"),
+        ("filtered", "0", "training"),
+        ("filtered", "1", "training"),
+    ]
+    assert (per_seed[1]["cost"], per_seed[1]["steps"], per_seed[1]["episodes"]) == ("2.0", "20", "2")
+    saved = json.loads((experiment.folder / "summary.json").read_text())["unfiltered"]["training"]["cost"]
+    assert saved == {"iqm": 1.5, "low": 1.0, "high": 2.0, "seeds": 2, "spread": "range"}
+
+
+def test_learning_curve(fake_experiment):
+    experiment = fake_experiment()
+    for seed in (0, 1):
+        rows = [episode(timesteps=10 * t, cost=t + 2 * seed) for t in range(1, 101)]
+        write_training(experiment, 0, seed, rows)
+    curve = learning_curve(experiment, experiment.arms[0], "cost")
+    assert len(curve.steps) == 40 and np.all(np.diff(curve.iqm) > 0)
+    assert curve.iqm[0] == pytest.approx(1.5 + 1)  # episodes 1 and 2 of either seed
+    assert curve.low[-1] == pytest.approx(curve.iqm[-1] - 1)
+    assert curve.high[-1] == pytest.approx(curve.iqm[-1] + 1)
+    # Fewer bins where a seed has few episodes; none at all where a seed has none.
+    write_training(experiment, 0, 1, [episode(timesteps=500, cost=1), episode(timesteps=1000, cost=3)])
+    assert len(learning_curve(experiment, experiment.arms[0], "cost").steps) == 2
+    assert learning_curve(experiment, experiment.arms[1], "cost") is None
