@@ -160,7 +160,7 @@ def reach(body: HeadingDrive, motion: Motion) -> float:
 
 @compiled
 def _gap(disc: Array, x: float, y: float) -> float:
-    return hypot(disc[0] - x, disc[1] - y) - disc[2]
+    return hypot(disc[0] - x, disc[1] - y) - float(disc[2])
 
 
 @compiled
