@@ -5,13 +5,15 @@ after braking, `h = D - v^2 / (2 a_brake)` with approach speed v; state error, h
 inside it. `a_brake` is a *validated lower bound* on the deceleration and is not checked here. Along the line to each
 surface the motion is one-dimensional: the acceleration of the approach is bounded, which is affine in the control.
 
-Speeds, rooms and limits are arrays of one shape, or numbers.
+The functions are compiled.
 """
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from safe_wrappers.control.compiled import compiled
 from safe_wrappers.errors import Array
 
 _RETREAT_RATE: Final = 1.0
@@ -29,18 +31,20 @@ class Nearest(NamedTuple):
     curvature: Array  # of the surface of equal distance through the point, along each coordinate, 1/m, (k, d)
 
 
-def held_stop(speed: Array | float, brake: float, control_dt: float) -> Array:
+@compiled
+def held_stop(speed: float, brake: float, control_dt: float) -> float:
     """The shortest stopping distance, m, if every deceleration is held for a whole control interval.
 
     The chord of `v^2 / (2 a_brake)` between whole multiples of the speed (m/s) that one hold removes.
     """
     loss = brake * control_dt
-    holds = np.maximum(speed, 0.0) / loss
-    whole = np.floor(holds)
-    return np.asarray(loss * control_dt * (0.5 * whole**2 + (whole + 0.5) * (holds - whole)))
+    holds = (0.0 if speed <= 0.0 else speed) / loss
+    whole = float(np.floor(holds))
+    return loss * control_dt * (0.5 * (whole * whole) + (whole + 0.5) * (holds - whole))
 
 
-def held_limit(room: Array | float, speed: Array | float, brake: float, control_dt: float) -> Array:
+@compiled
+def held_limit(room: float, speed: float, brake: float, control_dt: float) -> float:
     """The largest approach acceleration, m/s^2, that may be *held* for a whole control interval.
 
     After it held braking must stop the machine inside the room. It is at least `-brake` wherever the room is not less
@@ -54,17 +58,19 @@ def held_limit(room: Array | float, speed: Array | float, brake: float, control_
     """
     # In units of the speed and the distance of one hold of full braking the condition on the end speed w is
     # w / 2 + (chord of w^2 / 2) <= left, which at whole w = k reads k (k + 1) / 2 and has slope k + 1 above it.
-    left = (room - 0.5 * speed * control_dt) / (brake * control_dt**2)
-    whole = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * np.maximum(left, 0.0)) - 1.0))
-    end = (whole + (left - 0.5 * whole * (whole + 1.0)) / (whole + 1.0)) * brake * control_dt
+    left = (room - 0.5 * speed * control_dt) / (brake * (control_dt * control_dt))
+    if left >= 0.0:
+        whole = float(np.floor(0.5 * (math.sqrt(1.0 + 8.0 * left) - 1.0)))
+        end = (whole + (left - 0.5 * whole * (whole + 1.0)) / (whole + 1.0)) * brake * control_dt
+        return (end - speed) / control_dt
     # Otherwise the motion must reverse inside the hold, before the room ends if there is some.
-    halt = -(np.maximum(speed, 0.0) ** 2) / (2.0 * np.where(room > 0.0, room, 1.0))
-    reversed_ = np.where(
-        room > 0.0, np.minimum(halt, -speed / control_dt), (_RETREAT_RATE * room - speed) / control_dt
-    )
-    return np.asarray(np.where(left >= 0.0, (end - speed) / control_dt, reversed_))
+    if room > 0.0:
+        approach = 0.0 if speed <= 0.0 else speed
+        return min(-(approach * approach) / (2.0 * room), -speed / control_dt)
+    return (_RETREAT_RATE * room - speed) / control_dt
 
 
+@compiled
 def approaches(near: Nearest, velocity: Array, delay_s: float, radius: float) -> tuple[Array, Array]:
     """Clearances, m, and approach speeds, m/s, of a point from k surfaces, shapes (k,).
 
@@ -75,8 +81,8 @@ def approaches(near: Nearest, velocity: Array, delay_s: float, radius: float) ->
             convex).
         radius: Of the machine around the point, m.
     """
-    met = np.einsum("kd,kd->k", near.normal, near.velocity)
-    return near.distance - delay_s * met - radius, met - near.normal @ velocity
+    met = (near.normal * near.velocity).sum(axis=1)
+    return near.distance - delay_s * met - radius, met - (near.normal * velocity).sum(axis=1)
 
 
 class Machine(NamedTuple):
@@ -91,6 +97,7 @@ class Machine(NamedTuple):
     reserve: float  # kept free in the rows, m, but not in the rooms
 
 
+@compiled
 def approach_rows(
     near: Nearest, velocity: Array, drift: Array, effect: Array, machine: Machine
 ) -> tuple[Array, Array, Array]:
@@ -106,15 +113,24 @@ def approach_rows(
     Returns:
         Rooms, m, shape (k,); normals, shape (r, m), and offsets, shape (r,), of the rows.
     """
-    low, high, delay_s, control_dt, radius, braking, reserve = machine
-    clearance, speed = approaches(near, velocity, delay_s, radius)
-    limit = held_limit(clearance - reserve, speed, braking, control_dt) + near.normal @ drift
-    # Who passes by on the outside of a round surface moves away from it.
-    sharpest, sideways = near.curvature.max(axis=1), velocity - near.velocity
-    bend = (near.curvature * sideways**2).sum(axis=1) - sharpest * speed**2
-    limit += np.where((clearance + radius > 0.0) & ~(bend <= 0.0), bend, 0.0)
-    pushes = -near.normal @ effect
-    strongest = np.abs(pushes) @ np.minimum(np.maximum(np.abs(low), np.abs(high)), _UNBOUNDED)
-    # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
-    close = ~(strongest <= limit)
-    return clearance - held_stop(speed, braking, control_dt), pushes[close], limit[close]
+    m = machine
+    clearance, speed = approaches(near, velocity, m.delay_s, m.radius)
+    most = np.minimum(np.maximum(np.abs(m.low), np.abs(m.high)), _UNBOUNDED)
+    normals, offsets, rows = np.empty((len(speed), len(most))), np.empty(len(speed)), 0
+    room = np.empty(len(speed))
+    for i in range(len(speed)):
+        room[i] = clearance[i] - held_stop(speed[i], m.braking, m.control_dt)
+        normal, curvature, sideways = near.normal[i], near.curvature[i], velocity - near.velocity[i]
+        limit = held_limit(clearance[i] - m.reserve, speed[i], m.braking, m.control_dt)
+        limit += (normal * drift).sum()
+        # Who passes by on the outside of a round surface moves away from it.
+        bend = (curvature * sideways * sideways).sum() - curvature.max() * speed[i] * speed[i]
+        if clearance[i] + m.radius > 0.0 and not bend <= 0.0:
+            limit += bend
+        for k in range(len(most)):
+            normals[rows, k] = -(normal * effect[:, k]).sum()
+        # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
+        if not (np.abs(normals[rows]) * most).sum() <= limit:
+            offsets[rows] = limit
+            rows += 1
+    return room, normals[:rows].copy(), offsets[:rows].copy()
