@@ -27,9 +27,9 @@ class HeadingDriveClearance(Detour, Model):
 
     Proved: from a safe state the backup is admitted, for any number of discs, and the discs stay clear at every
     physics substep, while the model is right, the measured position is to within `state_error`, discs stand still and
-    nothing hits the robot. With `uncertainty` every executed control that is not flagged leads clear of the discs for
-    each of the models at its corners, and for the model itself; that there is one at every step, and that models
-    between them are safe, is tested and not proved.
+    nothing hits the robot. Best effort with `uncertainty`: every executed control that is not flagged leads clear of
+    the discs for each of the models at its corners, and for the model itself; that there is one at every step, and
+    that models between them are safe, is tested and not proved.
 
     Args:
         obstacles: `Disc` and `Discs`; they stand still.
@@ -48,7 +48,6 @@ class HeadingDriveClearance(Detour, Model):
     uncertainty: float = 0.0
     detour: bool = False
 
-    promise = "proved"
     smooth: ClassVar[bool] = False  # a speed servo chatters
     rounding = 1e-7  # braking is rounded to the action's dtype
     detour_steps: ClassVar[int] = 50
@@ -59,6 +58,7 @@ class HeadingDriveClearance(Detour, Model):
         self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
         if self.uncertainty >= 1.0:
             raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
+        self.promise = "best effort" if self.uncertainty else "proved"
 
     def setup(self, plant: Plant) -> None:
         hint = "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
