@@ -64,8 +64,8 @@ _MATTER = {
     "filter/bound.py": "Bound._of min/max; Bound._wanted min/max; Bound.slack min/max; Bound.admits not",
     "constraints/detour.py": "Detour.observe arithmetic; Detour._kept_side comparison",
     "control/backup/heading_drive.py": "clearances not; clearances comparison",
-    "constraints/backup/coasting_clearance.py": "CoastingClearance.leaves_clear not;"
-    " CoastingClearance._after min/max; CoastingClearance.h_along not",
+    "constraints/backup/coasting_clearance.py": "CoastingClearance._course comparison;"
+    " CoastingClearance.proposals not; CoastingClearance.h_along not",
     "constraints/backup/escape_clearance.py": "EscapeClearance.clearance not; EscapeClearance.proposals not",
     "constraints/backup/wall_clearance.py": "WallClearance.proposals not; WallClearance.h_along arithmetic",
     "control/backup/point_among_walls.py": "way min/max; distances min/max; slides comparison",

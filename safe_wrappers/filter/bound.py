@@ -16,6 +16,8 @@ from safe_wrappers.plants.plant import Plant
 
 _KEPT = 10
 """Control steps for which slopes are kept where controls are displacements; trajectories check what follows."""
+_LOWEST = -1e300
+"""In the place of an h of minus infinity: what is as low admits nothing, and what is finite is better."""
 
 
 class Bound:
@@ -168,13 +170,13 @@ class Bound:
     def _wanted(self) -> tuple[Array, Array]:
         """From outside: what a trajectory is to leave at least on the way, and at its end, margin taken off."""
         if self._asked is None:
-            spec, least = self.spec, np.minimum(self._value - self.spec.margin, 0.0)
+            spec, least = self.spec, np.clip(self._value - self.spec.margin, _LOWEST, 0.0)
             end = least * np.exp(-spec.horizon * self.plant.control_dt / spec.recovery_s)
             backup = self.backup()
             if backup is not None:
                 left = spec.h_along(self.model.rollout(backup, spec.horizon)) - spec.margin
                 # Where the limit is kept now, not even the backup may lose it.
-                lost = np.where(self._value >= 0.0, -spec.margin, -np.inf)
+                lost = np.where(self._value >= 0.0, -spec.margin, _LOWEST)
                 least = np.minimum(least, np.maximum(left.min(axis=0), lost))
                 end = np.minimum(end, np.maximum(left[-1], lost))
             self._asked = least, end

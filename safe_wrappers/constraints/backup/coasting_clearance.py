@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -21,13 +21,12 @@ from safe_wrappers.errors import (
     positive,
     whole_number,
 )
+from safe_wrappers.filter.constraint import Memory
 from safe_wrappers.plants.mujoco.coasting import Coasting, Course
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
 _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
-_WAY_OUT_M = 1e-3  # gain of clearance that is asked for where zero control leaves less than the margin
-_RECOVERED = 0.5  # share of the best gain of clearance that a control has to reach from inside an obstacle
 # Shares of the drive for the outer and the inner actuator of a detour, as they are tried.
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 
@@ -39,8 +38,7 @@ class CoastingClearance(Detour, Model):
     For machines that friction and damping stop within a few steps, for example on wheels. A control is forecast on
     the machine's model: held for one control interval, then zero. It is admitted if the machine rests within
     `horizon` control intervals, and if on the whole way the body's origin stays out of `keep_out` and the outline out
-    of `untouched`. From inside an obstacle controls are admitted that gain at least half of what full drive gains at
-    best.
+    of `untouched`. The backup is no control; where that is not clear any more, the full drive that ends farthest out.
 
     Proved, for obstacles that stand still, and as far as `margin` covers the forecast's error: from a state whose way
     to rest is clear (h >= 0) there is always an admissible control, and every physics substep is clear.
@@ -76,7 +74,6 @@ class CoastingClearance(Detour, Model):
 
     promise = "proved"
     smooth: ClassVar[bool] = False
-    recovery_s: ClassVar[float] = 0.0  # from inside an obstacle `leaves_clear` says what leads out
     detour_steps: ClassVar[int] = 25
 
     def __post_init__(self) -> None:
@@ -116,45 +113,48 @@ class CoastingClearance(Detour, Model):
         outline = np.reshape(self.outline, (-1, 2))
         self._corners = convex_outline(outline) if len(outline) else outline
         self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
-        self._origin = _Group(self.keep_out, np.zeros((0, 2)))
-        self._whole = _Group(self.untouched, self._corners)
+        self._groups = _Group(self.keep_out, np.zeros((0, 2))), _Group(self.untouched, self._corners)
         self._most, self.max_decrease = self.max_decrease, None  # counted here, not by the filter
         self._first_turns_left: bool | None = None
 
-    def clearance(self) -> Array:
-        """On the way to rest without control, margin not taken off, m, shape (1,); minus infinity without rest.
+    def observe(self, memory: Memory) -> None:
+        super().observe(memory)
+        self._look()
 
-        Where nothing is forecast, a lower bound: the present clearance less the way that the speed may add.
-        """
+    def _look(self) -> None:
+        """See which discs may come into play, whatever is done."""
         here = self.coasting.start()
         self._here, self._ahead = here.places[0], here.ahead[0]
-        way, rolls = math.inf, 0.0
+        self._within, self._rolls = math.inf, 0.0
         if self._most is not None:
             added = self.max_decrease_per_speed * self.coasting.speed(self._radius)
-            way = self._most + added
-            rolls = added if self.max_decrease_per_speed else way
-        room = self.margin + way
-        self._least = min(group.keep(self.plant, here, room) for group in (self._origin, self._whole))
-        self._within = way
-        self._known: dict[bytes, _Outcome] = {}
-        if self._origin.near or self._whole.near:
-            return np.array([min(self._least, self._after(self._still).least)])
-        return np.array([self._least - rolls])
+            self._within = self._most + added
+            self._rolls = added if self.max_decrease_per_speed else self._within
+        room = self.margin + self._within
+        self._least = min(group.keep(self.plant, here, room) for group in self._groups)
+        self._near = any(group.near for group in self._groups)
+        self._known: dict[bytes, Course] = {}
 
     def nearest(self, neighbours: int) -> Array:
-        discs = np.concatenate([self._origin.discs, self._whole.discs])
+        discs = np.concatenate([group.discs for group in self._groups])
         (x, y), (ahead_x, ahead_y) = self._here, self._ahead
         vx, vy = self.coasting.velocity()
         return nearest_discs(discs, x, y, math.atan2(ahead_y, ahead_x), vx, vy, neighbours)
 
-    def _after(self, control: Array) -> "_Outcome":
-        """The outcome of a control, forecast once per observation."""
+    def rollout(self, control: Array | None, horizon: int = 1) -> "Way":
+        """A control held for one control interval, then none until rest; of None the way to rest from here.
+
+        Each course is forecast once per observation, and only where a disc may come into play.
+        """
+        return Way(control, self._course(self._still if control is None else control) if self._near else None)
+
+    def _course(self, control: Array) -> Course:
         low, high = self.plant.acting_range
         acting = np.minimum(np.maximum(control, low), high) + 0.0  # no -0.0: its bytes differ
         key = acting.tobytes()
         if key not in self._known:
             course = self.coasting.run(acting, self.horizon, self._radius)
-            outcome, fallen = self._outcome(course)
+            fallen = max(group.fallen(course) for group in self._groups)
             if fallen > self._within + _SAME_M:
                 warnings.warn(
                     f"CoastingClearance: the clearance fell by {fallen:.3g} m until rest, farther than the declared "
@@ -162,60 +162,25 @@ class CoastingClearance(Detour, Model):
                     stacklevel=2,
                 )
                 self._most = None
-                self.memory["detour"] = 0.0, 0
-                self.clearance()
-                outcome, _ = self._outcome(course)
-            self._known[key] = outcome
+                self._look()
+            self._known[key] = course
         return self._known[key]
 
-    def _outcome(self, course: Course) -> tuple["_Outcome", float]:
-        """What a course leads to, and by how much a clearance falls on it, m."""
-        least, end, fallen = zip(*(group.along(course) for group in (self._origin, self._whole)), strict=True)
-        (ax, ay), (bx, by) = course.ahead[0].tolist(), course.ahead[-1].tolist()
-        way, turn = course.places[-1] - self._here, math.atan2(ax * by - ay * bx, ax * bx + ay * by)
-        return _Outcome(min(least) if course.rests else -math.inf, min(end), way, turn), max(fallen)
+    def h_along(self, path: "Way") -> Array:
+        """Clearance of every disc that may come into play, m, shape (instants, k); minus infinity without rest.
 
-    def leaves_clear(self, control: Array) -> bool:
-        """Whether a control leads to rest with the margin kept (or, where rest alone does not, to a way out)."""
-        if not (self._origin.near or self._whole.near):
-            return True  # no disc can come into play, whatever is done
-        if self._least < 0.0:
-            return self._leads_out(control)
-        after = self._after(control)
-        if after.least >= self.margin:
-            return True
-        if after.least < 0.0:
-            return False
-        rest = self._after(self._still)
-        if after is rest:
-            return rest.least >= 0.0
-        # The rollouts' errors have used up the margin: no less than rest leaves on the way, and more at its end.
-        kept = after.least >= max(rest.least - _SAME_M, 0.0) and after.end >= rest.end + _WAY_OUT_M
-        return rest.least < self.margin and kept
-
-    def _leads_out(self, control: Array) -> bool:
-        best = max(self._after(drive).end for drive in self._drives())
-        gain = best - self._least
-        return gain > 0.0 and self._after(control).end - self._least >= _RECOVERED * gain
-
-    def _drives(self) -> list[Array]:
-        """Full control of all actuators together and of each alone, both ways."""
-        low, high = self.plant.acting_range
-        return [high, low, *(np.where(one, end, 0.0) for one in np.eye(low.size) for end in (low, high))]
-
-    def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
-        """The state now and the control: its course is forecast where `h_along` needs it, once per observation."""
-        return Trajectory(control, self.plant.state[None])
-
-    def h_along(self, path: Trajectory) -> Array:
-        """The least clearance on the way, from inside an obstacle that at its end, m; infinite where none is near."""
+        Where none may, that of the nearest one now, less the way that the speed may add.
+        """
+        if path.course is None:
+            return np.array([[self._least - self._rolls]]) if path.control is None else np.zeros((1, 0))
+        left = np.concatenate([group.along(path.course) for group in self._groups], axis=1)
         if path.control is None:
-            return self.clearance()[None]
-        admitted, least = self.leaves_clear(path.control), math.inf
-        if self._origin.near or self._whole.near:
-            after = self._after(path.control)
-            least = after.end if self._least < 0.0 else after.least
-        return np.array([[max(least, self.margin) if admitted else min(least, self.margin - _SAME_M)]])
+            left = np.vstack([np.concatenate([group.now for group in self._groups]), left])
+        return left if path.course.rests else np.full_like(left, -np.inf)
+
+    def _end(self, control: Array) -> float:
+        """The least clearance at the end, m."""
+        return float(self.h_along(self.rollout(control))[-1].min(initial=np.inf))
 
     def points(self, path: Trajectory) -> Array:
         """The way of the origin until rest without control, m, shape (instants, 1, 2)."""
@@ -223,11 +188,17 @@ class CoastingClearance(Detour, Model):
         return np.concatenate([self._here[None], course.places])[:, None]
 
     def proposals(self, control: Array | None) -> list[Array]:
-        """What to try for a refused control: ways around, less of the same, none. The backup is no control at all."""
+        """What to try for a refused control: ways around, less of the same, none.
+
+        The backup is no control at all; where that is not clear, what ends farthest out: full control of all
+        actuators together or of one, either way.
+        """
         if control is None:
+            if self._near and self.h_along(self.rollout(None)).min() < 0.0:
+                low, high = self.plant.acting_range
+                ones = [np.where(one, end, 0.0) for one in np.eye(low.size) for end in (low, high)]
+                return sorted([self._still, high, low, *ones], key=lambda u: -self._end(u))[:1]
             return [self._still]
-        if self._least < 0.0:
-            return sorted(self._drives(), key=lambda u: -self._after(u).end)[:1]
         acting = np.clip(control, *self.plant.acting_range)
         around = self._around(acting) if self.detour and acting.size == 2 else []
         return [*around, 0.5 * acting, self._still]
@@ -239,8 +210,8 @@ class CoastingClearance(Detour, Model):
             return []  # turning on the spot, or no drive at all
 
         def beside_the_nearest() -> float:
-            way = self._after(acting).way
-            group = min((g for g in (self._origin, self._whole) if g.near), key=lambda g: g.now.min())
+            way = self._course(acting).places[-1] - self._here
+            group = min((g for g in self._groups if g.near), key=lambda g: g.now.min())
             x, y = group.nearest() - self._here
             # What is to the left of the way is passed on its right.
             return -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
@@ -248,20 +219,25 @@ class CoastingClearance(Detour, Model):
         side = self._kept_side() or beside_the_nearest()
         self._keep_side(side)
         if self._first_turns_left is None:
-            first, second = (self._after(u).turn for u in (np.array([drive, 0.0]), np.array([0.0, drive])))
+            first, second = (_turn(self._course(drive * one)) for one in np.eye(2))
             self._first_turns_left = (first - second) * drive > 0.0
         pairs = np.array(_AROUND) * drive
         outer_is_first = self._first_turns_left == (side * drive > 0.0)
         return list(pairs if outer_is_first else pairs[:, ::-1])
 
 
-class _Outcome(NamedTuple):
-    """What a control leads to."""
+class Way(Trajectory):
+    """A course to rest; None: no disc may come into play on it."""
 
-    least: float  # the least clearance until rest, m; minus infinity without rest
-    end: float  # the clearance at the end, m
-    way: Array  # from here to there, shape (2,), m
-    turn: float  # how far it turns on the way, rad
+    def __init__(self, control: Array | None, course: Course | None) -> None:
+        super().__init__(control, np.empty((0, 2)) if course is None else course.places)
+        self.course = course
+
+
+def _turn(course: Course) -> float:
+    """How far the body turns on its way, rad."""
+    (ax, ay), (bx, by) = course.ahead[0].tolist(), course.ahead[-1].tolist()
+    return math.atan2(ax * by - ay * bx, ax * bx + ay * by)
 
 
 class _Group:
@@ -292,14 +268,15 @@ class _Group:
         self._close, self.now = self.discs[close], now[close]
         return float(now.min(initial=np.inf))
 
-    def along(self, course: Course) -> tuple[float, float, float]:
-        """Along a course: least clearance, that at its end, and the most that one of them fell, m."""
-        if not self.near:
-            return math.inf, math.inf, 0.0
+    def along(self, course: Course) -> Array:
+        """What is left to the close discs along a course, m, shape (instants, close ones)."""
         # Contiguous as at rest: for another layout the function is compiled once more.
         places = np.ascontiguousarray(course.places)
-        left = clearances_on_a_course(self._outline, places, course.ahead, self._close)
-        return float(left.min()), float(left[-1].min()), float((self.now - left.min(axis=0)).max())
+        return clearances_on_a_course(self._outline, places, course.ahead, self._close)
+
+    def fallen(self, course: Course) -> float:
+        """The most that the clearance of one of them falls on a course, m."""
+        return float((self.now - self.along(course).min(axis=0)).max(initial=0.0))
 
     def nearest(self) -> Array:
         """Centre of the disc with the least room, shape (2,), m."""
