@@ -5,6 +5,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -168,10 +169,7 @@ class PredictiveShield(Constraint, Model):
             if self.h not in view.info:
                 raise ConfigurationError(f"the env reports no info[{self.h!r}]; it has {sorted(view.info)}")
             return -float(view.info[self.h])
-        return one_number("h", self.h(self._seen(view)))
-
-    def _seen(self, view: View) -> Any:
-        return view if self.sees == "view" else getattr(view, self.sees)
+        return one_number("h", self.h(_seen(self.sees, view)))
 
     def _function(self, backup: Any) -> Callable[[View], Array] | None:
         """What a backup does in a state, a control of shape (m,); None: the action goes on."""
@@ -179,11 +177,12 @@ class PredictiveShield(Constraint, Model):
         if named and backup == "hold":
             return None
         if not callable(backup):
-            constant = plant.control(np.zeros(plant.lower.shape) if named else backup, "the backup")
-            return lambda view: np.asarray(constant)
-        if isinstance(backup, _PolicyBackup):
-            return lambda view: np.asarray(plant.control(backup(view.observation), "the backup"))
-        return lambda view: np.asarray(plant.control(backup(self._seen(view)), "the backup"))
+            return partial(
+                _constant, plant.control(np.zeros(plant.lower.shape) if named else backup, "the backup")
+            )
+        return partial(
+            _asked, plant, backup, "observation" if isinstance(backup, _PolicyBackup) else self.sees
+        )
 
     def _first(self, backup: Callable[[View], Array] | None) -> Array:
         """What a backup would do now, shape (m,)."""
@@ -216,7 +215,7 @@ class PredictiveShield(Constraint, Model):
         """The slack of a control with a backup after it; NaN where an h is."""
         plant, terminal, least = self.plant, self.terminal, float(self._needed.min())
         policy = None if backup is None else lambda view: plant.action(backup(view))
-        until = None if terminal is None else lambda view: bool(terminal(self._seen(view)))
+        until = None if terminal is None else lambda view: bool(terminal(_seen(self.sees, view)))
         try:
             rollout = plant.rollout(control, self.horizon, policy, self._measure, least, until, self._between)
         except NotFiniteError:
@@ -243,6 +242,18 @@ class PredictiveShield(Constraint, Model):
                 f"value must return a number for each of {len(admitted)} actions, got shape {values.shape}"
             )
         return admitted[np.argsort(np.where(np.isnan(values), np.inf, -values), kind="stable")]
+
+
+def _seen(sees: str, view: View) -> Any:
+    return view if sees == "view" else getattr(view, sees)
+
+
+def _constant(control: Array, view: View) -> Array:
+    return np.asarray(control)
+
+
+def _asked(plant: Any, backup: Any, sees: str, view: View) -> Array:
+    return np.asarray(plant.control(backup(_seen(sees, view)), "the backup"))
 
 
 def _checked(backup: Any) -> Any:

@@ -114,7 +114,7 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
         if flag > 0 and share <= _ALLOWANCE:
             return Projection(answer, Status.PROJECTED, missed)
     if flag > 0 and missed < math.inf:
-        return Projection(answer, Status.INFEASIBLE, missed)
+        return Projection(np.where(a.any(axis=0), answer, control), Status.INFEASIBLE, missed)
     return Projection(control, Status.FAILED, violation)
 
 
