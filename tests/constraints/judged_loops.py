@@ -3,28 +3,9 @@
 import gymnasium as gym
 import mujoco
 import numpy as np
-import scenes
+from scenes import Scene
 
 import safe_wrappers as sw
-
-
-class Scene(scenes.Scene):
-    """It resets to the model's own pose; `start` is (qpos, qvel)."""
-
-    start = None
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        mujoco.mj_resetData(self.model, self.data)
-        if self.start is not None:
-            self.data.qpos[:], self.data.qvel[:] = self.start
-        mujoco.mj_forward(self.model, self.data)
-        return np.zeros(1), {}
-
-    def step(self, action):
-        self.data.ctrl[:] = action
-        mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
-        return np.zeros(1), 0.0, False, False, {}
 
 
 def sliders(count=1, actuator="motor", range_="-1 1", **options):

@@ -102,6 +102,17 @@ def test_a_reach_that_is_broken_is_dropped_with_a_warning():
     assert constraint.max_decrease is None
 
 
+def test_a_reach_that_is_broken_from_outside_brings_more_discs_into_play():
+    hazards = [
+        [0.203, 0.0],
+        [-0.2035, 0.0],
+        [0.0, 0.2105],
+    ]  # two inside the margin, one beyond the declared reach
+    _, constraint, _ = bound(hazards, max_decrease=0.001)
+    with pytest.warns(UserWarning, match="farther than the declared max_decrease"):
+        assert [constraint.admits(u) for u in (FULL, NONE)] == [False, True]
+
+
 def test_the_outline_counts_where_it_should():
     """Beside a vase that its front corner would touch, the car may not turn to it; its origin is far enough."""
     vases = [[0.18, 0.16 + 0.1415 + 0.008]]

@@ -46,23 +46,6 @@ SLED = """
 """
 
 
-class Sled(Scene):
-    """A mass on a damped rail."""
-
-    def __init__(self) -> None:
-        super().__init__(SLED, frame_skip=4)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        mujoco.mj_resetData(self.model, self.data)
-        return np.zeros(1), {}
-
-    def step(self, action):
-        self.data.ctrl[:] = action
-        mujoco.mj_step(self.model, self.data, self.frame_skip)
-        return np.zeros(1), 0.0, False, False, {}
-
-
 @dataclass
 class EndOfRail(sw.Constraint, Model):
     """A user's own model: MuJoCo's steps of a damped mass, written down, until it rests."""
@@ -160,7 +143,7 @@ KINDS = {
         cart_before_a_wall, in_the_cart, lambda raw: Reported(lambda info: info["cost"] - 0.5)
     ),
     "a user's own": Kind(
-        lambda: sw.CBFActionFilter(Sled(), [EndOfRail()]),
+        lambda: sw.CBFActionFilter(Scene(SLED, frame_skip=4), [EndOfRail()]),
         on_the_rail,
         lambda raw: Replay(raw, lambda data: float(data.qpos[0]) - END_M - ROUNDING),
     ),

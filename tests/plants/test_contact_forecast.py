@@ -40,16 +40,6 @@ class Legs(Scene):
             self.XML.format(integrator=integrator, cone=cone, condim=condim, more=more, act=act, end=end)
         )
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        mujoco.mj_resetData(self.model, self.data)
-        return np.zeros(1), {}
-
-    def step(self, action):
-        self.data.ctrl[:] = action
-        mujoco.mj_step(self.model, self.data, self.frame_skip)
-        return np.zeros(1), 0.0, False, False, {}
-
 
 def decoded(model, data, contact):
     """The contact's force on its second geom, in the world, from the rows of the solver, N."""

@@ -167,15 +167,17 @@ class CoastingClearance(Detour, Model):
         return self._known[key]
 
     def h_along(self, path: "Way") -> Array:
-        """Clearance of every disc that may come into play, m, shape (instants, k); minus infinity without rest.
+        """Clearance of the nearest disc that may come into play, m, shape (instants, 1); minus infinity without rest.
 
         Where none may, that of the nearest one now, less the way that the speed may add.
         """
         if path.course is None:
             return np.array([[self._least - self._rolls]]) if path.control is None else np.zeros((1, 0))
-        left = np.concatenate([group.along(path.course) for group in self._groups], axis=1)
+        every = np.concatenate([group.along(path.course) for group in self._groups], axis=1)
+        # One number: a `max_decrease` that proves wrong brings more discs into play in the middle of a step.
+        left = every.min(axis=1, keepdims=True)
         if path.control is None:
-            left = np.vstack([np.concatenate([group.now for group in self._groups]), left])
+            left = np.vstack([[[self._least]], left])
         return left if path.course.rests else np.full_like(left, -np.inf)
 
     def _end(self, control: Array) -> float:

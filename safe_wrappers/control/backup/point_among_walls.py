@@ -54,11 +54,8 @@ def way(axes: tuple[DampedAxis, DampedAxis], place: Array, velocity: Array, held
     substeps = axes[0].substeps
     places = np.empty((longest * substeps + 1, 2))
     for i in range(2):
-        axis, x, v = (
-            axes[i],
-            place[i] + 0.0 * velocity[i],
-            velocity[i],
-        )  # the clip makes numbers of what is none
+        # A velocity that is not a number makes the place one, too: the clip would hide it.
+        axis, x, v = axes[i], place[i] + 0.0 * velocity[i], velocity[i]
         places[0, i] = x
         for k in range(longest):
             v = clipped(axis, v)

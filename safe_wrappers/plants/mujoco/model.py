@@ -65,10 +65,8 @@ def frame(
     """Origin of a "body", "site" or "geom", shape (3,), m, and its Jacobian, or by `mj_jacDot` its rate, (3, nv)."""
     i = named(model, kind, name)
     body = i if kind == "body" else int(getattr(model, f"{kind}_bodyid")[i])
-    origin, jacobian = (
-        getattr(data, "xpos" if kind == "body" else f"{kind}_xpos")[i].copy(),
-        np.zeros((3, model.nv)),
-    )
+    origin = getattr(data, "xpos" if kind == "body" else f"{kind}_xpos")[i].copy()
+    jacobian = np.zeros((3, model.nv))
     compute(model, data, jacobian, None, origin, body)
     return origin, jacobian
 
