@@ -13,6 +13,7 @@ pytestmark = pytest.mark.skipif(not IS_COMPILED, reason="nothing is compiled in 
 EPISODE = """
 import sys
 import gymnasium as gym
+import gymnasium_robotics
 import safe_wrappers as sw
 
 def ready():
@@ -38,7 +39,10 @@ def run(script, *arguments, **environment):
     return done.stdout.strip(), done.stderr.strip()
 
 
-@pytest.mark.parametrize("env_id", ["Swimmer-v5", "Reacher-v5", "SafePointGoal1-v0"])
+COMPILED = ("SafePointGoal1-v0", "PointMaze_UMaze-v3", "OccludedCrossing-v0")
+
+
+@pytest.mark.parametrize("env_id", ["Swimmer-v5", "Reacher-v5", *COMPILED])
 def test_no_step_compiles(env_id):
     assert run(EPISODE, env_id)[0] == "True []"
 
