@@ -79,8 +79,7 @@ _MATTER = {
     " ChunkQueue.next comparison; ChunkQueue._sendable not",
 }
 MATTER = [Mutant(file, *one.rsplit(" ", 1)) for file, of in _MATTER.items() for one in of.split("; ")]
-"""What a filter must never get wrong, the first mistake of a kind in a function each; all that was tried by hand
-before is listed in `benchmarks/results/mutants.md`."""
+"""What a filter must never get wrong, the first mistake of a kind in a function each."""
 
 
 def _mistakes(node: Any) -> Iterator[tuple[str, Callable[[], None]]]:
