@@ -3,7 +3,8 @@
 Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1.
 
 An admissible nominal is returned bit for bit. Otherwise daqp answers, and its answer is measured on the rows. Where
-it misses one, daqp solves again with rows that may be violated; what that still violates is infeasible.
+it misses one, daqp solves again in other units, and then with rows that may be violated; what that still violates is
+infeasible.
 """
 
 import functools
@@ -38,7 +39,7 @@ class Status(StrEnum):
     PROJECTED = "projected"
     """`control` is the closest admissible control, residual checked."""
     INFEASIBLE = "infeasible"
-    """No control in the box satisfies everything; of rows, `control` violates them least."""
+    """The solver finds no control in the box that satisfies everything; of rows, `control` violates them least."""
     FAILED = "failed"
     """There is no answer; `control` is only inside the box."""
 
@@ -93,7 +94,7 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
     """`project` for callers that have already checked types, shapes and numbers."""
     u, a, b, lo, hi = _plain(u, a, b, lo, hi)
     control = np.minimum(np.maximum(u, lo), hi)
-    share, violation = _missed(control, u, a, b, lo, hi)
+    share, violation = _missed(control, a, b, lo, hi)
     if share <= 1.0:
         inside = bool((control == u).all())
         return (
@@ -102,15 +103,30 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
             else Projection(control, Status.PROJECTED, violation)
         )
     if violation == math.inf:  # a row that is not finite, or too large to be added up
+        if not ((control >= lo) & (control <= hi)).all():
+            raise ConfigurationError(
+                f"u_nom must be finite, and bounds must not cross; got {u}, {lo} and {hi}"
+            )
         return Projection(control, Status.FAILED, violation)
-    linear, normals, upper, lower, unit = _program(u, a, b, lo, hi)
-    for sense in (0, _SOFTENED):
+    program, hessian = _program(u, a, b, lo, hi), _identity(u.size)
+    for widths, sense in ((False, 0), (True, 0), (False, _SOFTENED)):
+        linear, normals, upper, lower, unit = program
+        weighed = hessian
+        if widths:  # one unit for all leaves little of a box that is narrow beside the others
+            width = np.array(
+                [half or max(abs(v), 1.0) for half, v in zip(map(_half_width, lo, hi), u, strict=True)]
+            )
+            if (width == width[0]).all():
+                continue
+            linear, normals, upper, lower, unit = _program(u / width, a * width, b, lo / width, hi / width)
+            weights = (width / width.max()) ** 2
+            weighed, linear, unit = np.diag(weights), linear * weights, unit * width
         senses = np.zeros(len(upper), np.int32)
         senses[u.size :] = sense
         rows, tolerance = (normals, upper, lower, senses), _SOFT if sense else _ROUNDING
-        found, _, flag, _ = daqp.solve(_identity(u.size), linear, *rows, primal_tol=tolerance, rho_soft=_SOFT)
+        found, _, flag, _ = daqp.solve(weighed, linear, *rows, primal_tol=tolerance, rho_soft=_SOFT)
         answer = np.minimum(np.maximum(found * unit, lo), hi)
-        share, missed = _missed(answer, u, a, b, lo, hi)
+        share, missed = _missed(answer, a, b, lo, hi)
         if flag > 0 and share <= _ALLOWANCE:
             return Projection(answer, Status.PROJECTED, missed)
     if flag > 0 and missed < math.inf:
@@ -131,17 +147,20 @@ def _half_width(low: float, high: float) -> float:
 
 
 @compiled
-def _missed(x: Array, u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple[float, float]:
-    """By how much a control x, for a nominal u, misses the rows: in tolerances of the worst one, and in row units.
+def _missed(x: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple[float, float]:
+    """By how much a control x misses the rows: in tolerances of the worst one, and in row units.
 
     A tolerance is a share of the numbers that the row adds up, or would in a box of order one. Both are infinite
     where that is no number.
     """
     share = violation = 0.0
+    for j in range(len(x)):
+        if not lo[j] <= x[j] <= hi[j]:
+            return math.inf, math.inf
     for i in range(len(b)):
         excess, size = -b[i], 0.0
         for j in range(len(x)):
-            reach = max(abs(x[j]), abs(u[j]), min(_half_width(lo[j], hi[j]), _WIDE))
+            reach = max(abs(x[j]), min(_half_width(lo[j], hi[j]), _WIDE))
             excess += a[i, j] * x[j]
             size += abs(a[i, j]) * reach
         if not (size < math.inf and excess < math.inf):
@@ -167,11 +186,14 @@ def _program(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple[Array,
         widest = max(widest, half if half > 0.0 else math.inf)
         size = max(size, min(half, _WIDE), abs(u[j]))
     for i in range(k):
-        square, excess = 0.0, -b[i]
+        square, excess, largest = 0.0, -b[i], 0.0
         for j in range(m):
             square += a[i, j] * a[i, j]
             excess += a[i, j] * u[j]
+            largest = max(largest, abs(a[i, j]))
         length = math.sqrt(square)
+        if largest > 0.0 and not 0.0 < square < math.inf:  # squares outside of float64's range
+            length = largest
         if length > 0.0 and b[i] < _UNBOUNDED * length:
             upper[m + i] = b[i] / length
             away = max(away, excess / length)
@@ -202,7 +224,7 @@ def load_solvers() -> None:
 def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upper: Array) -> bool:
     """Whether a control satisfies every row as closely as `project` asks of its answers."""
     control, normals, offsets, lower, upper = _plain(control, normals, offsets, lower, upper)
-    return _missed(control, control, normals, offsets, lower, upper)[0] <= _ALLOWANCE
+    return _missed(control, normals, offsets, lower, upper)[0] <= _ALLOWANCE
 
 
 def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
