@@ -108,23 +108,19 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
                 f"u_nom must be finite, and bounds must not cross; got {u}, {lo} and {hi}"
             )
         return Projection(control, Status.FAILED, violation)
-    program, hessian = _program(u, a, b, lo, hi), _identity(u.size)
     for widths, sense in ((False, 0), (True, 0), (False, _SOFTENED)):
-        linear, normals, upper, lower, unit = program
-        weighed = hessian
+        hessian, (linear, normals, upper, lower, unit) = _identity(u.size), _program(u, a, b, lo, hi)
         if widths:  # one unit for all leaves little of a box that is narrow beside the others
-            width = np.array(
-                [half or max(abs(v), 1.0) for half, v in zip(map(_half_width, lo, hi), u, strict=True)]
-            )
-            if (width == width[0]).all():
+            if (hi - lo == hi[0] - lo[0]).all():
                 continue
+            width = _widths(u, lo, hi)
             linear, normals, upper, lower, unit = _program(u / width, a * width, b, lo / width, hi / width)
             weights = (width / width.max()) ** 2
-            weighed, linear, unit = np.diag(weights), linear * weights, unit * width
+            hessian, linear, unit = np.diag(weights), linear * weights, unit * width
         senses = np.zeros(len(upper), np.int32)
         senses[u.size :] = sense
         rows, tolerance = (normals, upper, lower, senses), _SOFT if sense else _ROUNDING
-        found, _, flag, _ = daqp.solve(weighed, linear, *rows, primal_tol=tolerance, rho_soft=_SOFT)
+        found, _, flag, _ = daqp.solve(hessian, linear, *rows, primal_tol=tolerance, rho_soft=_SOFT)
         answer = np.minimum(np.maximum(found * unit, lo), hi)
         share, missed = _missed(answer, a, b, lo, hi)
         if flag > 0 and share <= _ALLOWANCE:
@@ -137,6 +133,14 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
 def _plain(*arrays: Array) -> Iterator[Array]:
     """Copied where compiled code would have to be compiled anew: strides, read-only memory."""
     return (part if part.flags.carray else part.copy() for part in arrays)
+
+
+def _widths(u: Array, lo: Array, hi: Array) -> Array:
+    """A unit per component: half of what the box spans, or the largest number known of a component that is open."""
+    half = 0.5 * hi - 0.5 * lo
+    known = np.max([np.where(np.abs(part) < _NO_BOUND, np.abs(part), 0.0) for part in (u, lo, hi)], axis=0)
+    width = np.where((half > 0.0) & (half < _NO_BOUND), half, known)
+    return np.where(width > 0.0, width, 1.0)
 
 
 @compiled

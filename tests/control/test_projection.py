@@ -249,19 +249,11 @@ def test_a_box_of_zero_width_is_its_point():
     np.testing.assert_allclose(answer.control, [0.2, 0.2], atol=1e-8)
 
 
-@pytest.mark.parametrize("scale", [1e-140, 1e-9, 1e9, 1e140])
+@pytest.mark.parametrize("scale", [1e-200, 1e-140, 1e-9, 1e9, 1e140, 1e200])
 def test_a_rows_scale_does_not_matter(scale):
     answer = project([0.9, 0.1], [[scale, 0.0], [0.0, scale]], [0.5 * scale, 0.5 * scale], -1.0, 1.0)
     assert answer.status == "projected"
     np.testing.assert_allclose(answer.control, [0.5, 0.1], atol=1e-7)
-
-
-@pytest.mark.parametrize("rows", [1, 2])
-def test_a_row_too_large_to_square_is_never_inactive(rows):
-    # The length overflows: an infinite tolerance would let everything through.
-    answer = project([0.9, 0.9], np.eye(2)[:rows] * 1e200, np.full(rows, -1e199), -1.0, 1.0)
-    assert answer.status != "inactive"
-    assert (answer.control[:rows] < 0.0).all() or answer.status in ("failed", "infeasible")
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

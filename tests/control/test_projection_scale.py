@@ -75,6 +75,26 @@ def test_a_nominal_on_the_boundary_to_rounding_is_inactive_in_every_unit(scale, 
         assert status == "projected" or answer.control.tobytes() == u.tobytes()
 
 
+@pytest.mark.parametrize("open_ended", [False, True])
+@given(st.integers(0, 2**31), st.integers(2, 5), st.integers(1, 8))
+def test_components_of_very_different_width(open_ended, seed, size, rows):
+    # A feasible point inside: one unit for all components once left narrow ones to the solver's tolerance.
+    rng = np.random.default_rng(seed)
+    width = 10.0 ** rng.uniform(-4.0, 4.0, size)
+    normals = rng.normal(size=(rows, size)) / width
+    lengths = np.linalg.norm(normals * width, axis=1)
+    offsets = normals @ (width * rng.uniform(-0.5, 0.5, size)) + lengths * rng.uniform(0.2, 1.0, rows)
+    upper = np.where(np.arange(size) < open_ended, np.inf, width)
+    answer = project(width * rng.uniform(-1.0, 1.0, size), normals, offsets, -width, upper)
+    assert answer.status in ("inactive", "projected")
+    assert keeps_rows(answer.control, normals, offsets, -width, upper)
+
+
+def test_a_nominal_far_outside_of_the_box_moves_no_row():
+    # A tolerance that grew with the nominal answered 1.0.
+    assert project([1e9], [[1.0]], [0.5], -1.0, 1.0).control == pytest.approx([0.5])
+
+
 @pytest.mark.parametrize("bound", [1e3, 1e5, 1e10, 1e20, 3.4e38, math.inf])
 @pytest.mark.parametrize("rows", [1, 2])
 def test_a_bound_that_is_far_away_lets_nothing_through(bound, rows):
