@@ -7,7 +7,7 @@ import gymnasium as gym
 from vector_worlds import DT, AtHazard, ScheduledCart, drift, push, read
 
 import safe_wrappers as sw
-from safe_wrappers.wrappers.faults import Jitter, Outages, RepeatedCommands
+from safe_wrappers.wrappers.faults import Outages, RepeatedCommands
 
 HAZARDS = [sw.constraints.Discs("hazard_positions", radius=0.2)]
 RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
@@ -50,7 +50,7 @@ def point_goal(index=0):
         env, sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=0.2, min_lease_s=0.08
     )
     env = sw.ChunkHandover(sw.RecordInterventions(env), 6, 2, [0, 2], rate_limit=40.0)
-    return Outages(Jitter(env, 0.05), 0.1, 0.1)
+    return Outages(env, 0.1, 0.1)
 
 
 def pendulum(index=0):
