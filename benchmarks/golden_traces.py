@@ -112,11 +112,8 @@ def _teleop() -> gym.Env[Any, Any]:
         bodies=["tool"],
         radius=TOOL_RADIUS,
     )
-    ceiling = sw.teleop.RoundTripCeiling(
-        sw.StoppingBudget(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
-    )
-    env = gym.make("TeleopContact-v0")
-    return sw.TeleopChannel(env, link, link, coding="wave", impedance=40.0, ceiling=ceiling)
+    budget = sw.StoppingBudget(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
+    return sw.TeleopChannel(gym.make("TeleopContact-v0"), link, link, impedance=40.0, budget=budget)
 
 
 def _lease_alone() -> gym.Env[Any, Any]:

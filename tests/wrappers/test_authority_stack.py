@@ -188,7 +188,9 @@ def test_chunks_under_a_lease_hit_nothing_whatever_is_lost(change):
             if guarded:
                 env = sw.LeaseExpiry(
                     cart,
-                    sw.StoppingBudget(read_cart, braking=cart.braking, acceleration=cart.drive, act_s=delay),
+                    sw.StoppingBudget(
+                        read_cart, braking=cart.braking, acceleration=cart.drive, delays_s=delay
+                    ),
                     fallback=stop,
                     plant=cart_plant(dt),
                 )

@@ -242,7 +242,7 @@ def test_nothing_is_hit_whatever_goes_wrong(kinds):
             )
             env = cart
             if guarded:
-                env = leased(cart, act_s=delay, age_s=age, blend_time=float(rng.choice([0.0, 0.2])))
+                env = leased(cart, delays_s=delay + age, blend_time=float(rng.choice([0.0, 0.2])))
             for kind in reversed(kinds):
                 env = faulty(kind, env)
             env.reset(seed=seed)
