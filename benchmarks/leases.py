@@ -189,8 +189,9 @@ class CartAndWall(gym.Env[Array, Array]):
         return bool(abs(self.data.qvel[0]) < 1e-9)
 
     def reading(self, env: Any) -> tuple[float, float]:
-        """Clearance and approach speed as the cart knows them: what a lease is granted from."""
-        return self._reading
+        """Clearance less its reserves, and approach speed, as the cart knows them: what a lease is granted from."""
+        gap, speed = self._reading
+        return gap - self.drive.localisation - self.drive.margin, speed
 
     def _advance(self) -> None:
         _, speed = self._state()
@@ -224,10 +225,9 @@ def full_brake(plant: Any) -> list[float]:
 
 def leased(cart: CartAndWall, drive: Drive) -> sw.LeaseExpiry:
     """The cart under a lease that knows its numbers."""
-    names = ("braking", "acceleration", "top_speed", "act_s", "localisation", "margin")
-    budget = sw.StoppingBudget(cart.reading, **{name: getattr(drive, name) for name in names})
-    delays = {name: getattr(drive, name) for name in ("detect_s", "confirm_s", "age_s")}
-    return sw.LeaseExpiry(cart, budget, **delays, max_lease_s=drive.longest_s, fallback=full_brake)
+    bounds = {name: getattr(drive, name) for name in ("braking", "acceleration", "top_speed")}
+    budget = sw.StoppingBudget(cart.reading, **bounds, delays_s=drive.to_brake_s + drive.age_s)
+    return sw.LeaseExpiry(cart, budget, max_lease_s=drive.longest_s, fallback=full_brake)
 
 
 def episode(mode: str, seed: tuple[int, ...]) -> dict[str, Any]:

@@ -4,10 +4,9 @@
     python -m benchmarks teleop --seeds 1    # a look
 
 `TeleopContact-v0` behind a `TeleopChannel`, 6 s an episode at 1 kHz. The delay is that of *each* direction. Networks:
-**steady** has nothing but the delay; **rough** has up to 30 % more, drawn for each packet, 5 % of loss, and packets
-that overtake each other; **outages** is rough and goes silent for 0.3 s every 2 s, on average. Operators
-(`TeleopOperator`): the **careful** one stops before the clamp, as far as what he sees lets him; the other **looks
-away** and sweeps on.
+**steady** has nothing but the delay; **rough** has up to 30 % more, drawn for each packet, and 5 % of loss;
+**outages** is rough, and loses all commands for 0.3 s every 2 s, on average. Operators (`TeleopOperator`): the
+**careful** one stops before the clamp, as far as what he sees lets him; the other **looks away** and sweeps on.
 
 Judged from outside the channel: energy is that of the operator's hand at the force that he is shown, and of what
 acted on the tool by the env's own account; clearance is the env's, at every physics substep.
@@ -27,6 +26,7 @@ import safe_wrappers as sw
 from benchmarks.tables import keep, markdown, measured, options, total
 from safe_wrappers.envs.teleop_contact import TELEOP_ACCELERATION, TELEOP_BRAKING, TELEOP_TOP_SPEED
 from safe_wrappers.envs.teleop_operator import TeleopOperator
+from safe_wrappers.wrappers.faults import Outages
 
 DELAYS_S = (0.0, 0.025, 0.05, 0.1, 0.2, 0.3)
 """Of each direction."""
@@ -34,8 +34,8 @@ JITTER, LOSS = 0.3, 0.05
 """Share of the delay; share of the packets."""
 OUTAGE_BETWEEN_S, OUTAGE_LENGTH_S = 2.0, 0.3
 CODINGS: Final[dict[str, dict[str, Any]]] = {
-    "plain": {"coding": "plain"},
-    "wave": {"coding": "wave", "impedance": 40.0},
+    "plain": {},
+    "wave": {"impedance": 40.0},
 }
 NETWORKS = ("steady", "rough", "outages")
 OPERATORS = ("careful", "looks away")
@@ -56,10 +56,7 @@ class Job:
 
 def link(network: str, delay_s: float) -> sw.teleop.Link:
     """One direction."""
-    if network == "steady":
-        return sw.teleop.Link(delay_s)
-    silent = (OUTAGE_BETWEEN_S, OUTAGE_LENGTH_S) if network == "outages" else (None, None)
-    return sw.teleop.Link(delay_s, JITTER * delay_s, LOSS, False, *silent)
+    return sw.teleop.Link(delay_s) if network == "steady" else sw.teleop.Link(delay_s, JITTER * delay_s, LOSS)
 
 
 def reading(env: gym.Env[Any, Any]) -> tuple[list[float], list[float]]:
@@ -71,19 +68,20 @@ def reading(env: gym.Env[Any, Any]) -> tuple[list[float], list[float]]:
 def channel(job: Job) -> sw.TeleopChannel:
     """The env behind its channel."""
     machine = {"braking": TELEOP_BRAKING, "acceleration": TELEOP_ACCELERATION, "top_speed": TELEOP_TOP_SPEED}
-    ceiling = sw.teleop.RoundTripCeiling(sw.StoppingBudget(reading, **machine))
     return sw.TeleopChannel(
         gym.make("TeleopContact-v0", max_episode_steps=job.steps, disable_env_checker=True),
         uplink=link(job.network, job.delay_s),
         downlink=link(job.network, job.delay_s),
-        ceiling=ceiling if job.revocation else None,
+        budget=sw.StoppingBudget(reading, **machine) if job.revocation else None,
         **CODINGS[job.coding],
     )
 
 
 def run(job: Job) -> dict[str, Any]:
     """One episode."""
-    env = channel(job)
+    env: gym.Env[Any, Any] = channel(job)
+    if job.network == "outages":
+        env = Outages(env, OUTAGE_BETWEEN_S, OUTAGE_LENGTH_S)
     raw: Any = env.unwrapped
     operator = TeleopOperator(job.seed, stops=job.operator == "careful")
     observation, _ = env.reset(seed=job.seed)

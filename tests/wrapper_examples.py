@@ -139,7 +139,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                     ),
                     acceleration=20.0,
                     top_speed=5.0,
-                    act_s=0.01,
+                    delays_s=0.01,
                 ),
             },
         ),
@@ -214,8 +214,8 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         "plain, any env": (
             "Reacher-v5",
             lambda: {
-                "uplink": sw.teleop.Link(0.04, 0.03, loss=0.1, in_order=False),
-                "downlink": {"delay_s": 0.02, "outage_between_s": 0.5, "outage_length_s": 0.1},
+                "uplink": sw.teleop.Link(0.04, 0.03, loss=0.1),
+                "downlink": {"delay_s": 0.02, "loss": 0.2},
             },
         ),
         "waves under a ceiling": (
@@ -223,16 +223,13 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             lambda: {
                 "uplink": sw.teleop.Link(0.003, 0.004, loss=0.05),
                 "downlink": 0.002,
-                "coding": "wave",
                 "impedance": 40.0,
-                "ceiling": sw.teleop.RoundTripCeiling(
-                    sw.StoppingBudget(
-                        sw.constraints.Clearance(
-                            [sw.constraints.Plane([0, 0.25], [0, -1])], 24.0, bodies=["tool"], radius=0.015
-                        ),
-                        acceleration=55.0,
-                        top_speed=1.4,
-                    )
+                "budget": sw.StoppingBudget(
+                    sw.constraints.Clearance(
+                        [sw.constraints.Plane([0, 0.25], [0, -1])], 24.0, bodies=["tool"], radius=0.015
+                    ),
+                    acceleration=55.0,
+                    top_speed=1.4,
                 ),
             },
         ),

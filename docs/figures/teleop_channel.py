@@ -22,15 +22,13 @@ DELAY_S = 0.1
 SECONDS = 4.0
 
 
-def ceiling() -> sw.teleop.RoundTripCeiling:
+def budget() -> sw.StoppingBudget:
     """Over the clearance to the clamp."""
     face = sw.constraints.Plane([0.0, CLAMP_Y], [0.0, -1.0])
     clamp = sw.constraints.Clearance(
         [face], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001
     )
-    return sw.teleop.RoundTripCeiling(
-        sw.StoppingBudget(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
-    )
+    return sw.StoppingBudget(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
 
 
 def episode(
@@ -57,7 +55,7 @@ def draw() -> Figure:
     clearance = figure.add_subplot(grid[1, :])
     time = STEP_S * np.arange(round(SECONDS / STEP_S))
     for coding, impedance, color in (("plain", None, OFF), ("wave", 40.0, ON)):
-        seen = episode(DELAY_S, SECONDS, (0.17, 0.0), coding=coding, impedance=impedance)
+        seen = episode(DELAY_S, SECONDS, (0.17, 0.0), impedance=impedance)
         force.plot(time, seen["contact_force"], color=color, lw=1.2, label=coding)
         energy.plot(time, seen["teleop/created_j"], color=color, label=coding)
     force.axhline(8.0, color=GRID, lw=1.0)
@@ -71,8 +69,8 @@ def draw() -> Figure:
         (False, OFF, "without a ceiling"),
         (True, ON, "with a ceiling"),
     ):
-        watch = ceiling() if watched else None
-        seen = episode(DELAY_S, SECONDS, (0.18, 0.1), False, coding="wave", impedance=40.0, ceiling=watch)
+        watch = budget() if watched else None
+        seen = episode(DELAY_S, SECONDS, (0.18, 0.1), False, impedance=40.0, budget=watch)
         time = STEP_S * np.arange(len(seen["clearance"]))
         clearance.plot(time, 1000.0 * seen["clearance"], color=color, label=label)
         if watched:

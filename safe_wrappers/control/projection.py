@@ -111,9 +111,9 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
     for widths, sense in ((False, 0), (True, 0), (False, _SOFTENED)):
         hessian, (linear, normals, upper, lower, unit) = _identity(u.size), _program(u, a, b, lo, hi)
         if widths:  # one unit for all leaves little of a box that is narrow beside the others
-            width = _widths(u, lo, hi)
-            if (width == width[0]).all():
+            if (hi - lo == hi[0] - lo[0]).all():
                 continue
+            width = _widths(u, lo, hi)
             linear, normals, upper, lower, unit = _program(u / width, a * width, b, lo / width, hi / width)
             weights = (width / width.max()) ** 2
             hessian, linear, unit = np.diag(weights), linear * weights, unit * width

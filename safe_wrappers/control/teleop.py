@@ -1,16 +1,14 @@
-"""Passivity over a network: wave variables, and energy ledgers of a channel and of one direction.
+"""Passivity over a network: wave variables, and the energy ledger of a channel.
 
-Source: appendix "Passivity and Energy-Bounded Interaction", extended from a fixed delay to jitter, reordering and
-loss. A port has an effort F (N or N m) and a flow v (m/s or rad/s); their product is power. A channel is passive when
-no more energy comes out than was stored at the start and went in; the wave transform keeps that for a *fixed* delay
-only. A sum of samples is the integral only if one of the two is held over the interval and the other is its mean.
+Source: appendix "Passivity and Energy-Bounded Interaction". A port has an effort F (N or N m) and a flow v (m/s or
+rad/s); their product is power. A channel is passive when no more energy comes out than was stored at the start and
+went in; the wave transform keeps that for a *fixed* delay only. A sum of samples is the integral only if one of the
+two is held over the interval and the other is its mean.
 
 What is not finite raises `ConfigurationError`.
 """
 
-import heapq
 import math
-from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -87,75 +85,3 @@ class ChannelLedger:
         """
         self.net_j += port_energy(effort_m, flow_m, time_s) - port_energy(effort_s, flow_s, time_s)
         self.created_j = max(self.created_j, stored_j - self.net_j)
-
-
-class WaveLine:
-    """Energy account of one direction of a channel: `send` notes what leaves, `deliver` takes what arrives.
-
-    A wave carries the energy `|u|^2 / 2 * tick`. Every wave that arrives is put out once, one per tick, in the order
-    of sending; zero while there is none. So no more energy comes out than has arrived, and the delay grows to that of
-    the latest packet. Always ``put_in_j = put_out_j + in_flight_j + reserve_j + lost_j``, none of them negative.
-
-    Args:
-        tick_s: Duration of every wave sent or put out, s.
-        components: m, of a wave.
-
-    Attributes:
-        put_in_j: Energy of all waves sent, J.
-        put_out_j: Energy of all waves put out, J.
-        lost_j: Energy that will never come out, J.
-    """
-
-    def __init__(self, tick_s: float, components: int = 1) -> None:
-        self._tick_s, self._components = tick_s, components
-        self._flying: dict[int, float] = {}
-        self._queue: list[tuple[int, float, tuple[float, ...]]] = []
-        self.put_in_j = self.put_out_j = self.lost_j = 0.0
-
-    @property
-    def in_flight_j(self) -> float:
-        """Energy of the packets that have neither arrived nor been declared lost, J."""
-        return math.fsum(self._flying.values())
-
-    @property
-    def reserve_j(self) -> float:
-        """Energy that has arrived and was not put out yet, J."""
-        return math.fsum(energy for _, energy, _ in self._queue)
-
-    def send(self, wave: ArrayLike, sequence: int) -> None:
-        """Note a finite wave that leaves, sqrt(W), shape (m,) or a number; each has a sequence number of its own."""
-        energy = self._energy(wave)
-        self._flying[sequence] = energy
-        self.put_in_j += energy
-
-    def lose(self, sequence: int) -> None:
-        """Declare a packet lost; its later arrival is ignored. Until then it counts as in flight."""
-        self.lost_j += self._flying.pop(sequence)
-
-    def deliver(self, packets: Iterable[tuple[int, ArrayLike]]) -> Array:
-        """The wave put out during this tick, sqrt(W), shape (m,). Call it once per tick, arrivals or not.
-
-        Args:
-            packets: Arrivals since the last tick, (sequence, wave) in any order. What is not in flight is ignored.
-        """
-        for sequence, wave in packets:
-            if sequence in self._flying:
-                # The energy as sent counts, not that of the received wave.
-                values = tuple(np.atleast_1d(wave).tolist())
-                heapq.heappush(self._queue, (sequence, self._flying.pop(sequence), values))
-        if not self._queue:
-            return np.zeros(self._components)
-        _, available, values = heapq.heappop(self._queue)
-        wave = np.array(values)
-        energy, shrink = self._energy(wave), 1.0
-        while energy > available:
-            # Rounding may leave the first try slightly above.
-            shrink *= 1.0 - 2.0**-50
-            wave = wave * (math.sqrt(available / energy) * shrink)
-            energy = self._energy(wave)
-        self.put_out_j += energy
-        self.lost_j += available - energy
-        return wave
-
-    def _energy(self, wave: ArrayLike) -> float:
-        return 0.5 * port_energy(wave, wave, self._tick_s)

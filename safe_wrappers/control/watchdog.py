@@ -33,8 +33,6 @@ _TINY = 1e-300
 """Absolute reserve for subnormal numbers, whose relative precision is lost."""
 _LONGEST = 1e300
 """s; largest finite lease, so that nothing overflows."""
-_AT_ONCE = 1e300
-"""m/s^2; a braking that takes no way."""
 
 
 def longest_lease(
@@ -103,16 +101,6 @@ def _lease(d: float, v: float, b: float, late: float, loc: float, gap: float, a:
     tau = min(tau, _LONGEST)
     lease = tau - late - _ROUNDING * (abs(tau) + late) - _TINY
     return -math.inf if math.isnan(lease) else lease
-
-
-def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
-    """The longest lease, s, shape (...), from a barrier that includes the stopping distance: `h / closing - delays`.
-
-    Where h cannot fall (closing speed <= 0): inf if it is positive, else -inf; -inf for inputs that are not finite.
-    The room is h, in any unit U; the closing speed bounds how fast it may fall under any command until the brakes
-    hold, U/s; the delays are the other four, s, at least 0.
-    """
-    return longest_lease(room, closing_speed, _AT_ONCE, delays_s)
 
 
 State = tuple[ArrayLike, ArrayLike, ArrayLike]

@@ -18,21 +18,6 @@ _SECANTS = 2  # tangents whose slopes secants correct, after one by differences
 _DIFFERENCES = 4  # tangents by differences, in one control step
 
 
-def linearize(slacks: Slacks, control: Array, low: Array, high: Array) -> HalfSpaces:
-    """Linearise predicted slacks about a control.
-
-    Args:
-        slacks: Of a control.
-        control: The refused control, shape (m,).
-        low: Bounds that the differences stay inside, shape (m,).
-        high: Likewise.
-
-    Returns:
-        k rows `-J u <= slacks(control) - J control`, aimed a little inward where a slack is negative.
-    """
-    return tangent_rows(slacks(control), control, differences(slacks, control, low, high))
-
-
 def differences(slacks: Slacks, control: Array, low: Array, high: Array) -> Array:
     """How slacks change with a control, shape (k, m); the differences stay inside the bounds, shapes (m,)."""
     base = slacks(control)

@@ -66,9 +66,6 @@ class LeaseExpiry(CommandGate):
     Args:
         env: With a one-dimensional Box action space.
         budget: A `StoppingBudget` or the dict of one.
-        detect_s: T_detect, s, until the end of a lease is recognised.
-        confirm_s: T_hold, s, a window of confirmation in which the last command goes on.
-        age_s: t_age, s, of the clearance when it is read.
         max_lease_s: No lease is longer, s.
         min_lease_s: Every fresh command gets a lease of at least so long, s; above 0 only with a CBFActionFilter
             inside. Behind a `ChunkHandover` give the time of one `execution_horizon`.
@@ -107,9 +104,6 @@ class LeaseExpiry(CommandGate):
         env: Env,
         budget: StoppingBudget | dict[str, Any],
         *,
-        detect_s: float = 0.0,
-        confirm_s: float = 0.0,
-        age_s: float = 0.0,
         max_lease_s: float = 1.0,
         min_lease_s: float = 0.0,
         blend_time: float = 0.1,
@@ -131,9 +125,6 @@ class LeaseExpiry(CommandGate):
             example = "LeaseExpiry(sw.protect(env), ...)"
             raise ConfigurationError(f"min_lease_s above 0 needs a CBFActionFilter inside: {example}")
         self._blend_steps = whole_steps(non_negative("blend_time", blend_time, "s"), self.control_dt)
-        delays = {"detect_s": detect_s, "confirm_s": confirm_s, "age_s": age_s}
-        # What they are, and by how much a step may outlast its lease.
-        self._delays_s = sum(non_negative(name, value, "s") for name, value in delays.items()) + self._same_s
         plant = bound_plant(env, plant, fallback, budget.clearance)
         self._budget = BoundBudget(budget, env, plant)
         self._fallback = FallbackController(env, fallback, plant, self._budget.bound)
@@ -198,7 +189,8 @@ class LeaseExpiry(CommandGate):
     def _grant(self, now: float) -> bool:
         """A new lease for the fresh command; False, and none at all, where it would not last."""
         self._budget.measure()
-        longest_s = self._budget.longest_time(self._delays_s + max(now - self._newest_s, 0.0))
+        # A step may outlast its lease by what counts as the same time.
+        longest_s = self._budget.longest_time(self._same_s + max(now - self._newest_s, 0.0))
         lease = max(min(longest_s, self._max_lease_s), self._min_lease_s)
         # NaN gives no lease at all: a filter inside reads the same state.
         granted = not math.isnan(longest_s) and lease + self._same_s >= self.control_dt

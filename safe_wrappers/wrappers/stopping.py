@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.constraints.clearance import Clearance
-from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room
+from safe_wrappers.control.watchdog import longest_lease
 from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative, positive
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.constraint import Constraint
@@ -25,13 +25,14 @@ from safe_wrappers.wrappers.serialize import constraint_from
 ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
 """Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""
 
+_AT_ONCE: Final = 1e300
+"""m/s^2; the braking of a value that counts the stopping distance already: it takes no way."""
 _ROW_TOLERANCE = 1e-9
 """Control units times normals: a row that is violated by less is kept."""
 
 
 _CHECKS: Final = (
-    (["localisation", "margin"], non_negative, "m"),
-    (["act_s"], non_negative, "s"),
+    (["delays_s"], non_negative, "s"),
     (["acceleration"], non_negative, "m/s^2"),
     (["braking"], positive, "m/s^2"),
     (["top_speed"], positive, "m/s"),
@@ -41,20 +42,20 @@ _CHECKS: Final = (
 
 @dataclass(frozen=True)
 class StoppingBudget:
-    """Clearance, bounds on the motion and reserves from which a stop is worked out; shared by lease and ceiling.
+    """Clearance, bounds on the motion and delays from which a stop is worked out; shared by lease and ceiling.
 
     Args:
         clearance: A `Clearance` or the dict of one; any other constraint, with `closing_speed`; or a function of the
-            env that returns clearances in m and approach speeds in m/s, shapes (k,).
-        braking: Verified lower bound on the deceleration of the fallback, m/s^2; None takes the constraint's own.
+            env that returns clearances in m, less all reserves, and approach speeds in m/s, shapes (k,).
+        braking: For a function: verified lower bound on the deceleration of the fallback, m/s^2. A `Clearance` has
+            its own, and its own margin and state error.
         acceleration: Largest approach acceleration that any command may cause, the fallback's too, m/s^2; 0 for a
             machine that cruises.
         closing_speed: For constraints other than Clearance: the fastest that their value may fall, in its unit per
             second, stopping distance and all, under any command.
         top_speed: Bound on the approach speed, m/s; None: none.
-        localisation: Bound on the error of the clearance, m; the constraint's own is added.
-        margin: Clearance to be kept at rest, m; the constraint's own is added.
-        act_s: T_act, until the full deceleration is there, s.
+        delays_s: T_detect + T_hold + t_age + T_act, s: how old a clearance is when it is read, how long the end of a
+            lease takes to be noticed and confirmed, and how long until the full deceleration is there.
 
     Raises:
         ConfigurationError: A bound that is missing, negative or does not belong to the clearance.
@@ -65,9 +66,7 @@ class StoppingBudget:
     acceleration: float | None = None
     closing_speed: float | None = None
     top_speed: float | None = None
-    localisation: float = 0.0
-    margin: float = 0.0
-    act_s: float = 0.0
+    delays_s: float = 0.0
 
     def __post_init__(self) -> None:
         given: Any = self.clearance
@@ -78,18 +77,17 @@ class StoppingBudget:
             raise ConfigurationError(f"clearance is a constraint or {function}; got {given!r}")
         for names, check, unit in _CHECKS:
             check_fields(self, check, names, unit)
-        name = type(self.clearance).__name__
-        if not self.measures_approach:
-            if self.closing_speed is None:
-                raise ConfigurationError(f"{name} does not say how fast it is approached: give closing_speed")
-            if (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
-                raise ConfigurationError(f"{name} counts braking already: give closing_speed alone")
-        elif self.closing_speed is not None:
-            raise ConfigurationError("closing_speed is for constraints that measure no approach speed")
-        elif self.braking is None and not isinstance(self.clearance, Clearance):
-            raise ConfigurationError("braking is missing: the least deceleration of the fallback, m/s^2")
-        elif self.acceleration is None:
-            raise ConfigurationError("acceleration is missing: the largest that any command may cause, m/s^2")
+        takes, more = {"closing_speed"}, set()
+        if self.measures_approach:
+            takes, more = {"acceleration"}, {"top_speed"}
+            if not isinstance(self.clearance, Clearance):
+                takes.add("braking")
+        bounds = ("braking", "acceleration", "closing_speed", "top_speed")
+        found = {name for name in bounds if getattr(self, name) is not None}
+        if not takes <= found <= takes | more:
+            kind, needed = type(self.clearance).__name__, " and ".join(sorted(takes))
+            optional = ", and maybe top_speed" if more else ""
+            raise ConfigurationError(f"a budget by a {kind} takes {needed}{optional}; got {sorted(found)}")
 
     @property
     def measures_approach(self) -> bool:
@@ -112,8 +110,8 @@ class BoundBudget:
     """A budget that measures an env, on a `bound_plant` if its clearance is a constraint.
 
     Attributes:
-        clearance: At the last `measure`, m, shape (k,); values of a constraint that measures no approach.
-        speed: Approach speeds then, m/s, shape (k,).
+        clearance: At the last `measure`, m, shape (k,); of a constraint that measures no approach, its room.
+        speed: Approach speeds then, m/s, shape (k,); `closing_speed` of a constraint that measures none.
     """
 
     clearance: Array
@@ -122,20 +120,17 @@ class BoundBudget:
     def __init__(self, budget: StoppingBudget, env: Env, plant: Plant | None) -> None:
         self._budget, self._env = budget, env
         given: Any = budget.clearance
-        braking, margin, localisation = budget.braking, budget.margin, budget.localisation
         self.bound: Bound | None = None
+        self._stop: Any = {"braking": _AT_ONCE if budget.braking is None else budget.braking}
         if isinstance(given, Constraint):
             assert plant is not None
-            margin, localisation = margin + given.margin, localisation + given.state_error
-            if isinstance(given, Clearance):  # whose rows are then those of this budget
-                braking = float(given.braking) if braking is None else braking
-                own: Any = {"braking": braking, "margin": margin, "state_error": localisation}
-                given = replace(given, **own)
             self.bound = Bound(given, plant)
             if not self.bound.measures_state:
                 name = type(given).__name__
                 raise ConfigurationError(f"{name} has no value that a lease could be worked out from")
-        self._stop: Any = {"localisation": localisation, "margin": margin, "braking": braking}
+        if isinstance(given, Clearance):
+            own = {"localisation": given.state_error, "margin": given.margin, "braking": float(given.braking)}
+            self._stop.update(own)
 
     def observe(self) -> None:
         """Take the present state; the constraint refuses what only a state can show."""
@@ -157,8 +152,9 @@ class BoundBudget:
             self.clearance, self.speed = self.bound.spec.approach()
         else:
             value = np.asarray(self.bound.value(), dtype=np.float64)
-            self.clearance = value[value != np.inf]
-            self.speed = np.zeros(self.clearance.shape)
+            spec = self.bound.spec
+            self.clearance = value[value != np.inf] - spec.margin - spec.state_error
+            self.speed = np.full(self.clearance.shape, self._budget.closing_speed)
 
     @property
     def readable(self) -> bool:
@@ -168,35 +164,35 @@ class BoundBudget:
     def longest_time(self, delays_s: float = 0.0) -> float:
         """The longest time that the worst command may go on from the measured state, s; zero or less: stop now.
 
-        NaN where the measurement is not finite; inf without obstacles near. `delays_s` are all delays but `act_s`, s.
+        NaN where the measurement is not finite; inf without obstacles near. `delays_s` are more than the budget's, s.
         """
         if not self.readable:
             return math.nan
-        budget, delays_s = self._budget, delays_s + self._budget.act_s
-        if budget.closing_speed is None:
-            top_speed = math.inf if budget.top_speed is None else budget.top_speed
-            bounds: Any = {"acceleration": budget.acceleration, "top_speed": top_speed, **self._stop}
-            times = longest_lease(self.clearance, self.speed, delays_s=delays_s, **bounds)
-        else:
-            left = self.clearance - self._stop["margin"] - self._stop["localisation"]
-            times = longest_lease_of_room(left, budget.closing_speed, delays_s)
+        budget = self._budget
+        top_speed = math.inf if budget.top_speed is None else budget.top_speed
+        acceleration = 0.0 if budget.acceleration is None else budget.acceleration
+        bounds: Any = {"acceleration": acceleration, "top_speed": top_speed, **self._stop}
+        times = longest_lease(self.clearance, self.speed, delays_s=delays_s + budget.delays_s, **bounds)
         return float(times.min(initial=np.inf))
 
-    def longest_round_trip(self, video_s: float, human_s: float) -> float:
-        """The longest round trip from which an operator can stop in time, s; inf where nothing approaches."""
-        delays_s = video_s + human_s + self._budget.act_s
+    def longest_round_trip(self, operator_s: float) -> float:
+        """The longest round trip from which an operator can stop in time, s; inf where nothing approaches.
+
+        `operator_s` is T_video + T_human, s.
+        """
+        delays_s = operator_s + self._budget.delays_s
         ceilings = longest_lease(self.clearance, self.speed, delays_s=delays_s, **self._stop)
         return float(ceilings[self.speed > 0.0].min(initial=math.inf))
 
     def can_stop_after(self, command: Array, duration_s: float) -> bool:
         """Whether the machine can stop by itself after a command of so many seconds.
 
-        By the declared bounds, whatever the command is, or by the rows of a `Clearance` (without `act_s`).
+        By the declared bounds, whatever the command is, or by the rows of a `Clearance` (without `delays_s`).
         """
         if self.longest_time() >= duration_s:
             return True
         by_rows = self.bound is not None and isinstance(self.bound.spec, Clearance)
-        if not (by_rows and self._budget.act_s == 0.0 and self.readable):
+        if not (by_rows and self._budget.delays_s == 0.0 and self.readable):
             return False
         assert self.bound is not None
         rows = self.bound.rows()

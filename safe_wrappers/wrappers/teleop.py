@@ -1,10 +1,10 @@
 """TeleopChannel: a network between the operator and the machine, and a local brake for when it is too slow."""
 
 import copy
-import heapq
 import math
-from dataclasses import KW_ONLY, dataclass
-from typing import Any, ClassVar, Final, Literal, get_args
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,12 @@ from safe_wrappers.errors import (
     non_negative,
     positive,
     settings_from,
-    true_or_false,
 )
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.wrappers.faults import OnOffProcess, probability
+from safe_wrappers.wrappers.faults import probability
 from safe_wrappers.wrappers.layer import SAME_STEP, Env, Step, WrapperRng, action_array
 from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.stopping import (
@@ -36,187 +35,85 @@ from safe_wrappers.wrappers.stopping import (
 )
 from safe_wrappers.wrappers.teleop_coding import Packet, Port, WaveCoding
 
-__all__ = ["Link", "RoundTripCeiling"]
+__all__ = ["Link"]
 
-Coding = Literal["plain", "wave"]
 _RELEASE: Final = 0.8
 """Authority comes back only when the round trip is below this share of the ceiling."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """What a network does to packets in one direction; plain data.
+    """What a network does to packets in one direction, which arrive in the order of sending; plain data.
 
     Args:
         delay_s: Shortest time that a packet takes, s.
-        jitter_s: How much longer it may take, s, uniform, drawn for each packet by itself.
-        loss: Probability that a packet is lost, from 0 to 1; during an outage every one is.
-        in_order: Whether a packet waits for those sent before it, as in a stream; datagrams may overtake (False).
-        outage_between_s: Mean time from the end of an outage to the start of the next, s; None: there are none.
-        outage_length_s: Mean length of an outage, s.
+        jitter_s: How much longer it may take by itself, s, uniform; it also waits for those sent before it.
+        loss: Probability that a packet is lost, from 0 to 1.
 
     Raises:
-        ConfigurationError: A negative time, a probability outside of 0 to 1, half of an outage.
+        ConfigurationError: A negative time, a probability outside of 0 to 1.
     """
 
     delay_s: float = 0.0
     jitter_s: float = 0.0
     loss: float = 0.0
-    in_order: bool = True
-    outage_between_s: float | None = None
-    outage_length_s: float | None = None
 
     def __post_init__(self) -> None:
         check_fields(self, non_negative, ["delay_s", "jitter_s"], "s")
         object.__setattr__(self, "loss", probability("loss", self.loss))
-        true_or_false("in_order", self.in_order)
-        if (self.outage_between_s is None) != (self.outage_length_s is None):
-            given = f"{self.outage_between_s!r} and {self.outage_length_s!r}"
-            raise ConfigurationError(f"an outage needs outage_between_s and outage_length_s, s; got {given}")
-        check_fields(self, positive, ["outage_between_s", "outage_length_s"], "s")
 
 
 class Line:
     """The packets of one direction, with random numbers of their own; times closer than `slack_s` are the same.
 
     Attributes:
-        newest: Of all packets that have arrived, the one that was sent last.
+        coming: Those on their way, in the order of sending, each with the time at which it arrives, s.
+        newest: The last one that has arrived.
     """
 
+    coming: deque[tuple[float, Packet]]
     newest: Packet
 
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:
         self._link, self._slack_s = link, slack_s
         self._random = WrapperRng(stream)
-        between_s, length_s = link.outage_between_s, link.outage_length_s
-        self._outages = None if between_s is None or length_s is None else OnOffProcess(between_s, length_s)
 
     def reset(self, env: Env, seed: int | None, first: Any = None) -> None:
         """Nothing is on its way, and `first`, made at 0 s, has arrived; call it after the env's own reset."""
         self._random.reset(env, seed)
-        if self._outages is not None:
-            self._outages.begin(self._random)
-        self._coming: list[tuple[float, Packet]] = []
-        self._sent = 0
+        self.coming = deque()
         self._latest_s = -math.inf
-        self.newest = Packet(-1, first, 0.0, None)
+        self.newest = Packet(first, 0.0)
 
-    def send(self, content: Any, made_s: float, wave: Array | None, now_s: float) -> tuple[int, bool]:
-        """Send a packet; its number, and whether it gets lost."""
-        link, packet = self._link, Packet(self._sent, content, made_s, wave)
-        self._sent += 1
+    def send(self, packet: Packet, now_s: float) -> bool:
+        """Send a packet; whether it gets lost."""
+        link = self._link
         # As many numbers for a lost packet as for one that is not: what follows stays the same.
         jitter_s = self._random.draw.uniform(0.0, link.jitter_s) if link.jitter_s else 0.0
         lost = bool(link.loss and self._random.draw.random() < link.loss)
-        if self._outages is not None:
-            lost |= self._outages.is_on(now_s, self._random)
         if not lost:
-            due_s = now_s + link.delay_s + jitter_s
-            if link.in_order:
-                due_s = self._latest_s = max(due_s, self._latest_s)
-            heapq.heappush(self._coming, (due_s, packet))
-        return packet.sequence, lost
+            self._latest_s = max(now_s + link.delay_s + jitter_s, self._latest_s)
+            self.coming.append((self._latest_s, packet))
+        return lost
 
     def receive(self, now_s: float) -> list[Packet]:
         """What has arrived since the last call, in the order of arrival."""
         found: list[Packet] = []
-        while self._coming and self._coming[0][0] <= now_s + self._slack_s:
-            found.append(heapq.heappop(self._coming)[1])
-        self.newest = max([self.newest, *found], key=lambda packet: packet.sequence)
+        while self.coming and self.coming[0][0] <= now_s + self._slack_s:
+            self.newest = self.coming.popleft()[1]
+            found.append(self.newest)
         return found
-
-
-@dataclass(frozen=True)
-class RoundTripCeiling:
-    """The longest round trip at which an operator may still be relied on, from the clearance and speed of the moment.
-
-    See `control.watchdog`. A command after which the machine could not stop is refused.
-
-    Args:
-        budget: A `StoppingBudget` or the dict of one, whose clearance is a `Clearance` or a function of the env.
-        video_s: T_video, exposure, encoding and display, without the downlink, s.
-        human_s: T_human, the operator's reaction, s.
-        longest_s: No ceiling is higher, s: an operator who is silent for longer loses authority at rest, too.
-
-    Raises:
-        ConfigurationError: A time that cannot be, or a clearance that measures no approach.
-    """
-
-    budget: StoppingBudget | dict[str, Any]
-    _: KW_ONLY
-    video_s: float = 0.1
-    human_s: float = 0.25
-    longest_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        budget = settings_from(StoppingBudget, self.budget, "budget")
-        if not budget.measures_approach:
-            name = type(budget.clearance).__name__
-            raise ConfigurationError(f"{name} does not say how fast it is approached: give a Clearance")
-        object.__setattr__(self, "budget", budget)
-        check_fields(self, non_negative, ["video_s", "human_s"], "s")
-        check_fields(self, positive, ["longest_s"], "s")
-
-
-class RoundTripWatch(BoundBudget):
-    """Decides whether the operator is obeyed in the coming control step, by clearance and approach.
-
-    Attributes:
-        revoked: Whether authority is revoked, as `judge` left it.
-        ceiling_s: The longest round trip at the last `look`, s, within `longest_s` of 0; the lowest where unreadable.
-    """
-
-    ceiling_s: float
-
-    def __init__(
-        self,
-        ceiling: RoundTripCeiling,
-        env: Env,
-        plant: Plant | None,
-        control_dt: float,
-        slack_s: float = 0.0,
-    ) -> None:
-        assert isinstance(ceiling.budget, StoppingBudget)
-        super().__init__(ceiling.budget, env, plant)
-        self._ceiling, self._control_dt, self._slack_s = ceiling, control_dt, slack_s
-
-    def reset(self) -> None:
-        """A new episode: authority is the operator's."""
-        self.observe()
-        self.revoked, self._revoked_s = False, -math.inf
-        self.look()
-
-    def look(self) -> None:
-        """Measure the clearance of the present state."""
-        self.measure()
-        ceiling, highest_s = self._ceiling, -math.inf
-        if self.readable:  # the next look comes one control step from now
-            highest_s = self.longest_round_trip(ceiling.video_s, ceiling.human_s) - self._control_dt
-        self.ceiling_s = min(max(highest_s, -ceiling.longest_s), ceiling.longest_s)
-
-    def judge(self, command: Array, seen_s: float, round_trip_s: float, now_s: float) -> None:
-        """Revoke authority, or give it back, for a command (m,) made from the image that was taken at `seen_s`."""
-        allowed_s = self.ceiling_s
-        if self.revoked and allowed_s > 0.0:
-            allowed_s *= _RELEASE
-        trusted = self.readable and round_trip_s <= allowed_s + self._slack_s
-        if self.revoked:
-            trusted = trusted and seen_s >= self._revoked_s - self._slack_s
-        trusted = trusted and self.can_stop_after(command, self._control_dt)
-        if not trusted and not self.revoked:
-            self._revoked_s = now_s
-        self.revoked = not trusted
 
 
 class TeleopChannel(CommandGate):
     """Puts a network between the policy, as a remote operator, and the machine.
 
     `step(action)` sends the action up, executes what has arrived at the machine, sends the observation down, and
-    returns the newest that has arrived at the operator. Reward, termination and info are not delayed. With a ceiling,
-    the local brake (`fallback`) acts when the round trip is too long for the clearance and approach speed of the
-    moment, or when the machine could not stop by itself after the command.
+    returns the newest that has arrived at the operator. Reward, termination and info are not delayed. With a budget
+    the round trip has a ceiling: the local brake (`fallback`) acts when it is too long for the clearance and approach
+    speed of the moment, or when the machine could not stop by itself after the command (`control.watchdog`).
 
-    **What it guarantees.** With a ceiling whose bounds are what they are declared to be, the machine stops inside the
+    **What it guarantees.** With a budget whose bounds are what they are declared to be, the machine stops inside the
     clearance whatever operator and network do, from a start where it can: proved where the clearance is a distance
     along a line that the brake acts along, best effort elsewhere or with an unverified fallback. With wave coding
     never more energy has come out than went in, less what is in flight. **What it does not.** Passivity limits
@@ -226,21 +123,24 @@ class TeleopChannel(CommandGate):
         env: With a one-dimensional Box action space.
         uplink: A `Link` for actions, the dict of one, or a delay in s.
         downlink: For observations, likewise.
-        coding: "plain" or "wave".
-        impedance: Characteristic impedance b of the waves, N s/m; for "wave".
-        ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
+        impedance: Characteristic impedance b of waves, N s/m; None sends flow and effort themselves.
+        budget: A `StoppingBudget` or the dict of one, whose clearance is a `Clearance` or a function of the env.
+            None: authority is never revoked.
+        video_s: T_video, exposure, encoding and display, without the downlink, s.
+        human_s: T_human, the operator's reaction, s.
+        longest_s: No ceiling is higher, s: an operator who is silent for longer loses authority at rest, too.
         fallback: The local brake: "brake", "hold", "zero", or a function of the plant.
-        plant: For the ceiling's constraint and the fallback; None reads the env's MuJoCo model.
+        plant: For the budget's constraint and the fallback; None reads the env's MuJoCo model.
 
     Info, at every step: ``teleop/round_trip_s``, ``teleop/created_j`` (float), ``teleop/revoked`` (bool),
     ``teleop/lost`` (int); without a filter inside ``executed_action`` and ``action/clipped`` (float).
 
     Raises:
-        ConfigurationError: A link, an impedance or a ceiling that cannot be, or a wrong order.
+        ConfigurationError: A link, an impedance, a budget or a time that cannot be, or a wrong order.
 
     Example:
         >>> import gymnasium as gym, numpy as np, safe_wrappers as sw
-        >>> env = sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, coding="wave", impedance=40.0)
+        >>> env = sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, impedance=40.0)
         >>> _ = env.reset(seed=0)
         >>> for _ in range(1000):
         ...     info = env.step(np.array([0.1, 0.0]))[4]
@@ -257,47 +157,48 @@ class TeleopChannel(CommandGate):
         env: Env,
         uplink: Link | dict[str, Any] | float,
         downlink: Link | dict[str, Any] | float,
-        coding: Coding = "plain",
+        *,
         impedance: float | None = None,
-        ceiling: RoundTripCeiling | dict[str, Any] | None = None,
+        budget: StoppingBudget | dict[str, Any] | None = None,
+        video_s: float = 0.1,
+        human_s: float = 0.25,
+        longest_s: float = 1.0,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
     ) -> None:
         CommandGate.__init__(self, env)
         plant = own_plant(plant)
         self.uplink, self.downlink = _link("uplink", uplink), _link("downlink", downlink)
-        limit = None if ceiling is None else settings_from(RoundTripCeiling, ceiling, "ceiling", ", or None")
-        if coding not in get_args(Coding):
-            raise ConfigurationError(f"coding is one of {', '.join(get_args(Coding))}; got {coding!r}")
         self._port = Port(env) if env.has_wrapper_attr("port_flow") else None
         self._waves: WaveCoding | None = None
-        if (coding == "wave") != (impedance is not None):
-            raise ConfigurationError(
-                f'coding="wave" takes an impedance in N s/m, plain coding none; got {impedance!r}'
-            )
         if impedance is not None:
             if self._port is None:
                 published = "port_flow, port_effort_observed, port_feedthrough and port_effort_acted"
-                raise ConfigurationError(
-                    f'coding="wave" needs a port: {env.unwrapped!r} publishes no {published}'
-                )
+                raise ConfigurationError(f"waves need a port: {env.unwrapped!r} publishes no {published}")
             refuse_changed_actions(env)
             self._waves = WaveCoding(self._port, self.control_dt, positive("impedance", impedance, "N s/m"))
         self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
         self._down = Line(self.downlink, "TeleopChannel down 0", self._same_s)
-        self._watch: RoundTripWatch | None = None
-        if limit is not None:
+        self._operator_s = non_negative("video_s", video_s, "s") + non_negative("human_s", human_s, "s")
+        self._longest_s = positive("longest_s", longest_s, "s")
+        self._budget: BoundBudget | None = None
+        if budget is not None:
+            budget = settings_from(StoppingBudget, budget, "budget", ", or None")
+            if not budget.measures_approach:
+                name = type(budget.clearance).__name__
+                raise ConfigurationError(f"{name} does not say how fast it is approached: give a Clearance")
             refuse_changed_actions(env)
-            plant = bound_plant(env, plant, fallback, limit.budget.clearance)  # type: ignore[union-attr]
+            plant = bound_plant(env, plant, fallback, budget.clearance)
             self._fallback = FallbackController(env, fallback, plant)
-            self._watch = RoundTripWatch(limit, env, plant, self.control_dt, self._same_s)
+            self._budget = BoundBudget(budget, env, plant)
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._up.reset(self.env, seed)
         self._down.reset(self.env, seed, copy.deepcopy(observation))
         observation = super()._begin(observation, info, seed)
-        if self._watch is not None:
-            self._watch.reset()
+        self.revoked, self._revoked_s = False, -math.inf
+        if self._budget is not None:
+            self._look(self._budget)
         self.ledger = ChannelLedger()
         if self._port is not None:
             self._port.reset(observation)
@@ -315,8 +216,8 @@ class TeleopChannel(CommandGate):
         self._send_up(self._inside(action_array(action, self._shape)), now_s)
         arrived = self._up.receive(now_s)
         command, seen_s = self._in_force(arrived)
-        if self._watch is not None:
-            self._watch.judge(self._boxed(command), seen_s, now_s - seen_s, now_s)
+        if self._budget is not None:
+            self._judge(self._budget, self._boxed(command), seen_s, now_s)
         if self.revoked:
             assert self._fallback is not None
             command = self._fallback.command().astype(self._dtype)
@@ -324,15 +225,34 @@ class TeleopChannel(CommandGate):
         # What the brake or a filter inside does is not the operator's: the channel's port stood still.
         obeyed = not self.revoked and np.array_equal(executed, np.asarray(command, dtype=np.float64))
         shown = self._send_down(executed, observation, obeyed)
-        if self._watch is not None:
-            self._watch.look()
+        if self._budget is not None:
+            self._look(self._budget)
         self._report(info, now_s - seen_s)
         return shown, reward, terminated, truncated, info
 
-    @property
-    def revoked(self) -> bool:
-        """Whether the local brake acted in the last step."""
-        return self._watch is not None and self._watch.revoked
+    def _look(self, budget: BoundBudget) -> None:
+        """Measure the clearance, and the ceiling: the longest round trip, s, within `longest_s` of 0.
+
+        Where nothing can be read it is the lowest.
+        """
+        budget.measure()
+        highest_s = -math.inf
+        if budget.readable:  # the next look comes one control step from now
+            highest_s = budget.longest_round_trip(self._operator_s) - self.control_dt
+        self._ceiling_s = min(max(highest_s, -self._longest_s), self._longest_s)
+
+    def _judge(self, budget: BoundBudget, command: Array, seen_s: float, now_s: float) -> None:
+        """Revoke authority, or give it back, for a command (m,) made from the image that was taken at `seen_s`."""
+        allowed_s = self._ceiling_s
+        if self.revoked and allowed_s > 0.0:
+            allowed_s *= _RELEASE
+        trusted = budget.readable and now_s - seen_s <= allowed_s + self._same_s
+        if self.revoked:
+            trusted = trusted and seen_s >= self._revoked_s - self._same_s
+        trusted = trusted and budget.can_stop_after(command, self.control_dt)
+        if not trusted and not self.revoked:
+            self._revoked_s = now_s
+        self.revoked = not trusted
 
     def _send_up(self, action: NDArray[Any] | None, now_s: float) -> None:
         """Send an action; one that is not finite, or from an image that nobody has seen yet, counts as lost."""
@@ -350,17 +270,15 @@ class TeleopChannel(CommandGate):
             self._send(self._up, action, self._images[step], wave)
 
     def _send(self, line: Line, content: Any, made_s: float, wave: Array | None) -> None:
-        sequence, lost = line.send(content, made_s, wave, self.now_s)
-        if self._waves is not None:
-            self._waves.sent(line is self._up, sequence, wave, lost)
-        self._lost += lost
+        energy_j = 0.0 if wave is None or self._waves is None else self._waves.energy(wave)
+        self._lost += line.send(Packet(content, made_s, wave, energy_j), self.now_s)
 
     def _in_force(self, arrived: list[Packet]) -> tuple[Any, float]:
         """The command for this step, at first zero, and when the image was taken that it was made from, s."""
         newest = self._up.newest
         command = self._rest() if newest.content is None else newest.content.copy()
         # What is judged is what is executed, by a filter inside too.
-        if self._watch is not None and ((command < self._low) | (command > self._high)).any():
+        if self._budget is not None and ((command < self._low) | (command > self._high)).any():
             command = self._boxed(command).astype(self._dtype)
         if self._waves is None:
             return command, newest.made_s
@@ -380,7 +298,7 @@ class TeleopChannel(CommandGate):
             wave = None if waves is None else waves.settle(*given, obeyed)
         self._send(self._down, copy.deepcopy(observation), self.now_s, wave)
         arrived, newest = self._down.receive(self.now_s), self._down.newest
-        self._images.append(max(self._images[-1], newest.made_s))
+        self._images.append(newest.made_s)
         shown = copy.deepcopy(newest.content)
         if port is not None:
             shown = shown if waves is None else port.replaced(shown, waves.felt(arrived))
@@ -390,8 +308,11 @@ class TeleopChannel(CommandGate):
 
     @property
     def stored_j(self) -> float:
-        """Energy of waves on their way, J; 0 for plain coding."""
-        return 0.0 if self._waves is None else self._waves.stored_j
+        """Energy of waves on their way, or arrived and not put out yet, J."""
+        if self._waves is None:
+            return 0.0
+        flying = (packet for _, packet in (*self._up.coming, *self._down.coming))
+        return math.fsum(packet.energy_j for packet in (*flying, *self._waves.waiting))
 
     def _report(self, info: dict[str, Any], round_trip_s: float) -> None:
         info[keys.TELEOP_ROUND_TRIP_S] = round_trip_s

@@ -1,23 +1,23 @@
 """Ports of effort and flow, and how both are written into packets with their energy paid for."""
 
-import heapq
 import math
+from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.control.teleop import WaveLine, effort_and_outgoing, port_energy, to_waves
+from safe_wrappers.control.teleop import effort_and_outgoing, port_energy, to_waves
 from safe_wrappers.errors import Array
 from safe_wrappers.wrappers.layer import Env
 
 
 class Packet(NamedTuple):
-    """What goes over the network; packets compare by their numbers."""
+    """What goes over the network."""
 
-    sequence: int  # on its line, from 0
     content: Any  # the operator's action, or the env's observation
     made_s: float  # when the image was taken that it was made from, or that it is, s
-    wave: Array | None  # what the coding adds
+    wave: Any = None  # what the coding adds, sqrt(W), shape (m,)
+    energy_j: float = 0.0  # of the wave
 
 
 class Port:
@@ -65,8 +65,11 @@ class Port:
 class WaveCoding:
     """Flow and effort as waves (`impedance` in N s/m), each of which pays for what it does at the other end.
 
-    In each tick of `tick_s`, in this order: `near` (the operator moves), `sent`, `far` (what arrived is decoded), the
-    env's step, `settle` (what truly happened), `sent`, `felt`.
+    A wave u carries the energy `|u|^2 / 2 * tick_s`. Every wave that arrives is put out once, one per tick; zero
+    while there is none. So no more energy comes out than has arrived, and the delay grows to that of the latest one.
+
+    In each tick of `tick_s`, in this order: `near` (the operator moves), `far` (what arrived is decoded), the env's
+    step, `settle` (what truly happened), `felt`.
     """
 
     def __init__(self, port: Port, tick_s: float, impedance: float) -> None:
@@ -74,41 +77,30 @@ class WaveCoding:
 
     def reset(self) -> None:
         """A new episode."""
-        size = len(self._port.flow)
-        self._still = np.zeros(size)
-        self._up, self._down = (WaveLine(self._tick_s, size) for _ in range(2))
-        self._back: list[Packet] = []
-        self._waiting: list[tuple[int, float]] = []
+        self._still = np.zeros(len(self._port.flow))
+        self._up: deque[Packet] = deque()
+        self._down: deque[Packet] = deque()
         self._incoming = self._felt = self._still
         self._seen_s = self._owed_j = 0.0
 
     def near(self, flow: Array | None) -> Array | None:
         """The wave in the packet up, of an operator who moves with this flow; None who is not there."""
-        incoming = self._delivered(self._down, self._back)  # while the operator is away, it ends there
-        self._back = []
+        # While the operator is away, it ends there.
+        incoming = self._down.popleft().wave if self._down else self._still
         if flow is None:
             self._felt = self._still
             return None
         self._felt, outgoing = effort_and_outgoing(flow, incoming, self._impedance)
         return outgoing
 
-    def sent(self, up: bool, sequence: int, wave: Any, lost: bool) -> None:
-        """A packet left, up or down."""
-        line = self._up if up else self._down
-        line.send(wave, sequence)
-        if lost:
-            line.lose(sequence)
-
     def far(self, arrived: list[Packet]) -> tuple[Array, float]:
         """The flow that the command gets by what has arrived; when its image was taken, s."""
-        wave = self._delivered(self._up, arrived)
-        # Seen as late as the wave that is put out now, or the last one.
-        for packet in arrived:
-            heapq.heappush(self._waiting, (packet.sequence, packet.made_s))
-        if self._waiting:
-            self._seen_s = heapq.heappop(self._waiting)[1]
+        self._up.extend(arrived)
+        wave = self._still
+        if self._up:  # seen as late as the wave that is put out now, or the last one
+            _, self._seen_s, wave, _ = self._up.popleft()
         # What the machine took beyond what had arrived is paid first.
-        energy = self._energy(wave)
+        energy = self.energy(wave)
         paid = min(self._owed_j, energy)
         if paid > 0.0:
             self._owed_j -= paid
@@ -126,8 +118,8 @@ class WaveCoding:
             return self._still
         _, outgoing = to_waves(effort, flow, self._impedance)
         # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.
-        left = self._energy(self._incoming) - port_energy(effort, flow, self._tick_s)
-        energy = self._energy(outgoing)
+        left = self.energy(self._incoming) - port_energy(effort, flow, self._tick_s)
+        energy = self.energy(outgoing)
         if left < 0.0:
             self._owed_j -= left
             outgoing = np.zeros_like(outgoing)
@@ -137,16 +129,14 @@ class WaveCoding:
 
     def felt(self, arrived: list[Packet]) -> Array:
         """The effort that the operator feels in this tick, in which these packets arrive."""
-        self._back += arrived
+        self._down.extend(arrived)
         return self._felt
 
     @property
-    def stored_j(self) -> float:
-        """Energy on its way, of waves that have arrived and were not put out yet too, J."""
-        return sum(line.in_flight_j + line.reserve_j for line in (self._up, self._down))
+    def waiting(self) -> list[Packet]:
+        """What has arrived and was not put out yet."""
+        return [*self._up, *self._down]
 
-    def _delivered(self, line: WaveLine, arrived: list[Packet]) -> Array:
-        return line.deliver([(packet.sequence, packet.wave) for packet in arrived])  # type: ignore[misc]
-
-    def _energy(self, wave: Array) -> float:
+    def energy(self, wave: Array) -> float:
+        """Of a wave, J."""
         return 0.5 * port_energy(wave, wave, self._tick_s)

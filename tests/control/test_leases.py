@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.watchdog import longest_lease, longest_lease_of_room
+from safe_wrappers.control.watchdog import longest_lease
 
 POSITIVE = st.floats(1e-3, 1e3)
 SMALL = st.floats(0.0, 2.0)
@@ -162,20 +162,3 @@ def test_more_of_anything_bad_shortens_the_lease(d, v, b, delays, a, more):
         longest_lease(d, v, b, delays, acceleration=a + more),
     ):
         assert shorter <= lease + 1e-9 * abs(lease) or lease <= 0.0
-
-
-@given(st.floats(-10, 100), st.floats(-1, 10), SMALL)
-@example(1.0, 5e-324, 0.1)
-def test_a_lease_of_room_is_used_up_exactly(room, closing, delays):
-    lease = float(longest_lease_of_room(room, closing, delays))
-    if closing <= 0.0:
-        assert lease == (np.inf if room > 0.0 else -np.inf)
-    elif np.isfinite(lease):
-        assert Fraction(closing) * (Fraction(lease) + Fraction(delays)) <= Fraction(room)
-        assert lease == pytest.approx(min(room / closing, 1e300) - delays, rel=1e-9, abs=1e-12)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_lease_of_unknown_room_is_revoked(bad):
-    assert longest_lease_of_room([bad, 1.0], [1.0, bad], 0.1).tolist() == [-np.inf, -np.inf]
-    assert longest_lease_of_room(1.0, 1.0, -0.1) == -np.inf

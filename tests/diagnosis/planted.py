@@ -118,7 +118,7 @@ HEALTHY: dict[str, Callable[[], Made]] = {
         gym.make("FlexJointReach-v0"), lambda env: waving(env, 0.15, 200.0)
     ),
     "TeleopContact through waves, in the air": lambda: _with(
-        sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, coding="wave", impedance=40.0),
+        sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, impedance=40.0),
         lambda env: waving(env, 0.02, 500.0),
     ),
 }

@@ -8,6 +8,7 @@ been forgotten at a reset can hide in both.
 from dataclasses import dataclass, field
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
@@ -47,8 +48,17 @@ def script(space, seed=0, drive=None):
     return action
 
 
+def _generators(env):
+    """The wrappers' own random numbers, the outermost first."""
+    inner, found = env, []
+    while isinstance(inner, gym.Wrapper):
+        found += [(inner, name) for name in ("random", "_random") if name in vars(inner)]
+        inner = inner.env
+    return found
+
+
 def by_hand(make, actions, i, *, seed, steps, options=None):
-    """The episodes of sub-env i: reset where one ends, on a new env that carries on the old one's generator."""
+    """The episodes of sub-env i: reset where one ends, on a new env that carries on the old one's generators."""
     env = make(i)
     observation, info = env.reset(seed=seed, options=options)
     episodes = [Episode(observation, info)]
@@ -61,6 +71,8 @@ def by_hand(make, actions, i, *, seed, steps, options=None):
         if terminated or truncated:
             used, env = env, make(i)
             env.unwrapped.np_random = used.unwrapped.np_random
+            for (new, name), (old, _) in zip(_generators(env), _generators(used), strict=True):
+                setattr(new, name, getattr(old, name))
             if hasattr(used.unwrapped, "ends"):
                 env.unwrapped.ends = used.unwrapped.ends
             episodes.append(Episode(*env.reset()))
@@ -121,6 +133,28 @@ def unroll(envs, actions, *, seed, steps, options=None):
                     episodes[i].append(Episode(again[i], told))
                 else:
                     assert told == {} and again[i].tobytes() == observations[i].tobytes()
+    return episodes
+
+
+def unroll_sb3(envs, actions, *, seed, steps, options=None):
+    """The episodes of every sub-env of an SB3 vector env, which resets within the step."""
+    n = envs.num_envs
+    envs.seed(seed)
+    envs.set_options(options)
+    observations = envs.reset()
+    episodes = [[Episode(o, told)] for o, told in zip(observations, envs.reset_infos, strict=True)]
+    for _ in range(steps):
+        proposed = [actions(i, len(e) - 1, len(e[-1].steps)) for i, e in enumerate(episodes)]
+        observations, rewards, dones, infos = envs.step(np.stack(proposed))
+        assert len(infos) == n
+        for i in range(n):
+            info = dict(infos[i])
+            truncated = info.pop("TimeLimit.truncated")
+            assert ("terminal_observation" in info) == dones[i] == ("episode" in info)
+            last = info.pop("terminal_observation") if dones[i] else observations[i]
+            episodes[i][-1].steps.append(Step(last, rewards[i], dones[i] and not truncated, truncated, info))
+            if dones[i]:
+                episodes[i].append(Episode(observations[i], envs.reset_infos[i]))
     return episodes
 
 

@@ -6,6 +6,7 @@ The oracle is Gymnasium's own vector env around `CBFActionFilter`s.
 import copy
 import dataclasses
 import functools
+from collections.abc import Callable
 from unittest import mock
 
 import gymnasium as gym
@@ -13,7 +14,7 @@ import gymnasium_robotics
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from vector_worlds import AtHazard, ScheduledCart, drift, push, read, slow
+from worlds import BEFORE_THE_WALL, HAZARDS, AtHazard, ScheduledCart, cart_plant
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
@@ -24,49 +25,88 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:the policy's action:UserWarning"),
     pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning"),
 ]
-every_mode = pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 HORIZON, STEPS, ENVS = 9, 24, 3
 
 
-def made(env_id, inner=lambda env: env):
-    return inner(gym.make(env_id, max_episode_steps=HORIZON))
+@dataclasses.dataclass
+class Play:
+    """How the vector env of filters and the filter of a vector env are made and driven.
 
+    Attributes:
+        make: An env.
+        limits: The constraints.
+        mode: Of resets.
+        plant: None: that of MuJoCo envs.
+        options: Of the filter.
+        form: Of the actions, made from the action space's.
+    """
 
-def recommended(env_id, **changes):
-    """`protect`'s constraints, the limit of a speed lower where random actions would not reach it."""
-    return [dataclasses.replace(c, **changes) for c in sw.protect(gym.make(env_id)).constraints]
+    make: Callable[[], gym.Env]
+    limits: list
+    mode: AutoresetMode = AutoresetMode.NEXT_STEP
+    plant: Callable[[], sw.Plant] | None = None
+    options: dict = dataclasses.field(default_factory=dict)
+    form: Callable = np.asarray
 
+    def pair(self, envs=ENVS):
+        """Both, anew."""
+        plain = SyncVectorEnv([self.make] * envs, autoreset_mode=self.mode)
+        alike = SyncVectorEnv(
+            [lambda: self._filter(sw.CBFActionFilter, self.make())] * envs, autoreset_mode=self.mode
+        )
+        return alike, self._filter(sw.VectorCBFActionFilter, plain)
 
-TABLE = {
-    "SafePointGoal1-v0": ({}, AtHazard),
-    "SafePointGoal2-v0": ({"detour": False}, AtHazard),
-    "SafeCarGoal1-v0": ({}, AtHazard),
-    "InvertedPendulum-v5": ({"margin": 0.85}, None),
-    "Reacher-v5": ({"limit": 1.0}, None),
-    "PointMaze_UMaze-v3": ({"margin": 0.25}, None),
-    "SafeHalfCheetahVelocity-v0": ({"limit": 0.2}, None),
-    "SafeAntVelocity-v0": ({"limit": 0.4}, None),
-    "SafeHopperVelocity-v0": ({"limit": 0.1}, None),
-    "SafeSwimmerVelocity-v0": ({"limit": 0.05}, None),
-    "SafeHumanoidVelocity-v0": ({"limit": 0.03}, None),
-    "FetchReach-v4": ({}, None),
-}
-"""Env id -> changes of the recipe; a wrapper that starts where the filter is needed."""
-
-
-def pair(make, constraints, mode=AutoresetMode.NEXT_STEP, envs=ENVS, **options):
-    """The vector env of filters, and the filter of a vector env."""
-
-    def filtered():
-        return sw.CBFActionFilter(
-            make(), constraints, **{k: v() if k == "plant" else v for k, v in options.items()}
+    def _filter(self, kind, env):
+        return kind(
+            env, self.limits, **({} if self.plant is None else {"plant": self.plant()}), **self.options
         )
 
-    plain = SyncVectorEnv([make] * envs, autoreset_mode=mode)
-    given = {k: v() if k == "plant" else v for k, v in options.items()}
-    return SyncVectorEnv([filtered] * envs, autoreset_mode=mode), sw.VectorCBFActionFilter(
-        plain, constraints, **given
-    )
+
+def on(env_id, inner=lambda env: env, changes=None, **more):
+    """`protect`'s constraints, the limit of a speed lower where random actions would not reach it."""
+    limits = [dataclasses.replace(c, **(changes or {})) for c in sw.protect(gym.make(env_id)).constraints]
+    return Play(lambda: inner(gym.make(env_id, max_episode_steps=HORIZON)), limits, **more)
+
+
+def at_hazard(**more):
+    return on("SafePointGoal1-v0", AtHazard, **more)
+
+
+def cart(**more):
+    return Play(ScheduledCart, [BEFORE_THE_WALL], plant=cart_plant, **more)
+
+
+def simulated(**more):
+    backup = [lambda x: [-2.0 * np.sign(x[2])], "zero"]
+    shield = sw.constraints.PredictiveShield(lambda x: 2.0 - abs(x[2]), 5, backup=backup, candidates=4)
+    plant = functools.partial(sw.SimulatorPlant, check_steps=0)
+    return Play(lambda: gym.make("Pendulum-v1", max_episode_steps=HORIZON), [shield], plant=plant, **more)
+
+
+PLAYS = {
+    "SafePointGoal2": on("SafePointGoal2-v0", AtHazard, {"detour": False}),
+    "SafeCarGoal1": on("SafeCarGoal1-v0", AtHazard),
+    "InvertedPendulum": on("InvertedPendulum-v5", changes={"margin": 0.85}),
+    "PointMaze_UMaze": on("PointMaze_UMaze-v3", changes={"margin": 0.25}),
+    "HalfCheetah": on("SafeHalfCheetahVelocity-v0", changes={"limit": 0.2}),
+    "Ant": on("SafeAntVelocity-v0", changes={"limit": 0.4}),
+    "Hopper": on("SafeHopperVelocity-v0", changes={"limit": 0.1}),
+    "Swimmer": on("SafeSwimmerVelocity-v0", changes={"limit": 0.05}),
+    "Humanoid": on("SafeHumanoidVelocity-v0", changes={"limit": 0.03}),
+    "FetchReach": on("FetchReach-v4"),
+    "delay": at_hazard(plant=functools.partial(sw.MujocoPlant, delay_s=0.02)),
+    "margin": at_hazard(options={"margin": 0.05}),
+    "hold": cart(options={"fallback": "hold"}),
+}
+FORMS = {"list": np.ndarray.tolist, "float64": np.float64, "float16": np.float16}
+for form in FORMS:  # the reward of Reacher has the action's dtype
+    PLAYS[f"SafePointGoal1, {form}"] = at_hazard(form=FORMS[form])
+    PLAYS[f"Reacher, {form}"] = on("Reacher-v5", changes={"limit": 1.0}, form=FORMS[form])
+for mode in AutoresetMode:
+    PLAYS[f"SafePointGoal1, {mode.value}"] = at_hazard(mode=mode)
+    PLAYS[f"Reacher, {mode.value}"] = on("Reacher-v5", changes={"limit": 1.0}, mode=mode)
+    PLAYS[f"cart, {mode.value}"] = cart(mode=mode)
+    PLAYS[f"simulated, {mode.value}"] = simulated(mode=mode)
 
 
 def script(envs, steps=STEPS, seed=0):
@@ -121,73 +161,23 @@ def assert_same_start(one, other):
     assert_same(one[1], other[1])
 
 
-@pytest.mark.parametrize("env_id", TABLE)
-def test_it_is_a_vector_env_of_filtered_envs(env_id):
-    changes, inner = TABLE[env_id]
-    alike, together = pair(
-        functools.partial(made, env_id, inner or (lambda env: env)), recommended(env_id, **changes)
-    )
-    assert play(alike, together, script(alike)) > 3
-    assert [single.filter_calls for single in together.filters] == [
-        single.filter_calls for single in alike.envs
-    ]
+@pytest.mark.parametrize("name", PLAYS)
+def test_it_is_a_vector_env_of_filtered_envs(name):
+    alike, together = PLAYS[name].pair()
+    assert play(alike, together, map(PLAYS[name].form, script(alike, 40))) > 3
+    assert [one.filter_calls for one in together.filters] == [one.filter_calls for one in alike.envs]
 
 
-@every_mode
-@pytest.mark.parametrize("env_id", ["SafePointGoal1-v0", "Reacher-v5"])
-def test_in_every_autoreset_mode(env_id, mode):
-    changes, inner = TABLE[env_id]
-    make = functools.partial(made, env_id, inner or (lambda env: env))
-    alike, together = pair(make, recommended(env_id, **changes), mode)
-    assert play(alike, together, script(alike, 40)) > 3
-
-
-@every_mode
-@pytest.mark.parametrize("fallback", ["hold", "brake"])
-def test_without_mujoco_and_with_a_fallback_that_holds(mode, fallback):
-    wall = sw.constraints.Clearance(
-        [sw.constraints.Plane([1.0], [-1.0])], braking=1.0, position=[0], velocity=[1]
-    )
-    plant = functools.partial(sw.AnalyticPlant, f=drift, g=push, state=read, control_dt=0.1)
-    alike, together = pair(ScheduledCart, [wall], mode, plant=plant, fallback=fallback)
-    assert play(alike, together, script(alike, 40)) > 3
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_long_episodes_among_the_hazards_with_detours_and_other_precisions(seed):
-    def make():
-        return AtHazard(gym.make("SafePointGoal1-v0"))
-
-    alike, together = pair(make, recommended("SafePointGoal1-v0"), envs=4)
-    rng = np.random.default_rng(seed)
-    actions = np.repeat(rng.uniform(-1.0, 1.0, (10, 4, 2)), 25, axis=0)
+def test_long_episodes_among_the_hazards():
+    limits = sw.protect(gym.make("SafePointGoal1-v0")).constraints
+    alike, together = Play(lambda: AtHazard(gym.make("SafePointGoal1-v0")), limits).pair(4)
+    actions = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, (10, 4, 2)), 25, axis=0)
     actions[..., 0] = 1.0
-    assert play(alike, together, actions.astype(np.float32 if seed else np.float64), seed) > 30
-
-
-@pytest.mark.parametrize(
-    "form", [np.ndarray.tolist, np.float64, np.float16], ids=["list", "float64", "float16"]
-)
-@pytest.mark.parametrize("env_id", ["SafePointGoal1-v0", "Reacher-v5"])
-def test_what_is_written_has_the_dtype_of_the_space_in_which_an_env_may_compute(env_id, form):
-    changes, inner = TABLE[env_id]
-    make = functools.partial(made, env_id, inner or (lambda env: env))
-    alike, together = pair(make, recommended(env_id, **changes))
-    assert (
-        play(alike, together, map(form, script(alike, 40))) > 3
-    )  # the reward of Reacher has the action's dtype
-
-
-@pytest.mark.parametrize("options", [{"plant": lambda: sw.MujocoPlant(delay_s=0.02)}, {"margin": 0.05}])
-def test_with_a_delay_or_a_margin(options):
-    make = functools.partial(made, "SafePointGoal1-v0", AtHazard)
-    alike, together = pair(make, recommended("SafePointGoal1-v0"), **options)
-    assert play(alike, together, script(alike)) > 3
+    assert play(alike, together, actions.astype(np.float32)) > 30
 
 
 def test_what_changes_during_an_episode_is_read_again():
-    make = functools.partial(made, "SafePointGoal1-v0", AtHazard)
-    alike, together = pair(make, recommended("SafePointGoal1-v0"))
+    alike, together = at_hazard().pair()
     play(alike, together, script(alike))
     for single in (*alike.envs, *together.filters):
         single.plant.perturb(mass=1.5, damping=0.7)
@@ -199,8 +189,7 @@ def test_what_changes_during_an_episode_is_read_again():
 
 
 def test_after_a_reset_nothing_is_left_of_the_last_episode():
-    make = functools.partial(made, "SafePointGoal1-v0", AtHazard)
-    alike, together = pair(make, recommended("SafePointGoal1-v0"), fallback="hold")
+    alike, together = at_hazard(options={"fallback": "hold"}).pair()
     forward = np.ones((1, ENVS, 2), np.float32)
     play(
         alike, together, forward.repeat(HORIZON, axis=0)
@@ -211,9 +200,7 @@ def test_after_a_reset_nothing_is_left_of_the_last_episode():
 
 
 def test_a_copy_plays_alike_and_leaves_the_original_alone():
-    alike, together = pair(
-        functools.partial(made, "SafePointGoal1-v0", AtHazard), recommended("SafePointGoal1-v0")
-    )
+    alike, together = at_hazard().pair()
     play(alike, together, script(alike, 4))
     copied = copy.deepcopy(together)  # Gymnasium's envs are made anew
     there = [env.unwrapped.data.qpos.copy() for env in together.env.envs]
@@ -222,8 +209,7 @@ def test_a_copy_plays_alike_and_leaves_the_original_alone():
 
 
 def test_a_state_that_is_not_a_number_runs_the_fallback_and_a_start_outside_is_warned_of():
-    make = functools.partial(made, "SafePointGoal1-v0", AtHazard)
-    alike, together = pair(make, recommended("SafePointGoal1-v0"))
+    alike, together = at_hazard().pair()
     play(alike, together, script(alike, 4))
     infos = []
     for envs in (alike.envs, together.env.envs):
@@ -248,27 +234,7 @@ def test_actions_of_another_shape_and_other_vector_envs_are_refused():
         sw.protect(scaled)
     faulty = SyncVectorEnv([lambda: Outages(gym.make("SafePointGoal1-v0"), 0.1, 0.1)])
     with pytest.raises(sw.SafeWrappersError, match="Outages inside CBFActionFilter"):
-        sw.VectorCBFActionFilter(faulty, recommended("SafePointGoal1-v0"))
-
-
-def test_the_last_step_of_an_episode_is_reported_beside_envs_that_go_on():
-    # SB3's adapter asks for SAME_STEP: there a buffer of executed actions reads final_info.
-    makers = [functools.partial(ScheduledCart, index) for index in range(2)]
-    limit = [sw.constraints.Barrier(slow)]
-    plant = functools.partial(sw.AnalyticPlant, drift, push, read)
-    filtered = [lambda make=make: sw.CBFActionFilter(make(), limit, plant()) for make in makers]
-    same = AutoresetMode.SAME_STEP
-    alike = SyncVectorEnv(filtered, autoreset_mode=same)
-    together = sw.VectorCBFActionFilter(SyncVectorEnv(makers, autoreset_mode=same), limit, plant())
-    start = {"start": [0.0, 0.45], "ends": [[3], [100]]}
-    for envs in (alike, together):
-        envs.reset(seed=0, options=start)
-    for _ in range(3):
-        infos, others = (envs.step(np.ones((2, 1), np.float32))[4] for envs in (alike, together))
-    finals = others["final_info"]
-    np.testing.assert_array_equal(finals["_executed_action"], [True, False])
-    assert finals["cbf/intervened"][0] and finals["executed_action"][0] != 0.0
-    assert_same(infos, others)
+        sw.VectorCBFActionFilter(faulty, [HAZARDS])
 
 
 def test_after_a_reset_that_one_env_refuses_no_step_is_made():
@@ -291,9 +257,7 @@ def test_after_a_reset_that_one_env_refuses_no_step_is_made():
 
 
 def test_a_step_that_one_env_breaks_off_admits_nothing_of_the_next():
-    envs = sw.VectorCBFActionFilter(
-        SyncVectorEnv([lambda: gym.make("SafePointGoal1-v0")] * 2), recommended("SafePointGoal1-v0")
-    )
+    envs = sw.VectorCBFActionFilter(SyncVectorEnv([lambda: gym.make("SafePointGoal1-v0")] * 2), [HAZARDS])
     envs.reset(seed=0)
     actions = np.zeros((2, 2), dtype=np.float32)
     with (

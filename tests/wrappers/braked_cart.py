@@ -33,10 +33,12 @@ class BrakedCart(gym.Env):
         delay_s=0.0,
         age_s=0.0,
         noise=0.0,
+        reserve=0.0,
         dtype=np.float32,
     ):
         self.dt, self.wall, self.drive, self.braking, self.top = dt, wall, drive, braking, top
         self.start, self.delay_s, self.age_s, self.noise = (x, v), delay_s, age_s, noise
+        self.reserve = reserve
         self.action_space = gym.spaces.Box(
             np.array([-1.0, 0.0], dtype), np.array([1.0, 1.0], dtype), dtype=dtype
         )
@@ -106,9 +108,9 @@ class BrakedCart(gym.Env):
 
 
 def read_cart(env):
-    """For LeaseExpiry's `clearance`."""
+    """For LeaseExpiry's `clearance`: less what it may be wrong by, and what is to be kept."""
     clearance, speed = env.unwrapped.measured()
-    return [clearance], [speed]
+    return [clearance - env.unwrapped.reserve], [speed]
 
 
 def lease(env, clearance, **options):

@@ -1,7 +1,5 @@
 """What the tests of TeleopChannel share: the task behind a channel, drivers, and energy counted from outside."""
 
-from dataclasses import fields
-
 import gymnasium as gym
 import numpy as np
 
@@ -23,10 +21,10 @@ def clamp(braking=TELEOP_BRAKING, margin=MARGIN):
     return sw.constraints.Clearance([face], braking, bodies=["tool"], radius=TOOL_RADIUS, margin=margin)
 
 
-def ceiling(braking=TELEOP_BRAKING, margin=MARGIN, **changes):
-    arguments = {"acceleration": TELEOP_ACCELERATION, "top_speed": TELEOP_TOP_SPEED} | changes
-    budget = {f.name: arguments.pop(f.name) for f in fields(sw.StoppingBudget) if f.name in arguments}
-    return sw.teleop.RoundTripCeiling(sw.StoppingBudget(clamp(braking, margin), **budget), **arguments)
+def ceiling(braking=TELEOP_BRAKING, margin=MARGIN, delays_s=0.0, **times):
+    """What a channel with a ceiling takes."""
+    machine = {"acceleration": TELEOP_ACCELERATION, "top_speed": TELEOP_TOP_SPEED, "delays_s": delays_s}
+    return {"budget": sw.StoppingBudget(clamp(braking, margin), **machine), **times}
 
 
 def channel(uplink=0.0, downlink=0.0, inside=None, **options):

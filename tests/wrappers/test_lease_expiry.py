@@ -42,15 +42,11 @@ def draw(rng):
         "noise": float(rng.choice([0.0, rng.uniform(0.0, 0.2)])),
     }
     v = rng.uniform(0.0, min(cart["top"], 4.0))
-    detect, confirm, act = rng.uniform(0.0, 1.5 * dt, 3) * rng.integers(0, 2)
-    cart["delay_s"] = detect + confirm + act
+    cart["delay_s"] = float(rng.uniform(0.0, 4.5 * dt) * rng.integers(0, 2))
+    margin = float(rng.choice([0.0, rng.uniform(0.0, 0.2)]))
+    cart["reserve"] = cart["noise"] + margin
     options = {
-        "detect_s": detect,
-        "confirm_s": confirm,
-        "act_s": act,
-        "age_s": cart["age_s"],
-        "localisation": cart["noise"],
-        "margin": float(rng.choice([0.0, rng.uniform(0.0, 0.2)])),
+        "delays_s": cart["delay_s"] + cart["age_s"],
         "max_lease_s": float(rng.choice([2 * dt, 5 * dt, rng.uniform(2 * dt, 1.0), 1.0])),
         "blend_time": float(rng.choice([0.0, dt, rng.uniform(0.0, 5 * dt)])),
         "top_speed": None if math.isinf(cart["top"]) else cart["top"],
@@ -58,7 +54,7 @@ def draw(rng):
     options["max_lease_s"] = max(options["max_lease_s"], options["blend_time"] + 2 * dt)
     # Wherever it starts, it can still stop, if the brakes are put on now, with all their delays.
     way, speed = worst_way(cart["delay_s"], v, cart["drive"], cart["top"])
-    reserve = options["margin"] + 2.0 * cart["noise"]
+    reserve = margin + 2.0 * cart["noise"]
     cart["wall"] = way + speed**2 / (2.0 * cart["braking"]) + reserve + rng.exponential(1.5)
     cart["v"] = v
     return cart, options
@@ -93,8 +89,7 @@ def follow(seed, steps=60):
     cart = BrakedCart(**arguments)
     env = leased(cart, **options)
     env.reset(seed=seed)
-    reserve = options["localisation"] + options["margin"]
-    fixed = sum(options[k] for k in ("detect_s", "confirm_s", "age_s", "act_s"))
+    reserve, fixed = cart.reserve, options["delays_s"]
 
     def lease(clearance, speed, more):
         return lease_by_bisection(clearance, speed, cart.braking, cart.drive, cart.top, reserve, fixed + more)
@@ -129,7 +124,7 @@ def follow(seed, steps=60):
         assert remaining - 2e-6 * env.control_dt <= info["lease/remaining_s"] <= remaining + 1e-9
         np.testing.assert_allclose(cart.given[-1], wanted, rtol=0, atol=2e-7)
         counts += flags
-    assert cart.farthest <= cart.wall - options["margin"] + 1e-9
+    assert cart.farthest <= cart.wall - (reserve - cart.noise) + 1e-9
     return counts
 
 
@@ -155,18 +150,18 @@ def test_the_lease_is_just_long_enough_and_one_five_percent_longer_hits(dt, driv
     hits = 0
     for _ in range(20):
         braking, v, steps = rng.uniform(1.0, 6.0), rng.uniform(0.3, 3.0), int(rng.integers(20, 40))
-        detect, confirm, act, age = rng.uniform(0.0, 2.0 * dt, 4)
-        tau = steps * dt + detect + confirm + act + age
+        delay, age = rng.uniform(0.0, 6.0 * dt), rng.uniform(0.0, 2.0 * dt)
+        tau = steps * dt + delay + age
         way, speed = worst_way(tau, v, drive, math.inf)
         # The lease is worth exactly so many steps. It is granted `age` late: the cart has sped up by nothing, then.
         wall = way + speed**2 / (2.0 * braking) + 1e-7
         for stretch in (1.0, 1.05):
             monkeypatch.setattr(BoundBudget, "longest_time", lambda self, d, s=stretch: s * true(self, d))
-            cart = BrakedCart(dt, wall, drive, braking, v=v, delay_s=detect + confirm + act)
+            cart = BrakedCart(dt, wall, drive, braking, v=v, delay_s=delay)
             # The worst case of an old reading: full drive from the moment on at which it was taken.
             cart.reset()
             x, now = worst_way(age, v, drive, math.inf)
-            env = leased(cart, detect_s=detect, confirm_s=confirm, age_s=age, act_s=act, max_lease_s=10.0)
+            env = leased(cart, delays_s=delay + age, max_lease_s=10.0)
             env.reset(options={"start": (x, now)})
             cart.applied = (1.0, 0.0)
             cart.measured = lambda w=wall, v=v: (w, v)
@@ -184,7 +179,7 @@ def test_the_lease_is_just_long_enough_and_one_five_percent_longer_hits(dt, driv
     assert hits == 20
 
 
-@pytest.mark.parametrize("part", ["act_s", "age_s", "localisation"])
+@pytest.mark.parametrize("part", ["delay_s", "age_s", "noise"])
 def test_every_part_of_the_budget_is_needed(part):
     # Among random worlds none is hit with it, and some are without it.
     hits = {True: 0, False: 0}
@@ -192,18 +187,19 @@ def test_every_part_of_the_budget_is_needed(part):
         for counted in hits:
             rng = np.random.default_rng(seed)
             dt = 0.02
-            size = 0.3 if part == "localisation" else rng.uniform(3.0, 10.0) * dt
+            size = 0.3 if part == "noise" else rng.uniform(3.0, 10.0) * dt
+            counted_as = "reserve" if part == "noise" else "delays_s"
+            known = {counted_as: size if counted else 0.0}
             cart = BrakedCart(
                 dt,
                 drive=3.0,
                 braking=2.0,
                 v=1.0,
                 wall=rng.uniform(1.5, 4.0),
-                delay_s=size if part == "act_s" else 0.0,
-                age_s=size if part == "age_s" else 0.0,
-                noise=size if part == "localisation" else 0.0,
+                reserve=known.pop("reserve", 0.0),
+                **{part: size},
             )
-            env = leased(cart, max_lease_s=2.0, **({part: size} if counted else {}))
+            env = leased(cart, max_lease_s=2.0, **known)
             env.reset(seed=seed)
             dead_from = rng.integers(1, 20)
             for t in range(80):

@@ -47,9 +47,7 @@ def test_a_clearance_on_a_mujoco_cart(reserve):
             rail(margin=margin, state_error=error),
             acceleration=20.0,
             top_speed=3.0,
-            act_s=0.01,
-            margin=0.01,
-            localisation=0.005,
+            delays_s=0.01,
         ),
         max_lease_s=5.0,
         blend_time=0.0,
@@ -61,7 +59,7 @@ def test_a_clearance_on_a_mujoco_cart(reserve):
         env.reset(seed=0)
         x, v = rng.uniform(-0.9, 0.9), rng.uniform(-3.0, 3.0)
         env.unwrapped.set_state(np.array([x, 0.0]), np.array([v, 0.0]))
-        away = margin + error + 0.01 + 0.005
+        away = margin + error
         wanted = min(
             lease_by_bisection(0.9 - x, v, 8.0, 20.0, 3.0, away, 0.01),
             lease_by_bisection(0.9 + x, -v, 8.0, 20.0, 3.0, away, 0.01),
@@ -218,6 +216,26 @@ def test_least_s_needs_a_filter_inside_and_no_more_than_max_lease_s():
         sw.LeaseExpiry(inside, sw.StoppingBudget(rail(), acceleration=1.0), min_lease_s=-0.1)
 
 
+@pytest.mark.parametrize(
+    ("clearance", "given", "needed"),
+    [
+        (lambda env: (1.0, 0.0), {"acceleration": 1.0}, "acceleration and braking"),
+        (lambda env: (1.0, 0.0), {"braking": 1.0}, "acceleration and braking"),
+        (rail(), {}, "takes acceleration, and maybe top_speed"),
+        (rail(), {"acceleration": 1.0, "braking": 9.0}, "takes acceleration, and maybe top_speed"),
+        (sw.constraints.JointSpeedLimit(1.0), {"acceleration": 1.0}, "takes closing_speed; got"),
+        (
+            sw.constraints.JointSpeedLimit(1.0),
+            {"closing_speed": 1.0, "top_speed": 1.0},
+            "takes closing_speed;",
+        ),
+    ],
+)
+def test_a_budget_takes_the_bounds_that_belong_to_its_clearance(clearance, given, needed):
+    with pytest.raises(ConfigurationError, match=needed):
+        sw.StoppingBudget(clearance, **given)
+
+
 class Checked(sw.Constraint):
     """A constraint that only a state can show to be wrong."""
 
@@ -244,15 +262,15 @@ def test_what_only_a_state_can_show_is_refused_at_the_reset():
 HOLD, BRAKING = 0.1, 4.0
 
 
-def measured(room, own, reserves):
+def measured(room, own, **delay):
     """The budget of a cart at rest, so far from a wall."""
     cart, plant = BrakedCart(dt=HOLD, wall=room), cart_plant(HOLD)
     wall = sw.constraints.Plane([room], [-1.0])
-    clearance = sw.constraints.Clearance([wall], braking=1.0, position=[0], velocity=[1], **own)
+    clearance = sw.constraints.Clearance([wall], braking=BRAKING, position=[0], velocity=[1], **own)
     cart.reset()
     # So fast a cart could be that no command is let through unseen.
     plant.bind(cart)
-    bound = BoundBudget(sw.StoppingBudget(clearance, BRAKING, acceleration=1e3, **reserves), cart, plant)
+    bound = BoundBudget(sw.StoppingBudget(clearance, acceleration=1e3, **delay), cart, plant)
     bound.measure()
     return bound
 
@@ -263,29 +281,19 @@ def throttle(value):
 
 @pytest.mark.parametrize("room", [0.0, 0.002, 0.008])
 @pytest.mark.parametrize(
-    ("own", "extra"),
-    [
-        ({}, {}),
-        ({"margin": 0.2}, {}),
-        ({"state_error": 0.2}, {}),
-        ({}, {"margin": 0.2}),
-        ({}, {"localisation": 0.2}),
-        ({"margin": 0.05, "state_error": 0.03}, {"margin": 0.08, "localisation": 0.04}),
-    ],
-    ids=str,
+    "own", [{}, {"margin": 0.2}, {"state_error": 0.2}, {"margin": 0.05, "state_error": 0.03}], ids=str
 )
-def test_what_a_command_may_do_counts_the_clearances_reserves_and_the_budgets(own, extra, room):
+def test_what_a_command_may_do_counts_the_clearances_reserves(own, room):
     """From rest, one hold of an acceleration takes a h^2 / 2, and one hold of braking back to rest as much."""
-    left = room + sum(own.values()) + sum(extra.values())
-    budget = measured(left, own, extra)
+    budget = measured(room + sum(own.values()), own)
     most = room / HOLD**2
     for more, admitted in ((-1.0, True), (-1e-6, True), (1e-6, False), (0.5, False)):
         assert budget.can_stop_after(throttle(most + more), HOLD) == admitted
 
 
 def test_while_the_brake_only_begins_to_act_no_command_is_known_to_lead_away():
-    for act_s, admitted in ((0.0, True), (0.01, False)):
-        budget = measured(0.0, {}, {"act_s": act_s})
+    for delays_s, admitted in ((0.0, True), (0.01, False)):
+        budget = measured(0.0, {}, delays_s=delays_s)
         assert budget.longest_time() < HOLD
         assert budget.can_stop_after(throttle(-1.0), HOLD) == admitted
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.control.backup.heading_drive import HeadingDrive
-from safe_wrappers.errors import Array, UnsupportedEnvError
+from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, SLIDE
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -65,11 +65,6 @@ class PlanarFrame:
             wanted = "needs one actuator along its heading (at a site) and one on its hinge"
             raise UnsupportedEnvError(f"body {body!r} {wanted}")
         self.drive_index, self.turn_index = pushing[0], turning[0]
-
-    def views(self, data: mujoco.MjData) -> tuple[Array, Array]:
-        """Positions and velocities of the joints, without the body's place: parts of the data's arrays, (3,)."""
-        q, v = int(self.place[0]), int(self.place[1])
-        return data.qpos[q : q + 3], data.qvel[v : v + 3]
 
 
 def heading_drive(plant: MujocoPlant, body: str) -> HeadingDrive:

@@ -1,4 +1,4 @@
-"""Worlds for the vector envs: a cart whose episodes end when the test says, and three of the library's tasks.
+"""Worlds for the vector envs: a cart whose episodes end when the test says, and some of the library's tasks.
 
 Everything is a function or a class of a module, so that a spawned process can unpickle it; no learner is imported.
 """
@@ -14,6 +14,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import safe_wrappers as sw
 from safe_wrappers.info import COST, COST_SUBSTEP
+from safe_wrappers.wrappers.faults import Jitter, Outages, RepeatedCommands
 
 WALL = 1.0
 DT = 0.1
@@ -92,15 +93,23 @@ class CountUnsafeWarnings(gym.Wrapper):
         return result
 
 
+def cart_plant(delay_s=0.0):
+    return sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=DT, delay_s=delay_s)
+
+
+BEFORE_THE_WALL = sw.constraints.Clearance(
+    [sw.constraints.Plane([WALL], [-1.0])], braking=1.0, position=[0], velocity=[1]
+)
+HAZARDS = sw.constraints.HeadingDriveClearance(
+    [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004, detour=True
+)
+"""One for all envs: the filter's business is to take copies."""
+
+
 def cart_filter(index=0, delay_s=0.0, fallback="hold"):
     """A cart that stays in front of a wall and below 0.5 m/s. `hold` shows the last action after a reset."""
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=DT, delay_s=delay_s)
-    wall = sw.constraints.Clearance(
-        [sw.constraints.Plane([WALL], [-1.0])], braking=1.0, position=[0], velocity=[1]
-    )
-    return sw.CBFActionFilter(
-        ScheduledCart(index), [wall, sw.constraints.Barrier(slow, alpha=2.0)], plant=plant, fallback=fallback
-    )
+    limits = [BEFORE_THE_WALL, sw.constraints.Barrier(slow, alpha=2.0)]
+    return sw.CBFActionFilter(ScheduledCart(index), limits, plant=cart_plant(delay_s), fallback=fallback)
 
 
 def cart(index=0, delay_s=0.25):
@@ -159,7 +168,55 @@ def rover(index=0):
     return CountUnsafeWarnings(sw.RecordInterventions(limiter))
 
 
-TASKS = {"cart": cart, "point_goal": point_goal, "reacher": reacher, "pendulum": pendulum, "rover": rover}
+def commanded_cart(index=0):
+    """Faults, chunks, a lease and the filter."""
+    env = sw.CBFActionFilter(ScheduledCart(index), [BEFORE_THE_WALL], plant=cart_plant(), fallback="hold")
+    budget = sw.StoppingBudget(BEFORE_THE_WALL, acceleration=1.0)
+    lease = {"max_lease_s": 0.3, "min_lease_s": 0.1}
+    env = sw.LeaseExpiry(env, budget, plant=cart_plant(), fallback="hold", **lease)
+    env = sw.ChunkHandover(sw.RecordInterventions(env), 4, 2, [0, 2], rate_limit=6.0, fallback="hold")
+    return RepeatedCommands(Outages(env, 0.6, 0.3), 0.2)
+
+
+def commanded_point_goal(index=0):
+    env = AtHazard(gym.make("SafePointGoal1-v0", max_episode_steps=14 + 4 * index))
+    env = sw.CBFActionFilter(env, [HAZARDS], fallback="hold")
+    budget = sw.StoppingBudget(HAZARDS, closing_speed=4.0)
+    env = sw.RecordInterventions(sw.LeaseExpiry(env, budget, max_lease_s=0.2, min_lease_s=0.08))
+    return Outages(Jitter(sw.ChunkHandover(env, 6, 2, [0, 2], rate_limit=40.0), 0.05), 0.1, 0.1)
+
+
+def leased_pendulum(index=0):
+    """Lease and faults alone, no filter; the pole falls by itself."""
+    rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
+    clearance = sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0)
+    env = gym.make("InvertedPendulum-v5", max_episode_steps=8 + index)
+    env = sw.LeaseExpiry(env, sw.StoppingBudget(clearance, acceleration=20.0), max_lease_s=0.12)
+    return Outages(sw.RecordInterventions(env), 0.12, 0.3)
+
+
+def occluded(index=0):
+    """Estimates and sensor noise."""
+    cars = sw.occlusion.Track(
+        "car*", acceleration_noise=[0.0225, 0.0], reversion_s=2.0, start_position_std=[0.3, 0.0]
+    )
+    eye = sw.occlusion.Sensor("eye", view_deg=120, range_m=6.0)
+    task = gym.make("OccludedCrossing-v0", max_episode_steps=9 + index)
+    env = sw.OcclusionPenalty(task, [cars], eye, tolerance=0.5, weight=0.1)
+    return sw.RecordInterventions(sw.protect(env, cars="estimated", fallback="hold"))
+
+
+TASKS = {
+    "cart": cart,
+    "point_goal": point_goal,
+    "reacher": reacher,
+    "pendulum": pendulum,
+    "rover": rover,
+    "commanded_cart": commanded_cart,
+    "commanded_point_goal": commanded_point_goal,
+    "leased_pendulum": leased_pendulum,
+    "occluded": occluded,
+}
 
 
 KINDS = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
