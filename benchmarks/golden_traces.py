@@ -48,7 +48,7 @@ from safe_wrappers.envs.teleop_contact import (
     TELEOP_TOP_SPEED,
     TOOL_RADIUS,
 )
-from safe_wrappers.wrappers.faults import Jitter, Outages, RepeatedCommands
+from safe_wrappers.wrappers.faults import Outages, RepeatedCommands
 
 RECORDED = Path(__file__).parents[1] / "tests" / "data" / "golden_traces.json"
 STEPS, SEEDS, PER_DIGEST = 500, (0, 1), 50
@@ -90,7 +90,7 @@ def _late_commands(env_id: str, constraint: sw.Constraint, rate_limit: float, **
             sw.LeaseExpiry(env, sw.StoppingBudget(constraint, **bounds), max_lease_s=0.15)
         )
         env = sw.ChunkHandover(env, 6, 3, [0, 2], rate_limit=rate_limit)
-        return RepeatedCommands(Jitter(Outages(env, 0.5, 0.2), 0.05), 0.2)
+        return RepeatedCommands(Outages(env, 0.5, 0.2), 0.2)
 
     return make
 

@@ -5,8 +5,8 @@
 
 `TeleopContact-v0` behind a `TeleopChannel`, 6 s an episode at 1 kHz. The delay is that of *each* direction. Networks:
 **steady** has nothing but the delay; **rough** has up to 30 % more, drawn for each packet, and 5 % of loss;
-**outages** is rough, and loses all commands for 0.3 s every 2 s, on average. Operators (`TeleopOperator`): the **careful** one stops before the clamp, as far as what he sees lets him; the other **looks
-away** and sweeps on.
+**outages** is rough, and loses all commands for 0.3 s every 2 s, on average. Operators (`TeleopOperator`): the
+**careful** one stops before the clamp, as far as what he sees lets him; the other **looks away** and sweeps on.
 
 Judged from outside the channel: energy is that of the operator's hand at the force that he is shown, and of what
 acted on the tool by the env's own account; clearance is the env's, at every physics substep.

@@ -25,7 +25,6 @@ from safe_wrappers.wrappers.stack import Layer
 __all__ = [
     "FAULTS",
     "Fault",
-    "Jitter",
     "Outages",
     "RepeatedCommands",
 ]
@@ -152,64 +151,27 @@ class RepeatedCommands(Fault):
         return given
 
 
-class Jitter(Fault):
-    """Delays every command by a random time, uniform from 0 to `longest_s`, drawn for each by itself.
+class Outages(Fault):
+    """Loses all commands during outages of `mean_length_s`, `mean_between_s` apart, s on average.
 
-    At every step the newest command arrives that is there and newer than all that came before; commands that were
-    overtaken are lost.
+    Both times are exponentially distributed; an episode begins without an outage.
     """
 
-    def __init__(self, env: Env, longest_s: float) -> None:
-        self._longest_s = positive("longest_s", longest_s, "s")
+    def __init__(self, env: Env, mean_between_s: float, mean_length_s: float) -> None:
+        self._between_s = positive("mean_between_s", mean_between_s, "s")
+        self._length_s = positive("mean_length_s", mean_length_s, "s")
         super().__init__(env)
 
     def begin(self) -> None:
-        self._coming: list[tuple[float, Carried]] = []
+        self._on = False
+        self._until_s = self.random.draw.exponential(self._between_s)
 
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        if given is not None:
-            self._coming.append((now_s + self.random.draw.uniform(0.0, self._longest_s), given))
-        there = [command for due_s, command in self._coming if due_s <= now_s]
-        if not there:
-            return None
-        newest = max(there, key=lambda command: command.observed_s)
-        self._coming = [(due, c) for due, c in self._coming if c.observed_s > newest.observed_s]
-        return newest
-
-
-class OnOffProcess:
-    """A process that is off and on by turns, both for exponentially distributed times (means in s); it begins off."""
-
-    def __init__(self, mean_between_s: float, mean_length_s: float) -> None:
-        self._between = positive("mean_between_s", mean_between_s, "s")
-        self._length = positive("mean_length_s", mean_length_s, "s")
-
-    def begin(self, random: WrapperRng) -> None:
-        """A new episode."""
-        self._on = False
-        self._until_s = random.draw.exponential(self._between)
-
-    def is_on(self, now_s: float, random: WrapperRng) -> bool:
-        """Whether it is on now; times must not run backwards."""
         while now_s >= self._until_s:
             self._on = not self._on
-            self._until_s += random.draw.exponential(self._length if self._on else self._between)
-        return self._on
+            self._until_s += self.random.draw.exponential(self._length_s if self._on else self._between_s)
+        return None if self._on else given
 
 
-class Outages(Fault):
-    """Loses all commands during outages of `mean_length_s`, `mean_between_s` apart, s on average."""
-
-    def __init__(self, env: Env, mean_between_s: float, mean_length_s: float) -> None:
-        self._process = OnOffProcess(mean_between_s, mean_length_s)
-        super().__init__(env)
-
-    def begin(self) -> None:
-        self._process.begin(self.random)
-
-    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        return None if self._process.is_on(now_s, self.random) else given
-
-
-FAULTS: dict[str, type[Fault]] = {kind.__name__: kind for kind in (Jitter, Outages, RepeatedCommands)}
+FAULTS: dict[str, type[Fault]] = {kind.__name__: kind for kind in (Outages, RepeatedCommands)}
 """By name, for configs."""

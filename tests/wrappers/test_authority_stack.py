@@ -11,7 +11,7 @@ from braked_cart import BrakedCart, cart_plant, lease, read_cart, stop
 from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
-from safe_wrappers.wrappers.faults import Jitter, Outages, RepeatedCommands
+from safe_wrappers.wrappers.faults import Outages, RepeatedCommands
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
@@ -145,7 +145,6 @@ def reckless(robot, rng, t):
             False,
         ),  # the lease alone keeps it away from where a filter acts
         (0.02, lambda env: Outages(env, 0.5, 0.3), True),
-        (0.02, lambda env: Outages(Jitter(env, 0.2), 0.5, 0.3), False),
         (0.02, lambda env: RepeatedCommands(Outages(env, 0.5, 0.3), 0.3), True),
     ],
 )

@@ -12,13 +12,12 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.faults import FAULTS, Jitter, Outages, RepeatedCommands
+from safe_wrappers.wrappers.faults import FAULTS, Outages, RepeatedCommands
 from safe_wrappers.wrappers.layer import CommandReceiver
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 FULL = np.array([1.0, 0.0], np.float32)
 EXAMPLES = {
-    "Jitter": {"longest_s": 0.5},
     "Outages": {"mean_between_s": 1.0, "mean_length_s": 0.8},
     "RepeatedCommands": {"share": 0.4},
 }
@@ -79,9 +78,7 @@ def scripted(env, numbers):
     def pop(*_):
         return left.pop(0)
 
-    env.random = SimpleNamespace(
-        reset=lambda *_: None, draw=SimpleNamespace(random=pop, uniform=pop, exponential=pop)
-    )
+    env.random = SimpleNamespace(reset=lambda *_: None, draw=SimpleNamespace(random=pop, exponential=pop))
     return env
 
 
@@ -98,21 +95,6 @@ def test_repeated_commands_keep_their_stamp(numbers, share):
             before = (t * 0.1, t)
         assert heard[t] == before
         assert active[t] == (number < share)
-
-
-@given(delays=st.lists(st.floats(0.0, 0.7), min_size=1, max_size=30))
-def test_jitter_brings_the_newest_that_is_there_and_never_an_older_one(delays):
-    ear = Ear(BrakedCart())
-    heard, active = hear(scripted(Jitter(ear, 0.7), delays), ear, len(delays))
-    newest = -1
-    for t in range(len(delays)):
-        there = [i for i in range(newest + 1, t + 1) if i * 0.1 + delays[i] <= t * 0.1]
-        wanted = (None, None)
-        if there:
-            newest = max(there)
-            wanted = (newest * 0.1, newest)
-        assert heard[t] == wanted
-        assert active[t] == (wanted[1] != t)
 
 
 SPELLS = [0.25, 0.3, 0.1, 0.0, 0.4, 9.0]
@@ -211,8 +193,8 @@ def leased(cart, **more):
 
 NESTED = [
     *([kind] for kind in EXAMPLES),
-    ["Jitter", "RepeatedCommands", "Outages"],
-    ["Outages", "RepeatedCommands", "Jitter"],
+    ["RepeatedCommands", "Outages"],
+    ["Outages", "RepeatedCommands"],
 ]
 
 
@@ -287,7 +269,7 @@ def test_chunks_are_carried_lost_and_repeated_as_a_whole(kind):
     lost = sum(info["fault/active"] for info in infos)
     assert 5 < lost <= 40
     starved = sum(info["handover/starved"] for info in infos)
-    assert starved > 0 or kind in ("RepeatedCommands", "Jitter")
+    assert starved > 0 or kind == "RepeatedCommands"
     if kind == "RepeatedCommands":
         assert refused > 0  # a repeated chunk is not newer than the one in force
 
@@ -297,7 +279,6 @@ def test_chunks_are_carried_lost_and_repeated_as_a_whole(kind):
 
 BAD = {
     "RepeatedCommands": [{"share": -0.1}, {"share": 1.1}, {"share": math.nan}, {"share": None}],
-    "Jitter": [{"longest_s": 0.0}, {"longest_s": -1.0}, {"longest_s": math.inf}, {"longest_s": "long"}],
     "Outages": [
         {"mean_between_s": 0.0, "mean_length_s": 1.0},
         {"mean_between_s": 1.0, "mean_length_s": -1.0},
