@@ -39,7 +39,7 @@ class InfoKey:
 
 @dataclass(frozen=True)
 class EpisodeFigure:
-    """One figure of an episode: in ``info["interventions"]`` and a column of `RecordInterventions`' CSV file.
+    """One figure of an episode: in ``info["interventions"]`` and a column of a run's `episodes.csv`.
 
     Attributes:
         how: "count" is the number of steps at which a key is above zero, or the sum of a key of whole numbers;
@@ -247,7 +247,7 @@ EPISODE: Final = (
     EpisodeFigure("seen", "mean", (OCCLUSION_VISIBLE,)),
     EpisodeFigure("expiries", "onsets", (OCCLUSION_EXPIRED,)),
 )
-"""An episode's figures beside its length and return, in the order of the CSV file."""
+"""An episode's figures beside its length and return, in the order of `episodes.csv`."""
 EPISODE_SUMMARY: Final = _key("interventions", "dict")
 """At an episode's last step only: length, return, and the figures of `EPISODE` that the stack and the task report."""
 

@@ -18,7 +18,6 @@ LAYERS = {
     "constraints": ROOT / "safe_wrappers" / "constraints",
     "wrappers": ROOT / "safe_wrappers" / "wrappers",
     "sb3": ROOT / "safe_wrappers" / "sb3",
-    "diagnosis": ROOT / "safe_wrappers" / "diagnosis",
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
@@ -40,7 +39,6 @@ FORBIDDEN = {
     "plants": LEARNERS,
     "constraints": LEARNERS,
     "wrappers": LEARNERS,
-    "diagnosis": LEARNERS,
     "envs": LEARNERS,
     "sb3": set(),
     "train": set(),

@@ -12,12 +12,12 @@ from rich.console import Console
 from stable_baselines3.common.monitor import Monitor
 
 from safe_wrappers import info as keys
-from safe_wrappers.diagnosis import Diagnosis, diagnose
+from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.recording import RecordInterventions
 
 from .evaluation.evaluate import typical_seed
-from .files import say, write_bytes, write_text
+from .files import say, write_bytes
 from .policies import load_policy
 from .run.stack import make_env
 from .videos import drawing_without_a_screen, film_episode, for_film, without_gl
@@ -87,17 +87,13 @@ def diagnose_command(
     env_id: str,
     policy: Path | None,
     steps: int,
-    output: Path,
     console: Console,
     imports: Collection[str] = (),
-) -> Diagnosis:
-    """Diagnose an env by its id, print what was found, and write the same as JSON."""
+) -> None:
+    """Diagnose an env by its id, and print what was found."""
     env, acts = (make_env(env_id, {}), None) if policy is None else of_run(policy, env_id, imports)
-    found = diagnose(env, acts, steps)
+    say(console, str(diagnose(env, acts, steps)))
     env.close()
-    write_text(output, found.as_json())
-    say(console, f"{found}\nJSON: {output}")
-    return found
 
 
 def of_run(folder: Path, env_id: str, imports: Collection[str] = ()) -> tuple[gym.Env[Any, Any], Policy]:
@@ -108,6 +104,6 @@ def of_run(folder: Path, env_id: str, imports: Collection[str] = ()) -> tuple[gy
             f"--policy: {str(folder)!r} was trained on {trained.arm.env.id}, not on {env_id}: diagnose that env"
         )
     env = trained.make_env("none")
-    while isinstance(env, Monitor | RecordInterventions):  # they belong outside of filters that are tried
+    while isinstance(env, Monitor | RecordInterventions):  # they belong outside of a filter
         env = env.env
     return env, trained

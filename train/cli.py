@@ -66,9 +66,7 @@ def make_parser(command: str) -> argparse.ArgumentParser:
         else:
             add("env", metavar="ENV", help="an id of gymnasium.make")
             add("--policy", type=Path, metavar="RUN", help="a run's folder")
-            add("--steps", type=int, default=2000, help="control steps of each driver (default: %(default)s)")
-            what = "the same as JSON (default: %(default)s)"
-            add("--output", type=Path, metavar="FILE", default=Path("diagnosis.json"), help=what)
+            add("--steps", type=int, default=2000, help="control steps (default: %(default)s)")
         what = "a module that a policy's folder may import; may be given several times"
         add("--imports", action="append", metavar="MODULE", default=[], help=what)
     elif command == "push":
@@ -159,9 +157,7 @@ def _other(command: str, options: argparse.Namespace, overrides: list[str], cons
         case "diagnose":
             from .acting import diagnose_command
 
-            diagnose_command(
-                options.env, options.policy, options.steps, options.output, console, options.imports
-            )
+            diagnose_command(options.env, options.policy, options.steps, console, options.imports)
         case "enjoy":
             from .acting import enjoy_command
 

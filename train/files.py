@@ -15,7 +15,6 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.wrappers.recording import read_episodes
 
 Row = Mapping[str, int | float | bool | str]
 _PATIENCE_S: Final = 5.0
@@ -85,7 +84,10 @@ def read_rows(path: Path) -> list[dict[str, float]]:
         RunStateError: It is no table of numbers.
     """
     try:
-        return read_episodes(path) if path.exists() else []
+        data = path.read_bytes() if path.exists() else b""
+        # A number cut short still reads as a number, so only the newline tells that a line is whole.
+        rows = csv.DictReader(io.StringIO(data[: data.rfind(b"\n") + 1].decode()))
+        return [{key: float(value) for key, value in row.items() if value != ""} for row in rows]
     except (ValueError, TypeError, csv.Error) as error:
         raise RunStateError(f"{str(path)!r} is no table of numbers ({error}).") from None
 

@@ -27,8 +27,6 @@ _KEPT: Final = 256
 """Number of cached discretisations."""
 _TOLERANCE: Final = 1e-9
 """Singular values up to this share of the scale count as zero."""
-_PIVOT: Final = 0.1
-"""Share of the largest coefficient from which on one may be divided by."""
 
 
 def discretise(
@@ -199,8 +197,8 @@ def unobservable_subspace(a: Array, c: Array) -> Array:
     return np.asarray(basis)
 
 
-def unobservable_directions(A: ArrayLike, C: ArrayLike, names: Sequence[str]) -> tuple[str, ...]:
-    """The states' combinations that no output C x of x' = A x shows, one for each unobservable direction.
+def unobservable_states(A: ArrayLike, C: ArrayLike, names: Sequence[str]) -> tuple[str, ...]:
+    """The states that the outputs C x of x' = A x do not determine: those in some unobservable direction.
 
     Args:
         A: Shape (n, n), 1/s.
@@ -208,37 +206,12 @@ def unobservable_directions(A: ArrayLike, C: ArrayLike, names: Sequence[str]) ->
         names: Of the n states, in comparable units.
 
     >>> # A position that is measured, and a bias on a velocity that is not:
-    >>> unobservable_directions([[0, 1, 1], [0, 0, 0], [0, 0, 0]], [[1, 0, 0]], names=("x", "v", "bias"))
-    ('v - bias',)
+    >>> unobservable_states([[0, 1, 1], [0, 0, 0], [0, 0, 0]], [[1, 0, 0]], names=("x", "v", "bias"))
+    ('v', 'bias')
     """
     a, c = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
     lengths = np.linalg.norm(c, axis=1, keepdims=True)
-    scaled = a / (np.linalg.norm(a, 2) or 1.0), c / np.where(lengths > 0.0, lengths, 1.0)
-    return tuple(_described(row, names) for row in _reduced(unobservable_subspace(*scaled).T))
-
-
-def _reduced(rows: Array) -> Array:
-    """The row-reduced basis of the space that independent rows span, shape (k, n), by its first states."""
-    rows = rows.copy()
-    pivots: list[int] = []
-    for i in range(len(rows)):
-        sizes = np.abs(rows[i:]).max(axis=0)
-        pivot = int(np.argmax(sizes >= _PIVOT * sizes.max()))
-        best = i + int(np.argmax(np.abs(rows[i:, pivot])))
-        rows[[i, best]] = rows[[best, i]]
-        rows[i] /= rows[i, pivot]
-        others = np.arange(len(rows)) != i
-        rows[others] -= rows[others, pivot][:, None] * rows[i]
-        pivots.append(pivot)
-    return rows[np.argsort(pivots)]
-
-
-def _described(direction: Array, names: Sequence[str]) -> str:
-    """A direction (n,) in state space as a sum: "x - 0.75 y"."""
-    text = ""
-    for name, coefficient in zip(names, direction, strict=True):
-        if abs(coefficient) > 1e-8:
-            size = f"{abs(coefficient):.3g}"
-            sign = " - " if coefficient < 0.0 else " + " if text else ""
-            text += sign + (name if size == "1" else f"{size} {name}")
-    return text.strip()
+    basis = unobservable_subspace(
+        a / (np.linalg.norm(a, 2) or 1.0), c / np.where(lengths > 0.0, lengths, 1.0)
+    )
+    return tuple(name for name, row in zip(names, basis, strict=True) if np.linalg.norm(row) > 1e-8)

@@ -18,7 +18,7 @@ from safe_wrappers.control.dead_reckoning import (
     rigid_transform,
     to_sensor,
 )
-from safe_wrappers.control.estimation import Motion, Tracks, largest_deviation, unobservable_directions
+from safe_wrappers.control.estimation import Motion, Tracks, largest_deviation, unobservable_states
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,
@@ -440,9 +440,9 @@ class OcclusionPenalty(LayerWrapper):
 
     @property
     def unobservable(self) -> dict[str, list[str]]:
-        """Track name -> directions of its state ("x", "vy") that the sensor cannot resolve in sight."""
+        """Track name -> its states ("x", "vy") that the sensor does not determine in sight."""
         return {
-            name: list(unobservable_directions(motion.matrices()[0], self._matrix, self._state_names))
+            name: list(unobservable_states(motion.matrices()[0], self._matrix, self._state_names))
             for name, motion in zip(self.track_names, self.tracking.motions, strict=True)
         }
 

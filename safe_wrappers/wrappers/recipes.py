@@ -38,7 +38,6 @@ from safe_wrappers.plants.simulator import View
 
 Env = gym.Env[Any, Any]
 Recommended = list[Constraint]
-Corner = Sequence[float | None] | None
 
 POINT_HULL_RADIUS_M = 0.1585
 """Around the Point robot's turning axis: the far corners of its nose, sqrt(0.15^2 + 0.05^2), rounded up."""
@@ -139,9 +138,7 @@ FINGER_RADIUS_M = 0.0414
 """From the centre of a Fetch finger, a box of 77 x 14 x 27 mm, to its corners, rounded up."""
 
 
-def _fetch(
-    env: Env, low: Corner = None, high: Corner = None, keep_out: Sequence[Any] = (), table: bool = True
-) -> Recommended:
+def _fetch(env: Env, keep_out: Sequence[Any] = ()) -> Recommended:
     raw: Any = env.unwrapped
     start = raw.initial_gripper_xpos
     geom = int(raw.model.body("table0").geomadr[0])
@@ -150,16 +147,13 @@ def _fetch(
     top = float(middle[2] + half[2])
     # Goals and objects lie within 0.15 m of the gripper's start (in FetchSlide farther away), objects are pushed from
     # 0.06 m beyond, and a block is lifted to 0.48 m above the table. The arm reaches all of the box to 15 mm.
-    least = [float(start[0]) - 0.25, float(start[1]) - 0.25, top + 0.02]
-    most = [float(start[0]) + 0.25, float(start[1]) + 0.25, top + 0.5]
+    low = [float(start[0]) - 0.25, float(start[1]) - 0.25, top + 0.02]
+    high = [float(start[0]) + 0.25, float(start[1]) + 0.25, top + 0.5]
     # A displacement of zero stops the gripper within one of the two control steps. In both it moves by 83 mm per axis
     # at most, and a finger that also opens or closes by 0.16 m in all (measured).
-    low, high = least if low is None else low, most if high is None else high
     grip = Workspace(low, high, sites=["robot0:grip"], margin=0.001, horizon=2, max_decrease=0.1)
     # An upright finger's tip stays 4 mm above the table, where it still meets the lower half of block and puck.
-    obstacles = [*([Box(middle.tolist(), half.tolist())] if table else []), *keep_out]
-    if not obstacles:
-        return [grip]
+    obstacles = [Box(middle.tolist(), half.tolist()), *keep_out]
     fingers = [f"robot0:{side}_gripper_finger_link" for side in "lr"]
     clear = Workspace(
         keep_out=obstacles, geoms=fingers, radius=FINGER_RADIUS_M, margin=0.001, horizon=2, max_decrease=0.2

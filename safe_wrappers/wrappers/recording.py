@@ -1,13 +1,9 @@
 """A cost for a task that has none, and what filter and task did, per episode: CostFunction, RecordInterventions."""
 
-import csv
-import io
 import math
-import os
 import pkgutil
 from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -18,7 +14,7 @@ from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step
 from safe_wrappers.wrappers.stack import Layer
 
 COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
-"""The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""
+"""All that a summary may hold; what neither the task nor the stack reports is missing there."""
 _OF_FIGURES: Final = tuple(dict.fromkeys(name for figure in keys.EPISODE for name in figure.of))
 
 
@@ -102,15 +98,14 @@ class RecordInterventions(LayerWrapper):
     Put it outside the layers that it counts, and inside `ChunkHandover` and SB3's `Monitor`. At an episode's last
     step `info` gains `info["interventions"]`, a dict: `length`, `return` (of the task: penalties that a wrapper
     inside has taken off are added back), and the figures of `safe_wrappers.info.EPISODE`. What nobody reported is not
-    zero: it is missing in the summary, and an empty cell in the file. The same holds for a 0 that was not reported at
-    every step; a count above 0 is a lower bound.
+    zero: it is missing in the summary. The same holds for a 0 that was not reported at every step; a count above 0 is
+    a lower bound.
 
     Args:
         env: The env to record.
-        path: A CSV file, one for each env, that gains one row per finished episode; an existing one is continued.
 
     Raises:
-        ConfigurationError: `path` is a file with other columns; or a `ChunkHandover` inside.
+        ConfigurationError: A `ChunkHandover` inside.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -123,13 +118,6 @@ class RecordInterventions(LayerWrapper):
     """
 
     layer: ClassVar = Layer.RECORDER
-
-    def __init__(self, env: Env, path: str | os.PathLike[str] | None = None) -> None:
-        LayerWrapper.__init__(self, env)
-        text = None if path is None else os.fspath(path)
-        if text is not None:
-            _continue_file(Path(text))
-        self.path = text
 
     @property
     def filter_time_us(self) -> float | None:
@@ -156,8 +144,6 @@ class RecordInterventions(LayerWrapper):
             summary = {"length": len(self._steps), "return": self._return}
             summary |= {name: value for name, value in figures.items() if value is not None}
             info[keys.EPISODE_SUMMARY] = summary
-            if self.path is not None:
-                _append_row(Path(self.path), summary)
         return observation, reward, terminated, truncated, info
 
 
@@ -194,40 +180,3 @@ def _figure(
     if not total and len(numbers) < len(steps):
         return None
     return total / len(steps) if how == "mean" else total
-
-
-def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:
-    """Read a CSV file of `RecordInterventions`: one dict per whole line, without the cells that are empty."""
-    rows = csv.DictReader(io.StringIO(_whole_lines(Path(path).read_bytes()).decode()))
-    return [{key: float(value) for key, value in row.items() if value != ""} for row in rows]
-
-
-def _whole_lines(data: bytes) -> bytes:
-    # A number cut short still reads as a number, so only the newline tells that a line is whole.
-    return data[: data.rfind(b"\n") + 1]
-
-
-def _continue_file(path: Path) -> None:
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return
-    data = path.read_bytes()
-    whole = _whole_lines(data)
-    if len(whole) < len(data):
-        with path.open("rb+") as file:
-            file.truncate(len(whole))
-    header = whole.split(b"\n", 1)[0].decode(errors="replace").strip()
-    if header and header != ",".join(COLUMNS):
-        columns = f"has other columns ({header!r}; expected {','.join(COLUMNS)!r})"
-        raise ConfigurationError(f"RecordInterventions: {str(path)!r} {columns}. Give another path.")
-
-
-def _append_row(path: Path, row: dict[str, int | float | bool]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\n")
-    if not path.exists() or path.stat().st_size == 0:
-        writer.writeheader()
-    # Bools as 0 and 1, so that every cell reads back as a number.
-    writer.writerow({key: int(value) if isinstance(value, bool) else value for key, value in row.items()})
-    with path.open("a", newline="") as file:
-        file.write(text.getvalue())  # one write: a kill leaves at most one half line, at the end

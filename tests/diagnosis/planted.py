@@ -97,7 +97,9 @@ PLANTED: dict[str, tuple[str, int, Callable[[], Made]]] = {
     ),
     "a maze with stiff walls": ("contact_forces", 300, lambda: _with(gym.make("PointMaze_UMaze-v3"))),
     "a stop that is run into": ("limits", 300, lambda: _with(Bench(STOPPED), lambda env: waving(env, 0.5, 100.0))),
-    "hazards": ("limits", 1000, lambda: _with(gym.make("SafePointGoal1-v0"))),
+    "hazards": (
+        "limits", 1000, lambda: _with(gym.make("SafePointGoal1-v0"), lambda env: waving(env, 0.5, 100.0)),
+    ),
     "a speed limit": (
         "limits", 300, lambda: _with(gym.make("SafeSwimmerVelocity-v0"), lambda env: waving(env, 1.0, 25.0)),
     ),

@@ -15,13 +15,25 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.files import only_writer
+from safe_wrappers.train.files import append_row, only_writer, read_rows, write_rows
 from safe_wrappers.train.processes import Job, Progress, RunStoppedError, work
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
 from safe_wrappers.train.run.data_pickles import read_pickle
 from safe_wrappers.train.run.training import finished_checkpoint
 
 SAC = ("algorithm=SAC", "hyperparameters={learning_starts: 50, batch_size: 16, train_freq: 8}", "n_envs=1")
+
+
+@pytest.mark.parametrize("cut", [0, 1, 2])
+def test_a_half_written_last_row_is_none(tmp_path, cut):
+    path, columns = tmp_path / "episodes.csv", ("length", "success", "cost")
+    assert read_rows(path) == []
+    write_rows(path, columns, [{"length": 4, "success": True, "cost": 1.5}])
+    append_row(path, columns, {"length": 12})
+    path.write_bytes(path.read_bytes()[: -cut or None])
+    assert (
+        read_rows(path) == [{"length": 4.0, "success": 1.0, "cost": 1.5}, {"length": 12.0}][: 2 - bool(cut)]
+    )
 
 
 def test_a_run_leaves_rows_logs_and_a_policy_and_is_not_run_again(finished):

@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -10,11 +9,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.wrappers.recording import (
-    COLUMNS,
-    RecordInterventions,
-    read_episodes,
-)
+from safe_wrappers.wrappers.recording import COLUMNS, RecordInterventions
 
 
 class Scripted(gym.Wrapper):
@@ -76,8 +71,8 @@ SCRIPT = [
 ]
 
 
-def scripted_env(path=None, infos=SCRIPT):
-    return RecordInterventions(Scripted(gym.make("Pendulum-v1", max_episode_steps=len(infos)), infos), path)
+def scripted_env(infos=SCRIPT):
+    return RecordInterventions(Scripted(gym.make("Pendulum-v1", max_episode_steps=len(infos)), infos))
 
 
 def play(env, seed=0):
@@ -114,13 +109,21 @@ def test_counts_of_an_episode():
         "goals_reached": 2,
         "success": True,
     }
+    # Of a task without wheels, cars and tracks, and without StuckEscape.
+    assert summary.keys() == set(COLUMNS) - {
+        "stuck",
+        "mismatch",
+        "spin_outs",
+        "collisions",
+        "seen",
+        "expiries",
+    }
 
 
-def test_what_neither_the_stack_nor_the_task_reports_is_never_zero(tmp_path):
-    env = RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=3), tmp_path / "episodes.csv")
+def test_what_neither_the_stack_nor_the_task_reports_is_never_zero():
+    env = RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=3))
     infos, _ = play(env)
     assert infos[-1][keys.EPISODE_SUMMARY].keys() == {"length", "return"}
-    assert read_episodes(tmp_path / "episodes.csv")[0].keys() == {"length", "return"}
     assert env.filter_time_us is None
 
 
@@ -172,34 +175,6 @@ def test_vector_env_counts_episodes_apart_in_every_autoreset_mode(mode):
             if mode is gym.vector.AutoresetMode.DISABLED:
                 envs.reset(options={"reset_mask": truncated})
     assert ends >= 2
-
-
-def test_file_gains_one_row_per_episode(tmp_path: Path):
-    path = tmp_path / "deep" / "episodes.csv"
-    env = scripted_env(path)
-    play(env)
-    play(env)
-    assert path.read_text().splitlines()[0] == ",".join(COLUMNS)
-    assert len(path.read_text().splitlines()) == 3
-    first, second = read_episodes(path)
-    assert first["correction_mean"] == second["correction_mean"] == 0.5
-    assert first["success"] == 1.0
-    # A task without wheels, cars and tracks, no StuckEscape: empty cells, which do not come back.
-    assert set(first) == set(COLUMNS) - {"stuck", "mismatch", "spin_outs", "collisions", "seen", "expiries"}
-
-
-@pytest.mark.parametrize("cut", [1, 3, 30])
-def test_half_written_last_line_is_dropped_and_the_file_continued(tmp_path: Path, cut: int):
-    path = tmp_path / "episodes.csv"
-    env = scripted_env(path)
-    play(env)
-    play(env)
-    path.write_bytes(path.read_bytes()[:-cut])
-    assert len(read_episodes(path)) == 1
-    play(scripted_env(path))
-    rows = read_episodes(path)
-    assert len(rows) == 2
-    assert rows[0]["cost"] == rows[1]["cost"] == 1.0
 
 
 def tip_speed(env):
