@@ -1,10 +1,12 @@
 """Every algorithm and learner that a config can name: what it is given, killed, continued, and evaluated."""
 
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from fake_task import HAZARD, FakeFilter
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Box, Dict, Discrete
 from running import episodes, evaluated, finish, killed_after, resumed, trained
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -12,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.sb3 import ExecutedActionReplayBuffer
+from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer, ExecutedActionReplayBuffer
 from safe_wrappers.train.config import FilterConfig
 from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, algorithm_class
 from safe_wrappers.train.experiment import training_jobs
@@ -20,8 +22,8 @@ from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run import training as run_module
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
-from safe_wrappers.train.run.model import check_task
-from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.model import check_task, new_model
+from safe_wrappers.train.run.stack import make_stack, make_vec_env
 
 SMALL = "policy_kwargs: {net_arch: [8]}"
 REPLAY = f"learning_starts: 32, batch_size: 8, train_freq: 8, {SMALL}"
@@ -32,6 +34,7 @@ SETTINGS = {
     "TD3": f"{REPLAY}, action_noise: {{normal: 0.1}}",
     "DDPG": f"{REPLAY}, action_noise: {{ornstein_uhlenbeck: 0.1}}",
 } | dict.fromkeys(("SAC", "TQC", "CrossQ", "DQN", "QRDQN"), REPLAY)
+SETTINGS |= {f"sbx.{name}": SETTINGS[name] for name in ("PPO", "SAC", "TD3", "TQC", "CrossQ")}
 PENALTY = 1000.0
 """An episode of the fake task returns less than 5, so that one penalty in a return would show."""
 KINDS = {
@@ -101,10 +104,34 @@ class Shielded(FakeFilter):
         return *result, info
 
 
+class InParts(gym.ObservationWrapper):
+    """The fake task's observation in a dict."""
+
+    def __init__(self, env, shape):
+        super().__init__(env)
+        self.observation_space = Dict({"at": Box(-np.inf, np.inf, shape, np.float64)})
+
+    def observation(self, observation):
+        return {"at": observation.reshape(self.observation_space["at"].shape)}
+
+
+def in_parts(shape=(2,)):
+    return InParts(gym.make("fake_task:FakeGoal-v0"), tuple(shape))
+
+
+gym.register("DictGoal-v0", in_parts)
+
+
+def slow_if_compiled(algorithm):
+    """One of sbx's stands for all in the common tests: JAX compiles for ten seconds or more."""
+    slow = algorithm.startswith("sbx.") and algorithm != "sbx.SAC"
+    return pytest.param(algorithm, marks=pytest.mark.slow) if slow else algorithm
+
+
 def one_arm(fake_experiment, algorithm, learner, *overrides):
     """An experiment of one filtered arm."""
     if algorithm not in ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN"):
-        pytest.importorskip("sb3_contrib")
+        pytest.importorskip("sbx" if algorithm.startswith("sbx.") else "sb3_contrib")
     env, factory = [], "test_algorithms:shield"
     if algorithm in DISCRETE:
         env, factory = ["env=test_algorithms:DiscreteGoal-v0"], "test_algorithms:Shielded"
@@ -122,7 +149,7 @@ def one_arm(fake_experiment, algorithm, learner, *overrides):
     )
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", [*map(slow_if_compiled, ALGORITHMS)])
 def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, algorithm):
     experiment = one_arm(fake_experiment, algorithm, "safe_action" if algorithm in OFF_POLICY else "naive")
     (arm,), (job,) = experiment.arms, training_jobs(one_arm(fake_experiment, algorithm, "naive", "seeds=[0]"))
@@ -142,6 +169,15 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
     assert len(rows) == 64 // 20 + 64 // 20 and sum(row["intervention_rate"] for row in rows) > 0
     out = evaluated(experiment, 0)
     assert all(len(read_rows(out / f"filter_{state}.csv")) == 2 for state in ("off", "on"))
+
+
+def test_sbx_observes_a_dict_of_vectors(fake_experiment):
+    experiment = one_arm(fake_experiment, "sbx.SAC", "safe_action", "env=test_algorithms:DictGoal-v0")
+    (arm,) = experiment.arms
+    check_task(arm, make_stack(arm.env, arm.filter))
+    assert finish(trained(experiment, 0))["timesteps"] == 128
+    model = new_model(arm, 0, make_vec_env(arm))
+    assert type(model.replay_buffer) is ExecutedActionDictReplayBuffer
 
 
 def test_a_rollout_may_be_whole_episodes(fake_experiment):
@@ -225,9 +261,15 @@ def check_evaluation(experiment, model):
     [
         ("SAC", "test_algorithms:DiscreteGoal-v0", r"SAC needs actions of a Box, and .*Discrete\(3\).*PPO"),
         ("DQN", "fake_task:FakeGoal-v0", r"DQN needs actions of a Discrete, and fake_task.*PPO"),
+        ("sbx.PPO", "test_algorithms:DictGoal-v0", "sbx.PPO observes one array"),
+        (
+            "sbx.SAC",
+            "{id: 'test_algorithms:DictGoal-v0', kwargs: {shape: [1, 2]}}",
+            "sbx.SAC observes one array, or",
+        ),
     ],
 )
-def test_actions_of_the_wrong_kind_are_refused_before_the_first_step(
+def test_actions_and_observations_of_the_wrong_kind_are_refused_before_the_first_step(
     fake_experiment, algorithm, env, message
 ):
     (arm,) = one_arm(fake_experiment, algorithm, "naive", "arms={a: {filter: none}}", f"env={env}").arms
@@ -259,6 +301,11 @@ def test_actions_of_the_wrong_kind_are_refused_before_the_first_step(
         ("TD3", "naive", ["hyperparameters={}"], r"TD3 is deterministic .*\{normal: 0.1\}"),
         ("SAC", "{cost_limit: 1}", ["normalize.reward=true"], "leave normalize out"),
         ("SAC", "{cost_limit: -1}", [], "cost_limit"),
+        ("sbx.PPO", "safe_action", [], "sbx.PPO cannot learn from the executed action"),
+        ("sbx.PPO", "naive", ["hyperparameters.target_kl=0.1"], "target_kl adapts. Leave .* out"),
+        ("sbx.PPO", "naive", ["hyperparameters.clip_range_vf=0.1"], "nothing with clip_range_vf"),
+        ("sbx.CrossQ", "naive", ["hyperparameters.learning_rate=linear_1e-3"], "sbx.CrossQ cannot fall"),
+        ("sbx.SAC", "naive", ["device=auto"], "where the environment variable JAX_PLATFORMS says"),
     ],
 )
 def test_what_does_not_go_together_is_refused_with_the_reason(
@@ -266,3 +313,12 @@ def test_what_does_not_go_together_is_refused_with_the_reason(
 ):
     with pytest.raises(ConfigurationError, match=message):
         one_arm(fake_experiment, algorithm, learner, *overrides)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "package", "extra"), [("TQC", "sb3_contrib", "contrib"), ("sbx.SAC", "sbx", "sbx")]
+)
+def test_a_package_that_is_not_installed_is_named(monkeypatch, algorithm, package, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ConfigurationError, match=rf"{package}'s, .* pip install 'safe-wrappers\[{extra}\]'"):
+        algorithm_class(algorithm)

@@ -11,19 +11,47 @@ import zipfile
 from pathlib import Path
 
 import fake_task
+import numpy as np
 import pytest
 import torch
 from rich.console import Console
 from running import resumed, trained
 from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.acting import enjoy_command
+from safe_wrappers.train.config.algorithms import algorithm_class
 from safe_wrappers.train.files import only_writer
 from safe_wrappers.train.policies import load_policy
-from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, save_checkpoint
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, resume, save_checkpoint
 from safe_wrappers.train.run.data_pickles import read_pickle
+from safe_wrappers.train.run.model_files import write_model
+
+
+@pytest.mark.parametrize("algorithm", ["SAC", "PPO", "sbx.SAC", "sbx.PPO"])
+def test_a_model_that_was_stored_learns_on_as_if_it_were_not(tmp_path, algorithm):
+    if algorithm.startswith("sbx."):
+        pytest.importorskip("sbx")
+    env, small = DummyVecEnv([fake_task.FakeGoal]), {"policy_kwargs": {"net_arch": [4]}, "batch_size": 8}
+    small |= {"n_steps": 16} if algorithm.endswith("PPO") else {"learning_starts": 8, "buffer_size": 64}
+    model = algorithm_class(algorithm)("MlpPolicy", env, seed=0, device="cpu", **small)
+    model.learn(32)
+    folder = save_checkpoint(tmp_path, model, {})
+    before = model.predict(np.zeros(2))[0]
+
+    def learned(each):
+        env.seed(1)
+        each._last_obs = None  # a run that goes on begins new episodes
+        each.learn(16, reset_num_timesteps=False)
+        return each.predict(np.zeros(2))[0]  # drawn: the keys of random numbers count, too
+
+    expected = learned(model)
+    again = resume(folder, algorithm, env, "cpu", 64)
+    np.testing.assert_array_equal(again.predict(np.zeros(2))[0], before)
+    np.testing.assert_array_equal(learned(again), expected)
+
 
 # SIGKILL at every file operation: there is a whole one afterwards, no older one than before -----------------------
 
@@ -120,18 +148,28 @@ class Touch:
         return Path.touch, (self.path,)
 
 
+def rewrite(path, name, change):
+    """Another content of one part of a zip file."""
+    with zipfile.ZipFile(path) as archive:
+        parts = {part: archive.read(part) for part in archive.namelist()}
+    parts[name] = change(parts[name])
+    with zipfile.ZipFile(path, "w") as archive:
+        for part, content in parts.items():
+            archive.writestr(part, content)
+
+
 def poison(checkpoint, name, payload):
     """The payload inside of a checkpoint's file."""
     path = checkpoint / name
     if name == "model.zip":
-        with zipfile.ZipFile(path) as archive:
-            parts = {part: archive.read(part) for part in archive.namelist()}
-        data = json.loads(parts["data"])
-        data["lr_schedule"][":serialized:"] = base64.b64encode(pickle.dumps(payload)).decode()
-        parts["data"] = json.dumps(data)
-        with zipfile.ZipFile(path, "w") as archive:
-            for part, content in parts.items():
-                archive.writestr(part, content)
+        pickled = base64.b64encode(pickle.dumps(payload)).decode()
+
+        def poisoned(content):
+            data = json.loads(content)
+            data["lr_schedule"][":serialized:"] = pickled
+            return json.dumps(data)
+
+        rewrite(path, "data", poisoned)
     else:
         path.write_bytes(pickle.dumps(payload))
 
@@ -159,6 +197,18 @@ def test_a_checkpoint_that_would_run_something_is_refused(finished, fake_experim
     assert not (tmp_path / "made").exists()
     pickle.loads(pickle.dumps(Touch(tmp_path / "made")))
     assert (tmp_path / "made").exists()  # it would have been
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80", b"\x82\xa5model\x80\xa6policy\x80"])
+def test_arrays_of_no_such_network_are_refused(tmp_path, content):
+    sbx = pytest.importorskip("sbx")
+    write_model(sbx.SAC("MlpPolicy", fake_task.FakeGoal(), buffer_size=1), tmp_path / "model.zip")
+    assert load_model(tmp_path, "sbx.SAC", "cpu").num_timesteps == 0
+    with pytest.raises(ValueError, match=r"Policy \(its arrays are .*load_policy\) unknown"):
+        sbx.SAC.load(tmp_path / "model.zip")
+    rewrite(tmp_path / "model.zip", "jax.msgpack", lambda _: content)
+    with pytest.raises(RunStateError, match=r"model\.zip' cannot be read"):
+        load_model(tmp_path, "sbx.SAC", "cpu")
 
 
 @pytest.mark.parametrize(

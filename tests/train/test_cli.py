@@ -140,7 +140,7 @@ def test_help_and_mistakes_in_the_command_do_not_wait_for_torch():
 import sys
 from safe_wrappers.train.cli import main
 late = {"torch", "stable_baselines3", "sb3_contrib", "tensorboard", "matplotlib", "PIL", "gymnasium_robotics"}
-late |= {"optuna", "ray"}
+late |= {"optuna", "ray", "sbx", "jax"}
 for arguments in (["--help"], ["--version"], ["trian"], ["train"], ["train", "a.yaml", "--no"], ["train", "a.yaml"]):
     read = {"rich", "pydantic"} if arguments != ["train", "a.yaml"] else set()
     try:

@@ -37,6 +37,7 @@ PPO = {
     "normalize": {"observation": True},
 }
 SAC = {"algorithm": "SAC", "hyperparameters": {"learning_starts": 40, "use_sde": True, **SMALL}}
+SBX = {**SAC, "algorithm": "sbx.SAC"}
 DQN = {
     "algorithm": "DQN",
     "env": "CartPole-v1",
@@ -64,8 +65,10 @@ def policy(reacher, tmp_path):
     return shutil.copytree(reacher / "policy", tmp_path / "policy")
 
 
-@pytest.mark.parametrize("settings", [None, SAC, DQN], ids=["PPO", "SAC", "DQN"])
+@pytest.mark.parametrize("settings", [None, SAC, DQN, SBX], ids=["PPO", "SAC", "DQN", "sbx"])
 def test_its_folder_acts_as_the_run_does(settings, reacher, tmp_path):
+    if settings is SBX:
+        pytest.importorskip("sbx")
     run = reacher if settings is None else trained(settings, tmp_path)
     of_run, of_folder = load_policy(run), load_policy(str(run / "policy"))
     assert of_folder.arm.fingerprint() == of_run.arm.fingerprint()

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from safe_wrappers.errors import RunStateError
+from safe_wrappers.train.config.algorithms import algorithm_class
 from safe_wrappers.train.files import append_row, only_writer, read_rows, write_rows
 from safe_wrappers.train.processes import Job, Progress, RunStoppedError, work
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
@@ -102,8 +103,12 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypa
     assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == ["step_000000000768"]
 
 
-def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment, monkeypatch):
-    experiment = fake_experiment(*SAC, "total_steps=320")
+@pytest.mark.parametrize("algorithm", ["SAC", "sbx.SAC"])
+def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment, monkeypatch, algorithm):
+    if algorithm == "sbx.SAC":
+        pytest.importorskip("sbx")
+    settings = (*SAC, f"algorithm={algorithm}")
+    experiment = fake_experiment(*settings, "total_steps=320")
     folder = killed_after(experiment, 1, monkeypatch)
     buffer = resumed(experiment.arms[1], folder).replay_buffer
     assert buffer.size() == latest_checkpoint(folder / "checkpoints").timesteps == 128
@@ -122,14 +127,15 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     np.testing.assert_equal(vars(read_pickle(scaling).obs_rms), before)
 
     # Raised, it fills a new buffer before it learns.
-    trained_at, train = [], stable_baselines3.SAC.train
+    kind = algorithm_class(algorithm)
+    trained_at, train = [], kind.train
     monkeypatch.setattr(
-        stable_baselines3.SAC,
+        kind,
         "train",
         lambda self, **given: (trained_at.append(self.num_timesteps), train(self, **given)),
     )
     reports = Reports()
-    trained(fake_experiment(*SAC, "total_steps=400"), progress=reports.progress)
+    trained(fake_experiment(*settings, "total_steps=400"), progress=reports.progress)
     (line,) = reports.lines
     assert line.startswith("goes on from step 320 with an empty replay buffer") and "50 steps" in line
     assert 370 < trained_at[0] <= 384 and finish(folder)["timesteps"] == 400

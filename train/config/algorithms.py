@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -16,18 +17,21 @@ from .types import Count, Integer, NonNegative, Number, check_name, matching, va
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-_CONTRIB: Final = "sb3_contrib"
 _MODULES: Final = {
     **dict.fromkeys(("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN"), "stable_baselines3"),
-    **dict.fromkeys(("TQC", "CrossQ", "TRPO", "QRDQN"), _CONTRIB),
+    **dict.fromkeys(("TQC", "CrossQ", "TRPO", "QRDQN"), "sb3_contrib"),
+    **dict.fromkeys(("sbx.PPO", "sbx.SAC", "sbx.TD3", "sbx.TQC", "sbx.CrossQ"), "sbx"),
 }
-ON_POLICY: Final = ("PPO", "A2C", "TRPO")
+_EXTRAS: Final = {"sb3_contrib": "contrib", "sbx": "sbx"}
+SBX: Final = "sbx."
+"""Before the names of algorithms that compute in JAX."""
+ON_POLICY: Final = ("PPO", "A2C", "TRPO", "sbx.PPO")
 """They learn from what they have just done, continuous actions or discrete ones."""
-OFF_POLICY: Final = ("SAC", "TD3", "DDPG", "TQC", "CrossQ")
+OFF_POLICY: Final = ("SAC", "TD3", "DDPG", "TQC", "CrossQ", "sbx.SAC", "sbx.TD3", "sbx.TQC", "sbx.CrossQ")
 """They learn from a replay buffer, continuous actions."""
 DISCRETE: Final = ("DQN", "QRDQN")
 """They learn from a replay buffer, discrete actions; their filter is an ActionShield."""
-DETERMINISTIC: Final = ("TD3", "DDPG")
+DETERMINISTIC: Final = ("TD3", "DDPG", "sbx.TD3")
 """Of `OFF_POLICY` those whose policy tries nothing out by itself."""
 LINEAR: Final = "linear_"
 SCHEDULED: Final = ("learning_rate", "clip_range", "clip_range_vf")
@@ -46,7 +50,7 @@ _Noise = Annotated[
 """A standard deviation of actions scaled to [-1, 1]."""
 _OF_DEFAULT: Final[Mapping[type, Any]] = {bool: StrictBool, int: Integer, float: Number}
 _TYPES: Final[Mapping[str, Any]] = {
-    "learning_rate": Annotated[Number, Field(gt=0)],
+    **dict.fromkeys(("learning_rate", "qf_learning_rate"), Annotated[Number, Field(gt=0)]),
     "action_noise": Annotated[
         _Noise | None, BeforeValidator(lambda given: None if given == "none" else given)
     ],
@@ -60,23 +64,26 @@ _LINEAR_NUMBER: Final = Annotated[str, matching(LINEAR + r"(\d+\.?\d*|\.\d+)([eE
 
 
 ALGORITHMS: Final = tuple(_MODULES)
-"""Names, Stable-Baselines3's and sb3-contrib's."""
+"""Names, Stable-Baselines3's, sb3-contrib's and sbx's."""
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
     """The class of one of `ALGORITHMS`.
 
     Raises:
-        ConfigurationError: It is one of sb3-contrib's, which is not installed.
+        ConfigurationError: It is one of a package that is not installed.
     """
+    package = _MODULES[name]
+    if package == "sbx":  # as torch, whatever else there is; JAX reads it at its first import
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
     try:
-        found: type[BaseAlgorithm] = getattr(importlib.import_module(_MODULES[name]), name)
+        found: type[BaseAlgorithm] = getattr(importlib.import_module(package), name.removeprefix(SBX))
     except ModuleNotFoundError as missing:
-        if missing.name != _CONTRIB:
+        if missing.name not in _EXTRAS:
             raise
         raise ConfigurationError(
-            f"algorithm: {name} is one of sb3-contrib's, which is not installed: pip install"
-            " 'safe-wrappers[contrib]'"
+            f"algorithm: {name} is one of {package}'s, which is not installed: pip install"
+            f" 'safe-wrappers[{_EXTRAS[package]}]'"
         ) from None
     return found
 

@@ -13,7 +13,7 @@ import yaml
 
 from safe_wrappers.errors import ConfigurationError
 
-from .algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY, check_hyperparameters
+from .algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY, SBX, check_hyperparameters
 from .models import ArmConfig, ExperimentConfig
 from .types import check_name, validate
 
@@ -175,6 +175,20 @@ def _conflicts(arm: ArmConfig) -> list[tuple[bool, str]]:
         (
             learner.stores_executed and given.get("n_steps", 1) > 1,
             f"learner {learner.kind} has one-step returns; leave hyperparameters.n_steps out.",
+        ),
+        (
+            arm.algorithm == "sbx.PPO" and not given.keys().isdisjoint(("clip_range_vf", "target_kl")),
+            "sbx.PPO does nothing with clip_range_vf, and a run that goes on would forget the learning rate that"
+            " target_kl adapts. Leave hyperparameters.clip_range_vf and target_kl out.",
+        ),
+        (
+            arm.algorithm == "sbx.CrossQ" and isinstance(given.get("learning_rate"), str),
+            "the learning rate of sbx.CrossQ cannot fall; give hyperparameters.learning_rate as a number.",
+        ),
+        (
+            arm.algorithm.startswith(SBX) and arm.device != "cpu",
+            f"device is torch's; {arm.algorithm} computes where the environment variable JAX_PLATFORMS says, on the"
+            " CPU without one. Leave device out.",
         ),
     ]
 

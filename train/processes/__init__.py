@@ -14,6 +14,11 @@ from safe_wrappers.errors import SafeWrappersError
 Message = tuple[str, Any]
 """`steps`, `say`, or at last `end` with what stopped or killed it, "" for nothing."""
 STOPPED: Final = "stopped"
+ONE_THREAD: Final = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC"), "1"
+)
+"""Environment variables that BLAS libraries and XLA (the last one) read as they are loaded: more threads would only
+fight for cores."""
 
 
 class RunStoppedError(SafeWrappersError):

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from safe_wrappers.errors import ConfigurationError
 
-from . import Job, Message, work
+from . import ONE_THREAD, Job, Message, work
 
 RETRIES: Final = 10
 """Nodes that one job may lose."""
@@ -122,8 +122,9 @@ def _work(pickled: bytes, name: str, path: list[str], folder: str, post: Any) ->
 
     sys.path.extend(entry for entry in path if entry not in sys.path)
     os.chdir(folder)
-    # For processes that it starts; Ray gave this one its own.
-    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+    os.environ.update(
+        ONE_THREAD
+    )  # for processes that it starts, and XLA; of the others Ray gave this one its own
     asked, stopped = 0.0, False
 
     def stopping() -> bool:

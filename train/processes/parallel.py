@@ -16,7 +16,7 @@ from typing import Any, Final
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
-from . import STOPPED, Interrupted, Job, Message, RunsFailedError, environment, work
+from . import ONE_THREAD, STOPPED, Interrupted, Job, Message, RunsFailedError, environment, work
 
 _POLL_S: Final = 0.2
 _SAVE_S: Final = 60.0
@@ -30,7 +30,7 @@ def run_jobs(
     title: str,
     on: str | None = None,
 ) -> None:
-    """Runs jobs in parallel, each in a process of its own with one BLAS and torch thread.
+    """Runs jobs in parallel, each in a process of its own with one BLAS, torch and XLA thread.
 
     A job that fails does not stop the others. If this process is killed, the jobs' processes end by themselves.
     SIGINT, SIGTERM and SIGHUP, where they are not ignored, ask the jobs to stop and wait for at most a minute, in
@@ -47,9 +47,7 @@ def run_jobs(
     wait_until = float("inf")
     with ExitStack() as stack:
         signals = stack.enter_context(_noted_signals())
-        # Read by the BLAS libraries when the spawned process loads them; more threads would only fight for cores.
-        one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        stack.enter_context(environment(one))
+        stack.enter_context(environment(ONE_THREAD))
         place: Any = LocalWorkers(workers)
         if on is not None:
             from .on_ray import RayWorkers

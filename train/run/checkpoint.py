@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import shutil
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -19,7 +20,8 @@ from safe_wrappers.errors import RunStateError
 
 from ..config.algorithms import algorithm_class
 from ..files import read_json, write_json
-from .data_pickles import pickles_of_model, read_pickle
+from .data_pickles import read_pickle
+from .model_files import read_model, write_model
 
 MODEL: Final = "model.zip"
 NORMALIZE: Final = "vecnormalize.pkl"
@@ -67,9 +69,9 @@ def resume(folder: Path, algorithm: str, env: VecEnv, device: str, buffer_size: 
     env = load_normalize(folder, env)
     replay = folder / _REPLAY
     model = _load(folder, algorithm, device, env, {"buffer_size": 1 if replay.exists() else buffer_size})
-    if isinstance(model, OffPolicyAlgorithm) and replay.exists():
+    if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None and replay.exists():
         buffer = read_pickle(replay)
-        buffer.device = model.device
+        buffer.device = model.replay_buffer.device
         model.buffer_size = buffer.buffer_size * buffer.n_envs
         model.replay_buffer = buffer
     states = json.loads((folder / _RANDOM).read_text())
@@ -85,14 +87,12 @@ def _load(
 ) -> BaseAlgorithm:
     path = folder / MODEL
     try:
-        known = pickles_of_model(path) | changed
-        model: BaseAlgorithm = algorithm_class(algorithm).load(path, env, device, custom_objects=known)
-    except (OSError, ValueError, KeyError) as error:
+        return read_model(algorithm_class(algorithm), path, env, device, changed)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise RunStateError(
             f"{str(path)!r} cannot be read ({error}). Delete {str(folder)!r}: a run goes on from the checkpoint"
             " before it, if it has one."
         ) from error
-    return model
 
 
 def save_checkpoint(root: Path, model: BaseAlgorithm, facts: Mapping[str, Any], final: bool = False) -> Path:
@@ -138,7 +138,7 @@ def _write(folder: Path, model: BaseAlgorithm, facts: Mapping[str, Any], final: 
 
 def save_policy(folder: Path, model: BaseAlgorithm) -> None:
     """Saves a model, and its running statistics if it has any."""
-    model.save(folder / MODEL)
+    write_model(model, folder / MODEL)
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
         normalize.save(str(folder / NORMALIZE))

@@ -30,7 +30,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from safe_wrappers.errors import RunStateError
 
 _PACKAGES: Final = frozenset(
-    ("collections", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib", "safe_wrappers")
+    ("collections", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib", "sbx", "safe_wrappers")
 )
 """Nothing else is imported to see what a name is."""
 _KINDS: Final = (
@@ -88,13 +88,10 @@ def pickles_of_model(path: Path) -> dict[str, Any]:
 
     Raises:
         RunStateError: A pickle names anything that is no data.
-        ValueError, KeyError: It is no such file.
+        ValueError, KeyError, zipfile.BadZipFile: It is no such file.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            data = json.loads(archive.read("data"))
-    except zipfile.BadZipFile as error:
-        raise ValueError(str(error)) from None
+    with zipfile.ZipFile(path) as archive:
+        data = json.loads(archive.read("data"))
     return {
         name: _Reader(io.BytesIO(base64.b64decode(value[":serialized:"])), path).load()
         for name, value in data.items()

@@ -27,6 +27,7 @@ from ..config.algorithms import (
     LINEAR,
     OFF_POLICY,
     ON_POLICY,
+    SBX,
     SCHEDULED,
     algorithm_class,
     default_of,
@@ -103,13 +104,20 @@ def learner_callbacks(arm: ArmConfig) -> list[BaseCallback]:
 
 def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
     """Refuses an arm whose algorithm does not fit this task, which only the task itself can tell."""
-    where = f"arms.{arm.name}"
-    kinds: tuple[type, ...] = (spaces.Box,) if arm.algorithm in OFF_POLICY else ()
+    seen, acts, where = env.observation_space, env.action_space, f"arms.{arm.name}: {arm.algorithm}"
+    kind: type = spaces.Box if arm.algorithm in OFF_POLICY else object
     if arm.algorithm in DISCRETE:
-        kinds = (spaces.Discrete,)
-    if kinds and not isinstance(env.action_space, kinds):
-        others = OFF_POLICY if isinstance(env.action_space, spaces.Box) else DISCRETE
+        kind = spaces.Discrete
+    if not isinstance(acts, kind):
+        others = OFF_POLICY if isinstance(acts, spaces.Box) else DISCRETE
         raise ConfigurationError(
-            f"{where}: {arm.algorithm} needs actions of a {' or '.join(kind.__name__ for kind in kinds)}, and"
-            f" {arm.env.id} has {env.action_space}. Other algorithms: {', '.join((*ON_POLICY, *others))}."
+            f"{where} needs actions of a {kind.__name__}, and {arm.env.id} has {acts}."
+            f" Other algorithms: {', '.join((*ON_POLICY, *others))}."
         )
+    if arm.algorithm.startswith(SBX) and isinstance(seen, spaces.Dict):
+        vectors = all(isinstance(part, spaces.Box) and len(part.shape) == 1 for part in seen.values())
+        if arm.algorithm in ON_POLICY or not vectors:
+            raise ConfigurationError(
+                f"{where} observes one array, or off-policy a dict of vectors, and {arm.env.id} has {seen}."
+                f" Without {SBX!r} it is the algorithm of a package that can."
+            )
