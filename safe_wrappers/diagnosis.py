@@ -173,7 +173,7 @@ class Recording:
 
     env: Env
     infos: list[dict[str, Any]]  # with those of a contact and a balance monitor, where the env allows them
-    struck: list[tuple[str, str] | None]  # bodies with the largest force
+    struck: list[tuple[str, ...] | None]  # bodies with the largest force
     first: np.ndarray  # steps of episodes, shape (k,)
     terminated: np.ndarray
     executed: Array  # actions that the unwrapped env was given, shape (k, m)

@@ -137,15 +137,11 @@ def marks_of(spec: Any) -> list[Mark]:
     found = [line for j in range(way.shape[1]) for line in _lines(WAY, way[:, j])]
     found += [mark("SPHERE", WAY, point, [max(radius, _THIN), 0.0, 0.0]) for point in way[-1]]
     obstacles = [one for name in ("obstacles", "keep_out", "untouched") for one in getattr(spec, name, ())]
-    if isinstance(spec, Workspace):
-        low, high = spec.low or [None] * 3, spec.high or [None] * 3
-        if None in (*low, *high):
-            walls = zip([*low, *high], np.vstack([np.eye(3), -np.eye(3)]), strict=True)
-            obstacles += [Plane(abs(normal) * v, normal) for v, normal in walls if v is not None]
-        else:
-            corners = [*product(*np.transpose([np.array(low) + inset, np.array(high) - inset]))]
-            edges = [ends for ends in combinations(np.array(corners), 2) if (ends[0] != ends[1]).sum() == 1]
-            found += [line for ends in edges for line in _lines(LIMIT, ends, _THIN / 3.0)]
+    sides = [*(spec.low or [None]), *(spec.high or [None])] if isinstance(spec, Workspace) else [None]
+    if None not in sides:
+        corners = [*product(*np.transpose([np.array(spec.low) + inset, np.array(spec.high) - inset]))]
+        edges = [ends for ends in combinations(np.array(corners), 2) if (ends[0] != ends[1]).sum() == 1]
+        found += [line for ends in edges for line in _lines(LIMIT, ends, _THIN / 3.0)]
     here = way[0, 0] if way.shape[1] else np.zeros(3)
     return found + [one for obstacle in obstacles for one in _around(obstacle, spec.plant, inset, here)]
 

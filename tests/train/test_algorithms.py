@@ -36,7 +36,7 @@ PENALTY = 1000.0
 """An episode of the fake task returns less than 5, so that one penalty in a return would show."""
 KINDS = {
     "naive": "naive",
-    "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}, per_correction: 1.0}}",
+    "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}}}",
     "safe_action": "safe_action",
 }
 
