@@ -75,8 +75,8 @@ _MATTER = {
     "wrappers/lease_expiry.py": (
         "LeaseExpiry.step not; LeaseExpiry._accepted not; LeaseExpiry._grant min/max; Admission.admits not"
     ),
-    "wrappers/chunk_handover.py": "ChunkHandover._submit not; ChunkQueue.submit min/max;"
-    " ChunkQueue.next comparison; ChunkQueue._sendable not",
+    "wrappers/chunk_handover.py": "ChunkHandover._submit not; ChunkHandover._submit min/max;"
+    " ChunkHandover._take_over comparison; ChunkHandover._sendable not",
 }
 MATTER = [Mutant(file, *one.rsplit(" ", 1)) for file, of in _MATTER.items() for one in of.split("; ")]
 """What a filter must never get wrong, the first mistake of a kind in a function each."""

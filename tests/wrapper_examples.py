@@ -99,7 +99,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                 "chunk_size": 8,
                 "execution_horizon": 3,
                 "inference_delay": [0, 2],
-                "blend": "quintic",
+                "limits": {"velocity": 20.0},
                 "rate_limit": [20.0, 30.0],
             },
         ),

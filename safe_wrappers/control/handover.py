@@ -1,7 +1,6 @@
 """The handover from one stream of held commands to the next: blends, and whether a machine bears them.
 
-A stream is a policy's commands for the next control steps, shape (n, m): one per step, in action units. With
-`rate_limit` in action units per second no two neighbours differ by more than `rate_limit * control_dt`. A machine's
+A stream is a policy's commands for the next control steps, shape (n, m): one per step, in action units. A machine's
 own limits are judged along the curve that a drive follows which interpolates the commands: matched ends say nothing
 about what lies between them.
 
@@ -11,20 +10,17 @@ Source: appendix "Smooth Trajectories and Bumpless Transfer".
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.errors import Array, ConfigurationError, positive
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
-
-BLENDS: Final = ("smoothstep", "quintic")
 
 LOOK_BACK: Final = 3
 """Commands before a seam that its blend continues: position, first and second difference."""
@@ -53,117 +49,47 @@ def shortest_blend(change: Array | float, limit: Array | float, derivative: int 
     return np.asarray(time * _ROUND_UP)
 
 
-class Seam(NamedTuple):
-    """Transition from one stream into the next."""
-
-    plan: Array  #: commands from the seam on, shape (n, m): the blend, then the new stream bit for bit
-    steps: int  #: control steps of the blend: the first `steps` commands are mixed
-    limited: NDArray[np.bool_]  #: which commands were rate-limited in addition to the blend, shape (n,)
-
-
 def join(
-    sent: Array,
-    prior: Array,
-    new: Array,
-    control_dt: float,
-    *,
-    blend: str = "smoothstep",
-    fewest: int = 0,
-    rate_limit: Array | float = np.inf,
-    low: Array | float = -np.inf,
-    high: Array | float = np.inf,
-    accepts: Callable[[int], bool] | None = None,
-) -> Seam | None:
-    """The shortest blend from what was sent into a new stream that keeps the rate limit.
+    sent: Array, prior: Array, new: Array, step: Array | float = np.inf, fewest: int = 0
+) -> tuple[Array, int]:
+    """The shortest blend from what was sent into a new stream in which neighbours differ by at most `step`.
 
-    If no blend that ends inside the new stream keeps it, the one that exceeds it least is rate-limited step by step.
+    Streams are mixed by the smoothstep, the prior one held at the last command unless it lasts for the whole blend.
+    If no blend that ends inside the new stream keeps the step, it is the one that exceeds it least.
 
     Args:
         sent: The latest commands, oldest first, shape (k, m), k >= 0; with none there is no seam.
         prior: Remaining commands of the present stream, shape (p, m), p >= 0.
         new: The new stream for the next steps, shape (n, m), n >= 1.
-        control_dt: Control interval, s.
-        blend: "smoothstep" mixes the streams, the prior one held at the last command unless it lasts for the whole
-            blend. "quintic" bridges from the last command to the new stream with matching first and second
-            derivatives at both ends, clipped to the box.
-        fewest: Least number of steps of the blend (fewer only if the new stream is shorter).
-        rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
-        low: Lower bound of the action box, for the bridge, shape (m,) or a number.
-        high: Upper bound.
-        accepts: Whether a blend of so many steps will do, 0 for none, asked from the shortest on of those that keep
-            the rate limit and that the box does not cut. If none will do, the result is None.
+        step: Action units, of every component, or of each, shape (m,).
+        fewest: Least number of control steps of the blend (fewer only if the new stream is shorter).
+
+    Returns:
+        The commands from the seam on, shape (n, m), the blend and then the new stream bit for bit; the blend's steps.
     """
-    step = np.asarray(rate_limit * control_dt)
+    found, least = (new, 0), np.inf
     if not len(sent):
-        plan, limited = limit_rate(new, None, step)
-        return Seam(plan, 0, limited)
+        return found
     first = min(fewest, len(new) - 1)
-    if accepts is None and first == 0 and len(new) > 1 and (np.abs(new[0] - sent[-1]) > step).any():
+    if first == 0 and len(new) > 1 and (np.abs(new[0] - sent[-1]) > step).any():
         first = 1
-    chosen, least = None, np.inf
     for steps in range(first, len(new)):
-        made = _mixed(sent, prior, new, steps) if blend == "smoothstep" else _bridged(sent, new, steps)
-        boxed = made if blend == "smoothstep" else np.clip(made, low, high)
-        plan = np.concatenate([boxed, new[steps:]])
-        way = np.diff(np.concatenate([sent[-1:], plan[: steps + 1]]), axis=0)
-        peak = float((np.abs(way) / step).max())
-        if accepts is None:
-            if chosen is None or peak < least:
-                chosen, least = (plan, steps), peak
-            if peak <= 1.0:
-                break
-        elif peak <= 1.0 and np.allclose(made, boxed, rtol=1e-9, atol=1e-12) and accepts(steps):
-            chosen = plan, steps
+        before = prior[:steps] if steps <= len(prior) else sent[-1]
+        mixed = before + smoothstep(np.arange(1.0, steps + 1.0) / (steps + 1.0))[:, None] * (
+            new[:steps] - before
+        )
+        plan = np.concatenate([mixed, new[steps:]])
+        peak = float((np.abs(_way(sent, plan, steps)) / step).max())
+        if peak < least:
+            found, least = (plan, steps), peak
+        if peak <= 1.0:
             break
-    if chosen is None:
-        return None
-    plan, limited = limit_rate(chosen[0], sent[-1], step)
-    return Seam(plan, chosen[1], limited)
+    return found
 
 
-def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
-    """Limit the difference of neighbouring commands, shape (n, m), to `step`; returns them and which were changed.
-
-    The step is in action units, a number or shape (m,), and may be infinite; `before` is the command before the
-    first, shape (m,), or None. Commands within the limit are returned bit for bit.
-    """
-    limited = np.zeros(len(commands), dtype=bool)
-    whole = commands if before is None else np.concatenate([before[None], commands])
-    if len(whole) < 2 or (np.abs(np.diff(whole, axis=0)) <= step).all():
-        return commands, limited
-    kept = commands.copy()
-    last = kept[0] if before is None else before
-    for i in range(len(kept)):
-        held = np.clip(kept[i], last - step, last + step)
-        limited[i] = (held != kept[i]).any()
-        kept[i] = last = held
-    return kept, limited
-
-
-def _phases(steps: int) -> Array:
-    """Normalised time of the commands of a blend, which arrives one command after them, shape (steps,)."""
-    return np.asarray(np.arange(1.0, steps + 1.0) / (steps + 1.0))
-
-
-@lru_cache(maxsize=256)
-def _basis(steps: int) -> Array:
-    """Contribution of each boundary value of a quintic of unit duration to each command, (steps, 6)."""
-    from scipy.interpolate import BPoly  # here: SciPy takes a while to import
-
-    unit = np.eye(6)
-    return np.asarray(BPoly.from_derivatives([0.0, 1.0], [unit[:3], unit[3:]])(_phases(steps)))
-
-
-def _mixed(sent: Array, prior: Array, new: Array, steps: int) -> Array:
-    """The commands of a blend of two streams, shape (steps, m)."""
-    before = prior[:steps] if steps <= len(prior) else sent[-1]
-    return np.asarray(before + smoothstep(_phases(steps))[:, None] * (new[:steps] - before))
-
-
-def _bridged(sent: Array, new: Array, steps: int) -> Array:
-    """The commands of a bridge, shape (steps, m). Derivatives are per control step, of which it lasts one more."""
-    given = np.stack([*_backward_differences(sent), *(d[steps] for d in _stream_derivatives(new))])
-    return np.asarray(_basis(steps) @ (given * (steps + 1.0) ** np.array([0, 1, 2, 0, 1, 2])[:, None]))
+def _way(sent: Array, plan: Array, steps: int) -> Array:
+    """Differences of neighbouring commands from the last one sent to the first one after a blend, (steps + 1, m)."""
+    return np.diff(np.concatenate([sent[-1:], plan[: steps + 1]]), axis=0)
 
 
 def _backward_differences(sent: Array) -> list[Array]:
@@ -183,7 +109,10 @@ def _stream_derivatives(new: Array) -> list[Array]:
 
 
 def bridge(sent: Array, new: Array, steps: int, control_dt: float) -> PPoly:
-    """The quintic of `join` that bridges `steps` commands: of the time since the last command, s, values (m,)."""
+    """The quintic that bridges `steps` commands: of the time since the last command, s, values (m,).
+
+    It goes from the last of `sent` (k, m) to entry `steps` of `new` (n, m), where first and second derivatives match.
+    """
     from scipy.interpolate import BPoly, PPoly
 
     per_step = control_dt ** -np.arange(3.0)[:, None]
@@ -221,24 +150,12 @@ def knot_torque_step(inertia: Array, spacing: float, positions: Array) -> Array:
     return np.asarray((inertia @ jumps[:, :, None])[:, :, 0])
 
 
-_UNITS: Final = {
-    "velocity": "action units per s",
-    "acceleration": "action units per s^2",
-    "jerk": "action units per s^3",
-    "torque": "N m",
-    "torque_slew": "N m/s",
-}
-
-
 @dataclass(frozen=True)
 class SeamLimits:
     """What a machine was measured to bear, for `ChunkHandover(limits=)`; what is None is not judged.
 
-    Each is one number for all entries of a command, or one for each of them. Torques are for commands that are
-    positions of joints: those which the joints need, by inverse dynamics of the env's MuJoCo model.
-
-    Raises:
-        ConfigurationError: A limit that is not positive, or none at all.
+    Each is one number for all entries of a command, or one for each of them, positive. Torques are for commands that
+    are positions of joints: those which the joints need, by inverse dynamics of the env's MuJoCo model.
     """
 
     velocity: float | Sequence[float] | None = None  #: action units per s
@@ -247,75 +164,69 @@ class SeamLimits:
     torque: float | Sequence[float] | None = None  #: N m
     torque_slew: float | Sequence[float] | None = None  #: N m/s
 
-    def __post_init__(self) -> None:
-        for name, unit in _UNITS.items():
-            object.__setattr__(self, name, _entries(f"limits.{name}", getattr(self, name), unit))
-        if all(getattr(self, name) is None for name in _UNITS):
-            raise ConfigurationError(f"limits has none; it takes {', '.join(_UNITS)}")
 
-    def of(self, name: str, controls: int) -> Array:
-        """A limit for each entry of a command, shape (controls,); infinite for none."""
-        value = getattr(self, name)
-        each = value if isinstance(value, tuple) else (math.inf if value is None else value,) * controls
-        if len(each) != controls:
-            raise ConfigurationError(f"limits.{name} has {len(each)} entries, a command {controls}")
-        return np.array(each)
-
-    @property
-    def needs_dynamics(self) -> bool:
-        """Whether torques are limited that only a model can tell."""
-        return self.torque is not None or self.torque_slew is not None
-
-
-def _entries(name: str, value: Any, unit: str) -> float | tuple[float, ...] | None:
+def limit_of_each(name: str, value: Any, controls: int, unit: str) -> Array:
+    """A limit for each entry of a command, shape (controls,), from one number or one for each; infinite for None."""
     if value is None:
-        return None
-    if isinstance(value, list | tuple | np.ndarray):
-        return tuple(positive(name, one, unit) for one in value)
-    return positive(name, value, unit)
+        return np.full(controls, np.inf)
+    each = [positive(name, one, unit) for one in np.ravel(value)]
+    if len(each) not in (1, controls):
+        wanted = f"one number, or one for each of the {controls} action components"
+        raise ConfigurationError(f"{name} is {wanted}; got {value!r}")
+    return np.array(np.broadcast_to(each, controls))
 
 
 class SeamCheck:
-    """Whether quintic blends and chunks of m controls keep a machine's limits.
+    """Quintic blends of m controls that keep a machine's limits, and whether its chunks do.
 
-    Where `limits.needs_dynamics`, `torques` gives those that positions, velocities and accelerations of the joints
-    take, N m, all of shape (k, m), and `inertia` the matrices of joint positions, shape (k, m, m), kg m^2.
+    Where torques are limited, `dynamics` has methods `torques` of positions, velocities and accelerations of the
+    joints, all of shape (k, m), N m, and `inertia` of their positions, shape (k, m, m), kg m^2.
     """
 
-    def __init__(
-        self,
-        limits: SeamLimits,
-        controls: int,
-        control_dt: float,
-        torques: Callable[[Array, Array, Array], Array] | None = None,
-        inertia: Callable[[Array], Array] | None = None,
-    ) -> None:
-        self._control_dt, self._torques, self._inertia = control_dt, torques, inertia
-        self._bounds = [limits.of(name, controls) for name in ("velocity", "acceleration", "jerk")]
-        self._torque, self._slew = limits.of("torque", controls), limits.of("torque_slew", controls)
+    def __init__(self, limits: SeamLimits, controls: int, control_dt: float, dynamics: Any = None) -> None:
+        self._control_dt, self._dynamics = control_dt, dynamics
+        units = ("action units per s", "action units per s^2", "action units per s^3", "N m", "N m/s")
+        *self._bounds, self._torque, self._slew = (
+            limit_of_each(f"limits.{field.name}", getattr(limits, field.name), controls, unit)
+            for field, unit in zip(fields(limits), units, strict=True)
+        )
 
-    def accepts(self, sent: Array, new: Array, steps: int) -> bool:
-        """Whether a quintic of `join` that bridges `steps` commands keeps all limits up to its end.
+    def join(
+        self, sent: Array, new: Array, step: Array, fewest: int, low: Array, high: Array
+    ) -> tuple[Array, int] | None:
+        """As `join`, but by quintics, and None if none will do, which keeps step, limits and box (m,)."""
+        if not len(sent):
+            return new, 0
+        for steps in range(min(fewest, len(new) - 1), len(new)):
+            curve = bridge(sent, new, steps, self._control_dt)
+            made = curve(self._control_dt * np.arange(1.0, steps + 1.0))
+            plan = np.concatenate([np.clip(made, low, high), new[steps:]])
+            cut = not np.allclose(made, plan[:steps], rtol=1e-9, atol=1e-12)
+            if not cut and (np.abs(_way(sent, plan, steps)) <= step).all() and self.accepts(curve):
+                return plan, steps
+        return None
+
+    def accepts(self, curve: PPoly) -> bool:
+        """Whether a blend keeps all limits up to its end.
 
         Torques are judged at every quarter of a control step, and where an acceleration is largest or smallest.
         """
-        curve = bridge(sent, new, steps, self._control_dt)
         if any((peaks(curve, d) > bound * _ROUNDING).any() for d, bound in enumerate(self._bounds, 1)):
             return False
-        if self._torques is None:
+        if self._dynamics is None:
             return True
-        grid = np.linspace(0.0, curve.x[-1], 4 * (steps + 1) + 1)
-        times = np.unique(np.concatenate([grid, *_extremes(curve, 2)]))
-        torque, passed = self._torques(*(curve(times, d) for d in range(3))), np.diff(times)[:, None]
+        quarters = round(4.0 * curve.x[-1] / self._control_dt)
+        times = np.unique(np.concatenate([np.linspace(0.0, curve.x[-1], quarters + 1), *_extremes(curve, 2)]))
+        torque, passed = self._dynamics.torques(*(curve(times, d) for d in range(3))), np.diff(times)[:, None]
         within = np.where(passed > 1e-9 * self._control_dt, passed, self._control_dt)
         slow = np.abs(np.diff(torque, axis=0)) <= self._slew * within * _ROUNDING
         return bool((np.abs(torque) <= self._torque * _ROUNDING).all() and slow.all())
 
     def bears_knots(self, knots: Array, spacing: float) -> bool:
         """Whether torque steps at the knots (k, m) of a cubic spline, `spacing` s apart, keep the torque's slew."""
-        if self._inertia is None or len(knots) < 3:
+        if self._dynamics is None or len(knots) < 3:
             return True
-        steps = knot_torque_step(self._inertia(knots[1:-1]), spacing, knots)
+        steps = knot_torque_step(self._dynamics.inertia(knots[1:-1]), spacing, knots)
         return bool((self._slew * self._control_dt * _ROUNDING >= np.abs(steps)).all())
 
     def shortest_fade(self, change: Array) -> float:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from safe_wrappers.control.handover import bridge, join, knot_torque_step, peaks
+from safe_wrappers.control.handover import SeamCheck, SeamLimits, bridge, knot_torque_step, peaks
 
 HOLD = 0.1
 
@@ -50,10 +50,11 @@ def test_a_curve_is_scipys_and_its_peaks_are_those_of_dense_samples(scenario):
 @given(scenario=streams())
 def test_at_the_control_steps_it_is_what_is_sent(scenario):
     sent, new, n = scenario
-    joined = join(sent, sent[:0], new, HOLD, blend="quintic", accepts=lambda steps: steps == n)
-    assert joined.steps == n
+    free, box = np.full(new.shape[1], np.inf), np.full(new.shape[1], 100.0)
+    plan, steps = SeamCheck(SeamLimits(), new.shape[1], HOLD).join(sent, new, free, n, -box, box)
+    assert steps == n
     curve = bridge(sent, new, n, HOLD)
-    np.testing.assert_allclose(curve(HOLD * np.arange(1, n + 2)), joined.plan[: n + 1], atol=1e-10)
+    np.testing.assert_allclose(curve(HOLD * np.arange(1, n + 2)), plan[: n + 1], atol=1e-10)
     np.testing.assert_allclose(curve(0.0), sent[-1])
 
 

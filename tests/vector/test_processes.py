@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 from single_loops import assert_same_episodes, by_hand, script, unroll
-from worlds import DT, TASKS, ScheduledCart, cart_filter, drift, push, read, sub_envs
+from vector_worlds import DT, TASKS, ScheduledCart, cart_filter, drift, push, read, sub_envs
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from single_loops import assert_same_episodes, by_hand, script, unroll, unroll_sb3
-from worlds import KINDS, TASKS, WAYS, sub_envs
+from vector_worlds import KINDS, TASKS, WAYS, sub_envs
 
 PIPES = {"async, pipes": functools.partial(AsyncVectorEnv, shared_memory=False)}
 PLAYED = [(task, *way) for task in TASKS for way in WAYS]

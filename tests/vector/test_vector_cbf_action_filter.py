@@ -14,7 +14,7 @@ import gymnasium_robotics
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from worlds import BEFORE_THE_WALL, HAZARDS, AtHazard, ScheduledCart, cart_plant
+from vector_worlds import BEFORE_THE_WALL, HAZARDS, AtHazard, ScheduledCart, cart_plant
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError

@@ -67,38 +67,31 @@ def counting_plant(dt=0.1):
 class ChunkHandover(sw.ChunkHandover):
     """Tells of each step the longest blend that began in it, s, and the age of the observation that took over."""
 
-    def __init__(self, *args, **more):
-        super().__init__(*args, **more)
-        queue = self._queue
-        queue.next = self._watched(queue.next)
-        queue._joined = self._kept(queue._joined, lambda seam: 0 if seam is None else seam.steps)
-        queue._fade_steps = self._kept(queue._fade_steps, int)
-        self.latency, self.blends = -1, [0]
+    latency, blends = -1, (0,)
 
-    def _watched(self, following):
-        def watched(*asked):
-            newest, now = self._queue._observed, self._queue.now
-            command = following(*asked)
-            if command.observed > newest:
-                self.latency = now - command.observed
-            return command
+    def _take_over(self):
+        newest = self._observed
+        seam = super()._take_over()
+        if self._observed > newest:
+            self.latency = self._steps_done - self._observed
+        return seam
 
-        return watched
+    def _joined(self, fresh):
+        found = super()._joined(fresh)
+        self.blends += (0 if found is None else found[1],)
+        return found
 
-    def _kept(self, made, steps):
-        def kept(given):
-            found = made(given)
-            self.blends.append(steps(found))
-            return found
-
-        return kept
+    def _fade_steps(self, target):
+        steps = super()._fade_steps(target)
+        self.blends += (steps,)
+        return steps
 
     def reset(self, **options):
         observation, info = super().reset(**options)
         return observation, info | {"handover/latency": -1, "handover/blend_time": 0.0}
 
     def step(self, action):
-        self.latency, self.blends = -1, [0]
+        self.latency, self.blends = -1, (0,)
         *answer, info = super().step(action)
         longest = max(self.blends)
         told = (longest + 1) * self.control_dt if longest else 0.0

@@ -5,9 +5,6 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import BPoly
-
-BLENDS = ("smoothstep", "quintic")
 
 
 def smooth(s):
@@ -35,7 +32,6 @@ class Tick:
 @dataclass
 class Slow:
     hold: float
-    blend: str = "smoothstep"
     fewest: int = 0
     limit: float = math.inf
     low: float = -math.inf
@@ -74,11 +70,10 @@ class Slow:
     def tick(self, fallback):
         tick = Tick(control=[])
         self.arrive(tick)
-        control, exact, limited = self.planned(tick)
+        control, exact = self.planned(tick)
         tick.starved = control is None
         if tick.starved:
-            control, exact, limited = self.box(fallback), True, False
-        tick.limited = limited
+            control, exact = self.box(fallback), True
         acting = "the fallback" if tick.starved else "the chunks"
         if self.sent and acting != self.acting:
             if not tick.seam:
@@ -138,7 +133,7 @@ class Slow:
         self.in_force = newest["observed"]
         fresh = newest["rows"][age:]
         if len(newest["rows"]) == 1:
-            self.plan = [(row, True, False) for row in fresh]
+            self.plan = [(row, True) for row in fresh]
         else:
             tick.blend_steps = self.join(fresh)
             tick.seam = bool(self.sent)
@@ -146,31 +141,14 @@ class Slow:
 
     def planned(self, tick):
         if not self.plan:
-            return None, False, False
+            return None, False
         tick.entry = self.now - self.in_force
         return self.plan.pop(0)
 
     def join(self, new):
         """Replace the plan by a blend into the new stream; its steps."""
-        prior = [row for row, _, _ in self.plan]
-        if not self.sent:
-            steps, plan = 0, list(new)
-        else:
-            steps, plan = self.shortest(prior, new)
-        self.plan = []
-        last = self.sent[-1] if self.sent else None
-        for i, row in enumerate(plan):
-            held = (
-                row
-                if last is None
-                else [min(max(b, a - self.step), a + self.step) for a, b in zip(last, row, strict=True)]
-            )
-            if last is not None:
-                for a, b in zip(last, row, strict=True):
-                    self.close_calls += 0 < abs(b - a) - self.step < 1e-5
-            limited = held != row
-            self.plan.append((held, i >= steps and not limited, limited))
-            last = held
+        steps, plan = self.shortest([row for row, _ in self.plan], new) if self.sent else (0, list(new))
+        self.plan = [(row, i >= steps) for i, row in enumerate(plan)]
         return steps
 
     def shortest(self, prior, new):
@@ -199,25 +177,10 @@ class Slow:
         last = self.sent[-1]
         plan = [list(row) for row in new]
         for k in range(len(last)):
-            if self.blend == "smoothstep":
-                for i in range(n):
-                    before = prior[i][k] if n <= len(prior) else last[k]
-                    alpha = smooth((i + 1) / (n + 1))
-                    plan[i][k] = (1 - alpha) * before + alpha * new[i][k]
-                continue
-            past = [row[k] for row in self.sent]
-            rate = past[-1] - past[-2] if len(past) > 1 else 0.0
-            second = past[-1] - 2 * past[-2] + past[-3] if len(past) > 2 else 0.0
-            ahead = [row[k] for row in new]
-            final = len(ahead) - 1
-            if 0 < n < final:
-                slope, bend = (ahead[n + 1] - ahead[n - 1]) / 2, ahead[n + 1] - 2 * ahead[n] + ahead[n - 1]
-            else:
-                slope, bend = (ahead[n] - ahead[n - 1] if n else 0.0), 0.0
-            ends = [[last[k], rate, second], [ahead[n], slope, bend]]
-            bridge = BPoly.from_derivatives([0.0, n + 1.0], ends)
             for i in range(n):
-                plan[i][k] = min(max(float(bridge(i + 1.0)), self.low), self.high)
+                before = prior[i][k] if n <= len(prior) else last[k]
+                alpha = smooth((i + 1) / (n + 1))
+                plan[i][k] = (1 - alpha) * before + alpha * new[i][k]
         return plan
 
 

@@ -10,7 +10,7 @@ import pytest
 from chunk_worlds import ChunkHandover, Line, Wander, counting_plant
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from slow_handover import BLENDS, Slow, measured
+from slow_handover import Slow, measured
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError
@@ -45,9 +45,8 @@ class Scenario:
     size: int
     horizon: int
     delay: tuple
-    blend: str
-    fewest: int | None
-    limit: float | None
+    fewest: int
+    limit: float
     controls: int
     dtype: type
     bound: float
@@ -67,22 +66,17 @@ class Scenario:
             self.size,
             self.horizon,
             self.delay[0] if self.delay[0] == self.delay[1] else list(self.delay),
-            blend=self.blend,
-            blend_time=None if self.fewest is None else (self.fewest + 1) * HOLD,
-            rate_limit=self.limit,
+            blend_time=(self.fewest + 1) * HOLD if self.fewest else None,
+            rate_limit=self.limit if math.isfinite(self.limit) else None,
             fallback=Wander(self.seed, self.controls, self.scale) if wander else self.fallback,
             plant=counting_plant(HOLD) if wander else None,
         )
 
     def oracle(self):
-        fewest = self.fewest or 0
-        if self.fewest is None and self.limit is None:
-            fewest = self.size - self.horizon - self.delay[1]
         return Slow(
             HOLD,
-            self.blend,
-            fewest,
-            math.inf if self.limit is None else self.limit,
+            self.fewest,
+            self.limit,
             -min(self.bound, float(np.finfo(np.float32).max)),
             min(self.bound, float(np.finfo(np.float32).max)),
             dtype=self.dtype,
@@ -106,26 +100,23 @@ EVENTS = ("fresh",) * 8 + ("nothing", "stale", "older", "future", "nan", "inf")
 
 
 @st.composite
-def scenarios(draw, blends=BLENDS, size=None, limited=None):
-    most = draw(st.integers(0, 4)) if size is None else 0
+def scenarios(draw, limited=False):
+    most = draw(st.integers(0, 4))
     delay = (draw(st.integers(0, most)), most)
-    horizon = draw(st.integers(max(most, 1), 6)) if size is None else 1
-    chunk = horizon + most + draw(st.integers(0, 6)) if size is None else size
-    blend = draw(st.sampled_from(blends))
-    fewest, limit = None, None
+    horizon = draw(st.integers(max(most, 1), 6))
+    chunk = horizon + most + draw(st.integers(0, 6))
+    fewest, limit = 0, math.inf
     if draw(st.booleans()) and chunk - most > 1:
         fewest = draw(st.integers(1, chunk - most - 1))
     elif chunk == 1 and draw(st.booleans()):
         fewest = draw(st.integers(1, 5))
-    nothing = fewest is None and chunk - horizon - most == 0
-    if limited or nothing or (limited is None and draw(st.booleans())):
+    if limited or not fewest or draw(st.booleans()):
         limit = draw(st.floats(0.05, 50.0))
     bound = draw(st.sampled_from([1.0, 1.0, 0.3, math.inf]))
     return Scenario(
         chunk,
         horizon,
         delay,
-        blend,
         fewest,
         limit,
         controls=draw(st.integers(1, 3)),
@@ -206,7 +197,7 @@ def test_every_command_and_every_figure_is_the_slow_simulators(scenario):
         assert reward == pytest.approx(sum(0.5 * (k + 1) for k in range(t - len(own), t)))
 
 
-@given(scenarios(blends=BLENDS, limited=True))
+@given(scenarios(limited=True))
 def test_no_two_neighbours_are_farther_apart_than_the_limit_allows(scenario):
     """Also where the simulator is not asked: ties, and numbers as coarse as the limit."""
     env, _, steps = play(scenario)
@@ -218,7 +209,7 @@ def test_no_two_neighbours_are_farther_apart_than_the_limit_allows(scenario):
 
 
 @given(
-    scenarios(blends=BLENDS, limited=True),
+    scenarios(limited=True),
     st.sampled_from([1e2, 1e5, 1e8, 1e30, 3e38]),
     st.sampled_from([1e-3, 0.05, 1.0]),
 )
@@ -242,13 +233,13 @@ def run(env, chunks, seed=0):
     return np.array(env.unwrapped.given), infos
 
 
-@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("limits", [None, {"jerk": 1e9}])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_without_need_for_a_blend_the_chunks_bits_are_executed(blend, dtype):
+def test_without_need_for_a_blend_the_chunks_bits_are_executed(limits, dtype):
     rng = np.random.default_rng(0)
     stream = rng.uniform(-1, 1, (40, 2)).astype(dtype)
     chunks = [stream[i : i + 8] for i in range(0, 32, 4)]  # they agree where they overlap
-    env = ChunkHandover(Line(2, dtype=dtype), 8, 4, 2, blend=blend, rate_limit=20.0, fallback="zero")
+    env = ChunkHandover(Line(2, dtype=dtype), 8, 4, 2, limits=limits, rate_limit=20.0, fallback="zero")
     commands, infos = run(env, chunks)
     assert commands[2:].tobytes() == stream[2:32].tobytes()
     assert [i["handover/limited"] for i in infos] == [0] * 8
@@ -359,10 +350,9 @@ def test_a_chunk_with_one_bad_entry_is_refused_whole_then_left_over_then_fallbac
     assert [float(c[0]) for c in env.unwrapped.given[12:]] == [float(np.float32(0.021))] * 4
 
 
-@pytest.mark.parametrize("blend", BLENDS)
-def test_into_the_fallback_and_back_is_bumpless(blend):
+def test_into_the_fallback_and_back_is_bumpless():
     limit = 1.0
-    env = ChunkHandover(Line(), 8, 4, blend=blend, rate_limit=limit, fallback="zero")
+    env = ChunkHandover(Line(), 8, 4, rate_limit=limit, fallback="zero")
     env.reset(seed=0)
     high, infos = np.full((8, 1), 0.9, np.float32), []
     for step in range(14):
@@ -459,7 +449,6 @@ def handover(env, **changed):
         ({"chunk_size": True, "execution_horizon": 1}, "chunk_size .* at least 1; got True"),
         ({"chunk_size": 0}, "at least 1; got 0"),
         ({"execution_horizon": 0}, "at least 1; got 0"),
-        ({"blend": "linear"}, "no blend 'linear'; choose smoothstep, quintic"),
         ({"rate_limit": 0.0}, "rate_limit .*> 0"),
         ({"rate_limit": math.nan}, "rate_limit .*finite"),
         ({"rate_limit": [5.0, 5.0]}, "one for each of the 1 action components"),
@@ -469,12 +458,7 @@ def handover(env, **changed):
             "a blend of 8 control steps .* 8 control steps: choose a longer chunk_size",
         ),
         ({"blend_time": 0.7, "inference_delay": 3}, "5 control steps"),
-        (
-            {"rate_limit": None, "execution_horizon": 8},
-            "a blend of 0 control steps does not fit.*pass rate_limit",
-        ),
-        ({"rate_limit": None, "execution_horizon": 5, "inference_delay": [0, 3]}, "a blend of 0"),
-        ({"rate_limit": None, "chunk_size": 1, "execution_horizon": 1}, "a blend of 0"),
+        ({"rate_limit": None}, "Give rate_limit, blend_time or limits"),
         ({"fallback": "sleep"}, "no fallback 'sleep'; choose brake, hold, zero"),
         ({"fallback": "brake"}, "(?i)mujoco"),
         ({"plant": 3}, "plant is a MujocoPlant"),

@@ -14,7 +14,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import safe_wrappers as sw
 from safe_wrappers.info import COST, COST_SUBSTEP
-from safe_wrappers.wrappers.faults import Jitter, Outages, RepeatedCommands
+from safe_wrappers.wrappers.faults import Outages, RepeatedCommands
 
 WALL = 1.0
 DT = 0.1
@@ -183,7 +183,7 @@ def commanded_point_goal(index=0):
     env = sw.CBFActionFilter(env, [HAZARDS], fallback="hold")
     budget = sw.StoppingBudget(HAZARDS, closing_speed=4.0)
     env = sw.RecordInterventions(sw.LeaseExpiry(env, budget, max_lease_s=0.2, min_lease_s=0.08))
-    return Outages(Jitter(sw.ChunkHandover(env, 6, 2, [0, 2], rate_limit=40.0), 0.05), 0.1, 0.1)
+    return Outages(sw.ChunkHandover(env, 6, 2, [0, 2], rate_limit=40.0), 0.1, 0.1)
 
 
 def leased_pendulum(index=0):
