@@ -120,18 +120,14 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
 
 def _found(name: str, recording: "Recording", attacked: bool) -> Finding:
     """One symptom, with its lines if it is there."""
-    symptom, code = SYMPTOMS[name], ""
+    symptom = SYMPTOMS[name]
     try:
         if attacked and symptom.policies_only:
             raise NotMeasuredError("an attacker says nothing of it: give a policy")
         figure = symptom.measure(recording)
-        if figure >= symptom.threshold:
-            code = symptom.tool(recording)
     except NotMeasuredError as error:
         return Finding(name, missing=str(error))
-    except ConfigurationError as error:
-        code = f"# What treats it is refused: {error}"
-    return Finding(name, figure, code)
+    return Finding(name, figure, symptom.tool(recording) if figure >= symptom.threshold else "")
 
 
 # Drivers, and what they do to an env ------------------------------------------------------------------------------
@@ -264,7 +260,7 @@ class Symptom(NamedTuple):
     threshold: float  # from which on it is a symptom
     unit: str  # of the threshold and of the figure
     measure: Callable[[Recording], float]  # the figure; or a `NotMeasuredError`
-    tool: Callable[[Recording], str]  # lines that treat it in `env`, or a comment; or a `ConfigurationError`
+    tool: Callable[[Recording], str]  # lines that treat it in `env`, or a comment
     policies_only: bool = False  # an attacker has this symptom of itself
 
 
@@ -333,7 +329,11 @@ def _measure_steps(recording: Recording) -> float:
 def _treat_steps(recording: Recording) -> str:
     """A handover of single actions that lets commands change by 5 % of their range in a control step."""
     low, high = _box(recording.env)
-    rate = float(f"{0.05 * float((high - low).min()) / check_timing(recording.env):.4g}")
+    try:
+        control_dt = check_timing(recording.env)
+    except ConfigurationError as error:
+        return f"# ChunkHandover(env, chunk_size=1, execution_horizon=1) is refused: {error}"
+    rate = float(f"{0.05 * float((high - low).min()) / control_dt:.4g}")
     return (
         "# If the policy gives chunks, pass them whole: ChunkHandover(env, chunk_size=..., execution_horizon=...).\n"
         f"env = sw.ChunkHandover(env, chunk_size=1, execution_horizon=1, rate_limit={rate})"
@@ -359,7 +359,7 @@ def _treat_forces(recording: Recording) -> str:
     forces = np.nan_to_num(recording.of_info("contact/peak_force"), nan=0.0)
     k = int(np.argmax(forces))
     depth, pair = float(recording.of_info("contact/penetration")[k]), recording.struck[k]
-    if pair is None or not depth > 0.0:
+    if pair is None or not all(pair) or not depth > 0.0:  # a body without a name cannot be given
         return "# Limit the speed of what hits: ImpactSpeedLimit, or a lower speed of the whole machine."
     model = recording.model
     fixed = fixed_bodies(model)
