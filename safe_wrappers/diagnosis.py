@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, cast
@@ -27,7 +27,7 @@ from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 from safe_wrappers.wrappers.protect import protect
 from safe_wrappers.wrappers.recipes import recipe_of
 
-__all__ = ["SYMPTOMS", "Diagnosis", "Finding", "diagnose"]
+__all__ = ["SYMPTOMS", "Finding", "diagnose"]
 
 Env = gym.Env[Any, Any]
 Driver = Callable[[Any], Any]
@@ -79,38 +79,7 @@ class Finding:
         return "\n      ".join([f"  {verdict:9} {self.symptom:17} {words}", *self.code.splitlines()])
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """What was looked for in an env.
-
-    Attributes:
-        env: Id of the env, or its name.
-        steps: Control steps that it was driven for.
-        driver: "policy" or "attacker".
-        findings: One per symptom, the most severe first; then what is not there, then what could not be measured.
-    """
-
-    env: str
-    steps: int
-    driver: str
-    findings: Sequence[Finding]
-
-    @property
-    def present(self) -> list[Finding]:
-        """The symptoms that are there, the most severe first."""
-        return [finding for finding in self.findings if finding.present]
-
-    def finding(self, symptom: str) -> Finding:
-        """That of one symptom."""
-        return {finding.symptom: finding for finding in self.findings}[symptom]
-
-    def __str__(self) -> str:
-        """A table for a terminal, and the lines to paste."""
-        head = f"{self.env}: {self.steps:,} steps, driven by the {self.driver}"
-        return "\n".join([head, *map(str, self.findings)])
-
-
-def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> Diagnosis:
+def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> list[Finding]:
     """Look for symptoms in an env and a policy, and name the wrapper that treats each.
 
     The env is driven by the policy, or without one by an attacker: random corners of the action space, each held for
@@ -124,6 +93,9 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
         steps: Control steps.
         seed: Of the attacker and of resets.
 
+    Returns:
+        One finding per symptom, the most severe first; then what is not there, then what could not be measured.
+
     Raises:
         UnsupportedEnvError: No Gymnasium env, or one with other actions.
         ConfigurationError: A policy that is none.
@@ -131,9 +103,9 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
-        >>> found = sw.diagnose(gym.make("SafeRover-v0"), steps=200)
-        >>> found.present[0].symptom
-        'wheel_slip'
+        >>> first, *_ = sw.diagnose(gym.make("SafeRover-v0"), steps=200)
+        >>> print(first.code)
+        env = sw.SlipLimiter(env, wheels=['front_left', 'front_right', 'rear_left', 'rear_right'])
     """
     if not isinstance(env, gym.Env):
         raise UnsupportedEnvError(f"diagnose takes one env, as gym.make returns it; got {env!r}")
@@ -143,8 +115,7 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         recording = record(env, attacker(env, seed) if attacked else policy_driver(policy), steps, seed)
     findings = [_found(name, recording, attacked) for name in SYMPTOMS]
-    findings.sort(key=lambda one: -math.inf if one.missing else one.severity, reverse=True)
-    return Diagnosis(name_of(env), steps, "attacker" if attacked else "policy", findings)
+    return sorted(findings, key=lambda one: -math.inf if one.missing else one.severity, reverse=True)
 
 
 def _found(name: str, recording: "Recording", attacked: bool) -> Finding:
@@ -202,7 +173,7 @@ class Recording:
 
     env: Env
     infos: list[dict[str, Any]]  # with those of a contact and a balance monitor, where the env allows them
-    struck: list[tuple[str, str] | None]  # bodies with the largest force
+    struck: list[tuple[str, ...] | None]  # bodies with the largest force
     first: np.ndarray  # steps of episodes, shape (k,)
     terminated: np.ndarray
     executed: Array  # actions that the unwrapped env was given, shape (k, m)

@@ -42,13 +42,13 @@ class EpisodeFigure:
     """One figure of an episode: in ``info["interventions"]`` and a column of a run's `episodes.csv`.
 
     Attributes:
-        how: "count" is the number of steps at which a key is above zero, or the sum of a key of whole numbers;
-            "onsets" counts the entries of an array that become True; "any" is whether it ever was.
+        how: "count" is the number of steps at which a key is above zero, or the sum of a key of whole numbers; "any"
+            is whether it ever was.
         of: The info keys that it is made from: for "count" all that exist, else the first that exists.
     """
 
     name: str
-    how: Literal["mean", "p95", "count", "sum", "min", "last", "any", "onsets"]
+    how: Literal["mean", "p95", "count", "sum", "min", "last", "any"]
     of: tuple[str, ...]
 
 
@@ -245,7 +245,6 @@ EPISODE: Final = (
     EpisodeFigure("success", "any", (SUCCESS, IS_SUCCESS)),
     EpisodeFigure("collisions", "count", (COLLISIONS,)),
     EpisodeFigure("seen", "mean", (OCCLUSION_VISIBLE,)),
-    EpisodeFigure("expiries", "onsets", (OCCLUSION_EXPIRED,)),
 )
 """An episode's figures beside its length and return, in the order of `episodes.csv`."""
 EPISODE_SUMMARY: Final = _key("interventions", "dict")

@@ -61,9 +61,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             },
         )
     },
-    "AdaptionPenalty": {
-        "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25}),
-    },
+    "AdaptionPenalty": {"a constant": (TASK, lambda: {"penalty": 0.5})},
     "BalanceMonitor": {
         "everything": ("HalfCheetah-v5", dict),
         "a trunk and its legs": (
