@@ -60,14 +60,9 @@ class Finding:
     missing: str = ""
 
     @property
-    def severity(self) -> float:
-        """The figure in thresholds; NaN where it was not measured."""
-        return self.figure / SYMPTOMS[self.symptom].threshold
-
-    @property
     def present(self) -> bool:
         """Whether the symptom is there."""
-        return self.severity >= 1.0
+        return self.figure >= SYMPTOMS[self.symptom].threshold
 
     def __str__(self) -> str:
         """For a terminal: the verdict, and of a symptom that is there the lines to paste."""
@@ -115,7 +110,8 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         recording = record(env, attacker(env, seed) if attacked else policy_driver(policy), steps, seed)
     findings = [_found(name, recording, attacked) for name in SYMPTOMS]
-    return sorted(findings, key=lambda one: -math.inf if one.missing else one.severity, reverse=True)
+    ranks = {one: -1.0 if one.missing else one.figure / SYMPTOMS[one.symptom].threshold for one in findings}
+    return sorted(findings, key=ranks.__getitem__, reverse=True)
 
 
 def _found(name: str, recording: "Recording", attacked: bool) -> Finding:

@@ -250,10 +250,6 @@ class CommandReceiver:
             )
         self._observed_s = observed_s
 
-    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
-        """Whether a chunk may be executed that ends with this command, shape (m,), so many control steps from now."""
-        return True
-
 
 def receiver_inside(env: Env) -> CommandReceiver | None:
     """The outermost receiver among an env's wrappers."""
