@@ -60,14 +60,9 @@ class Finding:
     missing: str = ""
 
     @property
-    def severity(self) -> float:
-        """The figure in thresholds; NaN where it was not measured."""
-        return self.figure / SYMPTOMS[self.symptom].threshold
-
-    @property
     def present(self) -> bool:
         """Whether the symptom is there."""
-        return self.severity >= 1.0
+        return self.figure >= SYMPTOMS[self.symptom].threshold
 
     def __str__(self) -> str:
         """For a terminal: the verdict, and of a symptom that is there the lines to paste."""
@@ -115,23 +110,20 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         recording = record(env, attacker(env, seed) if attacked else policy_driver(policy), steps, seed)
     findings = [_found(name, recording, attacked) for name in SYMPTOMS]
-    return sorted(findings, key=lambda one: -math.inf if one.missing else one.severity, reverse=True)
+    ranks = {one: -1.0 if one.missing else one.figure / SYMPTOMS[one.symptom].threshold for one in findings}
+    return sorted(findings, key=ranks.__getitem__, reverse=True)
 
 
 def _found(name: str, recording: "Recording", attacked: bool) -> Finding:
     """One symptom, with its lines if it is there."""
-    symptom, code = SYMPTOMS[name], ""
+    symptom = SYMPTOMS[name]
     try:
         if attacked and symptom.policies_only:
             raise NotMeasuredError("an attacker says nothing of it: give a policy")
         figure = symptom.measure(recording)
-        if figure >= symptom.threshold:
-            code = symptom.tool(recording)
     except NotMeasuredError as error:
         return Finding(name, missing=str(error))
-    except ConfigurationError as error:
-        code = f"# What treats it is refused: {error}"
-    return Finding(name, figure, code)
+    return Finding(name, figure, symptom.tool(recording) if figure >= symptom.threshold else "")
 
 
 # Drivers, and what they do to an env ------------------------------------------------------------------------------
@@ -264,7 +256,7 @@ class Symptom(NamedTuple):
     threshold: float  # from which on it is a symptom
     unit: str  # of the threshold and of the figure
     measure: Callable[[Recording], float]  # the figure; or a `NotMeasuredError`
-    tool: Callable[[Recording], str]  # lines that treat it in `env`, or a comment; or a `ConfigurationError`
+    tool: Callable[[Recording], str]  # lines that treat it in `env`, or a comment
     policies_only: bool = False  # an attacker has this symptom of itself
 
 
@@ -333,7 +325,11 @@ def _measure_steps(recording: Recording) -> float:
 def _treat_steps(recording: Recording) -> str:
     """A handover of single actions that lets commands change by 5 % of their range in a control step."""
     low, high = _box(recording.env)
-    rate = float(f"{0.05 * float((high - low).min()) / check_timing(recording.env):.4g}")
+    try:
+        control_dt = check_timing(recording.env)
+    except ConfigurationError as error:
+        return f"# ChunkHandover(env, chunk_size=1, execution_horizon=1) is refused: {error}"
+    rate = float(f"{0.05 * float((high - low).min()) / control_dt:.4g}")
     return (
         "# If the policy gives chunks, pass them whole: ChunkHandover(env, chunk_size=..., execution_horizon=...).\n"
         f"env = sw.ChunkHandover(env, chunk_size=1, execution_horizon=1, rate_limit={rate})"
@@ -359,7 +355,7 @@ def _treat_forces(recording: Recording) -> str:
     forces = np.nan_to_num(recording.of_info("contact/peak_force"), nan=0.0)
     k = int(np.argmax(forces))
     depth, pair = float(recording.of_info("contact/penetration")[k]), recording.struck[k]
-    if pair is None or not depth > 0.0:
+    if pair is None or not all(pair) or not depth > 0.0:  # a body without a name cannot be given
         return "# Limit the speed of what hits: ImpactSpeedLimit, or a lower speed of the whole machine."
     model = recording.model
     fixed = fixed_bodies(model)

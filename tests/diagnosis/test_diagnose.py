@@ -109,7 +109,22 @@ def test_what_treats_a_symptom_is_refused_with_the_reason():
     jumping = iter(range(10_000))
     seen = found(Drifting(), lambda observation: np.array([(-1.0) ** next(jumping)]), steps=60)
     code = seen["command_steps"].code
-    assert code.startswith("# What treats it is refused: ") and "has no attribute dt" in code
+    assert code.startswith("# ChunkHandover(") and "is refused: " in code and "has no attribute dt" in code
+
+
+def test_what_hits_without_a_name_is_found_all_the_same():
+    env = Bench(CART.format(stiffness=20_000).replace('name="cart"', ""))
+    finding = found(env, lambda observation: np.array([20.0]), steps=200)["contact_forces"]
+    assert finding.present and finding.code.startswith("# Limit the speed of what hits")
+
+
+def test_an_error_in_a_measurement_is_not_taken_for_a_refusal(monkeypatch):
+    def broken(recording):
+        raise ConfigurationError("of a bug")
+
+    monkeypatch.setitem(SYMPTOMS, "limits", SYMPTOMS["limits"]._replace(measure=broken))
+    with pytest.raises(ConfigurationError, match="of a bug"):
+        diagnose(gym.make("Swimmer-v5"), steps=2)
 
 
 def test_bad_input_is_refused_by_name():

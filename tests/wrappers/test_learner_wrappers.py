@@ -39,18 +39,6 @@ def test_rewards_and_costs_are_summed_up_and_the_filter_checks_every_control_ste
     assert info[keys.EPISODE_SUMMARY]["length"] == 50
 
 
-def test_one_control_step_is_the_env_itself():
-    once, plain = sw.ActionRepeat(stack(), 1), stack()
-    once.reset(seed=2)
-    plain.reset(seed=2)
-    once.action_space.seed(2)
-    for _ in range(20):
-        action = once.action_space.sample()
-        here, there = once.step(action), plain.step(action)
-        np.testing.assert_array_equal(here[0], there[0])
-        assert here[1:4] == there[1:4]
-
-
 @pytest.mark.parametrize("repeat", [0, 2.5, "4"])
 def test_a_repeat_that_is_no_count_is_refused(repeat):
     with pytest.raises(sw.SafeWrappersError, match="repeat"):

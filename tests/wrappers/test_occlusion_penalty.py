@@ -265,38 +265,6 @@ def test_the_observation_gains_the_estimates_relative_to_the_robot(axes):
     np.testing.assert_allclose(table[:, 2], deviations, atol=1e-12)
 
 
-# Randomness and episodes ------------------------------------------------------------------------------------------
-
-
-def trace(env, seed=0, count=40):
-    told = [env.reset(seed=seed)]
-    told += list(steps(env, count))
-    return [
-        (
-            observation["tracks"].tobytes() if isinstance(observation, dict) else observation.tobytes(),
-            *[{k: np.asarray(v).tobytes() for k, v in x.items()} if isinstance(x, dict) else x for x in rest],
-        )
-        for observation, *rest in told
-    ]
-
-
-def test_seeds_repeat_and_differ_and_the_env_s_own_generator_is_untouched():
-    env, bare = crossing(sensor=sw.occlusion.Sensor("eye")), gym.make("OccludedCrossing-v0")
-    first = trace(env, 5)
-    assert trace(env, 6) != first and trace(env, 5) == first
-    bare.reset(seed=5)
-    for _ in steps(bare, 40):
-        pass
-    for _ in range(2):  # and on, without seeds
-        env.reset()
-        bare.reset()
-        for _ in zip(steps(env, 10), steps(bare, 10), strict=True):
-            pass
-        assert env.unwrapped.data.qpos.tobytes() == bare.unwrapped.data.qpos.tobytes()
-    a, b = (e.unwrapped.np_random.bit_generator.state for e in (env, bare))
-    assert a == b
-
-
 # What is refused --------------------------------------------------------------------------------------------------
 
 
@@ -314,17 +282,11 @@ def made(env=None, tracks=None, sensor=EYE, tolerance=1.0, **options):
     ("given", "error", "words"),
     [
         ({"tolerance": 0.0}, ConfigurationError, "tolerance.*> 0 in m, got 0"),
-        ({"tolerance": -1}, ConfigurationError, "tolerance"),
-        ({"tolerance": np.nan}, ConfigurationError, "tolerance"),
-        ({"tolerance": None}, ConfigurationError, "tolerance must be a number"),
         ({"weight": -0.1}, ConfigurationError, "weight"),
-        ({"weight": np.inf}, ConfigurationError, "weight"),
         ({"sigmas": 0.0}, ConfigurationError, "sigmas"),
         ({"axes": "xz"}, ConfigurationError, "'xy' or 'xyz', got 'xz'"),
-        ({"axes": 2}, ConfigurationError, "axes"),
         ({"tracks": []}, ConfigurationError, "at least one Track"),
         ({"tracks": "thing"}, ConfigurationError, "at least one Track"),
-        ({"tracks": straight()}, ConfigurationError, "at least one Track"),
         ({"tracks": ["thing"]}, ConfigurationError, "a track is a Track"),
         ({"tracks": [straight("think")]}, UnknownNameError, "'think'; it has: robot, thing, thing2"),
         ({"tracks": [straight("")]}, UnknownNameError, "no body ''"),
@@ -414,15 +376,6 @@ def _text(raw):
 
     world, arm = raw.arguments
     return TEXT.format(world=world, arm=arm)
-
-
-def test_the_body_stays_where_it_is():
-    env = tracked(start_rate=2.0)
-    env.reset(seed=0)
-    errors = [(env.step(STILL), off(env))[1] for _ in range(100)]
-    assert (np.hypot(*(env.tracking.positions - [[1, 0], [-1, 0]]).T) < 0.05).all()
-    assert env.unwrapped.data.qvel[0] == pytest.approx(2.0)
-    assert errors[-1] < 0.01
 
 
 def test_what_is_seen_is_put_where_the_reckoned_pose_has_it():
