@@ -67,7 +67,8 @@ class Line:
     """The packets of one direction, with random numbers of their own; times closer than `slack_s` are the same.
 
     Attributes:
-        coming: Those on their way, in the order of sending, each with the time at which it arrives, s.
+        coming: Those on their way, in the order of sending, each with the time, s, from which it only waits for those
+            before it.
         newest: The last one that has arrived.
     """
 
@@ -79,7 +80,6 @@ class Line:
         """Nothing is on its way, and `first`, made at 0 s, has arrived; call it after the env's own reset."""
         self._random.reset(env, seed)
         self.coming: deque[tuple[float, Packet]] = deque()
-        self._latest_s = -math.inf
         self.newest = Packet(first, 0.0)
 
     def send(self, packet: Packet, now_s: float) -> bool:
@@ -89,8 +89,7 @@ class Line:
         jitter_s = self._random.draw.uniform(0.0, link.jitter_s) if link.jitter_s else 0.0
         lost = bool(link.loss and self._random.draw.random() < link.loss)
         if not lost:
-            self._latest_s = max(now_s + link.delay_s + jitter_s, self._latest_s)
-            self.coming.append((self._latest_s, packet))
+            self.coming.append((now_s + link.delay_s + jitter_s, packet))
         return lost
 
     def receive(self, now_s: float) -> list[Packet]:

@@ -15,23 +15,7 @@ from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.wrappers.layer import CommandReceiver, WrapperRng
 
 HOLD = 0.1
-TYPES = {
-    "handover/peak_jerk": "float",
-    "handover/blend_time": "float",
-    "handover/starved": "int",
-    "handover/limited": "int",
-    "handover/refused": "bool",
-    "handover/latency": "int",
-}
 pytestmark = pytest.mark.filterwarnings("ignore:a command was held back:UserWarning")
-
-
-def types(info):
-    return {
-        k: f"{v.dtype}{v.shape}" if isinstance(v, np.ndarray) else type(v).__name__
-        for k, v in info.items()
-        if k.startswith("handover/")
-    }
 
 
 # Random scenarios ---------------------------------------------------------------------------------------------
@@ -180,7 +164,6 @@ def test_every_command_and_every_figure_is_the_slow_simulators(scenario):
             assert command.tobytes() == np.array(tick.control, scenario.dtype).tobytes()
     figures, t = measured(given_commands, HOLD), 0
     for info, reward, own, refused in steps:
-        assert types(info) == TYPES
         assert info["handover/starved"] == sum(tick.starved for tick in own)
         assert info["handover/limited"] == sum(tick.limited for tick in own)
         assert info["handover/refused"] == (refused or any(tick.refused for tick in own))

@@ -231,6 +231,17 @@ def test_a_budget_takes_the_bounds_that_belong_to_its_clearance(clearance, given
         sw.StoppingBudget(clearance, **given)
 
 
+def test_the_margin_of_a_value_is_no_room():
+    times = []
+    for margin in (0.0, 0.2):
+        limit = sw.constraints.JointPositionLimit(-0.8, 0.8, ["slider"], margin=margin)
+        env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), sw.StoppingBudget(limit, closing_speed=4.0))
+        env.reset(seed=0)
+        env._budget.measure()
+        times.append(env._budget.longest_time())
+    assert times[0] - times[1] == pytest.approx(0.2 / 4.0)
+
+
 class Checked(sw.Constraint):
     """A constraint that only a state can show to be wrong."""
 
