@@ -202,9 +202,9 @@ BALANCE_LINEAR_MOMENTUM: Final = _key("balance/linear_momentum", "float64", shap
 BALANCE_ANGULAR_MOMENTUM: Final = _key("balance/angular_momentum", "float64", shape="(3,)", unit="kg m^2/s")
 """About the centre of mass, after the step."""
 BALANCE_FRICTION_USED: Final = _key("balance/friction_used", "float64", chunk="max")
-"""The largest ``|f_t| / (share mu f_n)`` of a contact with at least 1 % of the weight, over all evaluations."""
+"""The largest ``|f_t| / (mu f_n)`` of a contact with at least 1 % of the weight, over all evaluations."""
 BALANCE_ZMP_MARGIN: Final = _key("balance/zmp_margin", "float64", unit="m", chunk="min")
-"""Least distance of the zero moment point from the edge of the support polygon, less the inset; NaN without one."""
+"""Least distance of the zero moment point from the edge of the support polygon, negative outside; NaN without one."""
 BALANCE_PARTIAL: Final = _key("balance/partial", "bool", chunk="any")
 """Not every evaluation was seen (then only the last one counts), or numbers were not finite (reported as 0)."""
 

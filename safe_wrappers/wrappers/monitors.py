@@ -56,8 +56,9 @@ class StepMonitor(LayerWrapper, ABC):
         whole = self._replay.after(lambda data, _: self._visit(data))
         if not whole:
             message = (
-                f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
-                f"substeps, or MuJoCo has reset it; only the contacts left behind are read (info[{self.partial!r}])"
+                f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs, state or model "
+                "between substeps, or MuJoCo has reset it, or it has actuators with activations under Runge-Kutta; "
+                f"only the contacts left behind are read (info[{self.partial!r}])"
             )
             self._warn_once("partial", message)
             self._forget()
@@ -82,7 +83,8 @@ class ContactMonitor(StepMonitor):
     """Reports forces and violations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
-    of its own. An env that changes its inputs or its state between substeps cannot be replayed (`contact/partial`).
+    of its own. An env that changes its inputs or its state between substeps cannot be replayed, nor can actuators
+    with activations under Runge-Kutta (`contact/partial`).
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
