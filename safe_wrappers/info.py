@@ -168,8 +168,7 @@ keeps `limits`."""
 LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")
 """Remaining time of the lease in force after this control step; 0 without a lease."""
 LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
-"""A command was refused: no lease was granted, or it was not finite, older than the one in force or from the future,
-or a chunk's end was out of reach."""
+"""A command was refused: no lease was granted, or it was not finite, older than that in force or from the future."""
 LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_braking")
 """The fallback acted at this control step."""
 

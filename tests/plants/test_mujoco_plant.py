@@ -357,7 +357,7 @@ def test_forgetting_clears_the_commands_in_flight():
 @pytest.mark.parametrize(
     ("frame_skip", "control_dt", "got"),
     [
-        (0, None, "no control_dt and 0 by"),
+        (0, None, "no control_dt, and 0 by"),
         (5, 0.02, "2 by control_dt, and 5 by"),
         (None, 0.025, "2.5 by control_dt, and nothing by"),
     ],
