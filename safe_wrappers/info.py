@@ -118,11 +118,6 @@ CBF_STUCK: Final = _key("cbf/stuck", "bool", chunk="any", log="stuck")
 CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
 """A drawn action was proposed in the policy's place."""
 
-# PredictiveShield on an IdentifiedPlant, every step: of the predictions of h by one step ---------------------------
-PLANT_COVERAGE: Final = _key("plant/coverage", "float64")
-"""Share of the episode's steps so far after which h was at least its prediction less the margin; NaN before the first
-one."""
-
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")
 """Normalised slip of each wheel, in the order of `wheels`, before the step."""
