@@ -107,7 +107,7 @@ least violation."""
 EXECUTED_ACTION: Final = _key("executed_action", "float64", shape="(m,)", unit="action")
 """What the env was really given."""
 PROPOSED_ACTION: Final = _key("proposed_action", "float64", shape="(m,)", unit="action")
-"""What the filter was given, before boxing."""
+"""What the filter was given, before boxing; entries that are not finite are taken as 0."""
 
 _NUMBERS: Final = [key for key in KEYS.values() if not key.shape]
 CBF_BOOLS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "bool")
