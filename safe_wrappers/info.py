@@ -107,7 +107,7 @@ least violation."""
 EXECUTED_ACTION: Final = _key("executed_action", "float64", shape="(m,)", unit="action")
 """What the env was really given."""
 PROPOSED_ACTION: Final = _key("proposed_action", "float64", shape="(m,)", unit="action")
-"""What the filter was given, before boxing."""
+"""What the filter was given, before boxing; entries that are not finite are taken as 0."""
 
 _NUMBERS: Final = [key for key in KEYS.values() if not key.shape]
 CBF_BOOLS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "bool")
@@ -117,11 +117,6 @@ CBF_STUCK: Final = _key("cbf/stuck", "bool", chunk="any", log="stuck")
 """For `after_s` the filter has changed most actions, and the rewards have not added up to more than `progress`."""
 CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
 """A drawn action was proposed in the policy's place."""
-
-# PredictiveShield on an IdentifiedPlant, every step: of the predictions of h by one step ---------------------------
-PLANT_COVERAGE: Final = _key("plant/coverage", "float64")
-"""Share of the episode's steps so far after which h was at least its prediction less the margin; NaN before the first
-one."""
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")
@@ -173,8 +168,7 @@ keeps `limits`."""
 LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")
 """Remaining time of the lease in force after this control step; 0 without a lease."""
 LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
-"""A command was refused: no lease was granted, or it was not finite, older than the one in force or from the future,
-or a chunk's end was out of reach."""
+"""A command was refused: no lease was granted, or it was not finite, older than that in force or from the future."""
 LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_braking")
 """The fallback acted at this control step."""
 

@@ -52,6 +52,7 @@ class AdaptionPenalty(LayerWrapper):
 
     The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty` (Krasowski et al., Provably Safe
     Reinforcement Learning, TMLR 2023).
+    An action that is not finite is changed, and costs no more than any other.
 
     Wrappers that scale or clip rewards belong inside. Not for hindsight replay, which asks the task for rewards anew.
 

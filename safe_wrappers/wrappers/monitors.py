@@ -83,8 +83,8 @@ class ContactMonitor(StepMonitor):
     """Reports forces and violations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
-    of its own. An env that changes its inputs or its state between substeps cannot be replayed, nor can actuators with
-    activations under Runge-Kutta (`contact/partial`).
+    of its own. An env that changes its inputs or its state between substeps cannot be replayed, nor can actuators
+    with activations under Runge-Kutta (`contact/partial`).
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.

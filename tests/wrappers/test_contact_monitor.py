@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from meddling import Meddling
+from scenes import Scene
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -108,3 +109,14 @@ def test_numbers_that_are_none_are_reported_as_none():
     with warnings.catch_warnings(action="ignore"):
         info = [env.step(env.action_space.low)[4] for _ in range(25)][-1]
     assert np.isnan([info[k] for k in FLOATS]).all()
+
+
+def test_activations_under_runge_kutta_are_named_as_a_reason():
+    env = Scene(
+        """<mujoco><option integrator="RK4"/><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body>
+        </worldbody><actuator><general joint="x" dyntype="filter" dynprm=".1" gainprm="5"/></actuator></mujoco>"""
+    )
+    monitored = sw.ContactMonitor(env)
+    monitored.reset(seed=0)
+    with pytest.warns(UserWarning, match="actuators with activations under Runge-Kutta"):
+        assert monitored.step(np.ones(1))[4]["contact/partial"]

@@ -90,11 +90,12 @@ def test_a_changed_step_costs_the_penalty_and_no_other_does(penalty):
     assert 5 < changed < 35
 
 
-def test_a_non_finite_action_costs_the_penalty():
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_non_finite_action_costs_the_penalty(value):
     env = sw.AdaptionPenalty(filtered(), penalty=0.5)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="not finite"):
-        _, reward, _, _, info = env.step(np.array([np.nan], np.float32))
+        _, reward, _, _, info = env.step(np.array([value], np.float32))
     assert info[keys.CBF_INTERVENED] and info[keys.CBF_NONFINITE]
     assert info[keys.ADAPTION_PENALTY] == 0.5
     assert np.isfinite(reward)
