@@ -4,7 +4,7 @@
     python -m benchmarks endurance --steps 100000000   # and farther
 
 Chunks of one env, driver and seed are made one after the other in the same process, each a line in
-`runs/endurance/endurance.jsonl`. The hand-written drivers attack 16 envs at once through one `VectorCBFActionFilter`.
+`runs/endurance/endurance.jsonl`. The hand-written drivers attack 16 envs at once through a `VectorCBFActionFilter`.
 CEM and differences search 30 steps ahead in copies of the env, filter included. The learner is PPO that is paid for
 violations, anew in each chunk.
 

@@ -89,7 +89,7 @@ CASES = (
 )
 
 
-def driven(case: Case, driver: str, env: gym.Env[Any, Any], plant: sw.plants.RolloutPlant) -> Any:
+def driven(case: Case, driver: str, env: gym.Env[Any, Any], plant: sw.SimulatorPlant) -> Any:
     """The driver's action in the env's present state."""
     space = env.action_space
     if driver == "random":

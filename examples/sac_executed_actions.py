@@ -1,5 +1,7 @@
 """SAC that learns from the actions that were executed, not from those that it proposed.
 
+An action is held for four control steps, and the filter may change it differently in each: the last one's is stored.
+
 python examples/sac_executed_actions.py --steps 50000
 """
 

@@ -14,7 +14,7 @@ from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces
-from safe_wrappers.plants import AnalyticPlant, IdentifiedPlant, MujocoPlant, Plant, SimulatorPlant
+from safe_wrappers.plants import AnalyticPlant, MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.wrappers import faults, occlusion, teleop
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
@@ -43,7 +43,6 @@ __all__ = [
     "CostFunction",
     "FilterObservation",
     "HalfSpaces",
-    "IdentifiedPlant",
     "LeaseExpiry",
     "MujocoPlant",
     "OcclusionPenalty",

@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, cast
@@ -27,7 +27,7 @@ from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 from safe_wrappers.wrappers.protect import protect
 from safe_wrappers.wrappers.recipes import recipe_of
 
-__all__ = ["SYMPTOMS", "Diagnosis", "Finding", "diagnose"]
+__all__ = ["SYMPTOMS", "Finding", "diagnose"]
 
 Env = gym.Env[Any, Any]
 Driver = Callable[[Any], Any]
@@ -60,14 +60,9 @@ class Finding:
     missing: str = ""
 
     @property
-    def severity(self) -> float:
-        """The figure in thresholds; NaN where it was not measured."""
-        return self.figure / SYMPTOMS[self.symptom].threshold
-
-    @property
     def present(self) -> bool:
         """Whether the symptom is there."""
-        return self.severity >= 1.0
+        return self.figure >= SYMPTOMS[self.symptom].threshold
 
     def __str__(self) -> str:
         """For a terminal: the verdict, and of a symptom that is there the lines to paste."""
@@ -79,38 +74,7 @@ class Finding:
         return "\n      ".join([f"  {verdict:9} {self.symptom:17} {words}", *self.code.splitlines()])
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """What was looked for in an env.
-
-    Attributes:
-        env: Id of the env, or its name.
-        steps: Control steps that it was driven for.
-        driver: "policy" or "attacker".
-        findings: One per symptom, the most severe first; then what is not there, then what could not be measured.
-    """
-
-    env: str
-    steps: int
-    driver: str
-    findings: Sequence[Finding]
-
-    @property
-    def present(self) -> list[Finding]:
-        """The symptoms that are there, the most severe first."""
-        return [finding for finding in self.findings if finding.present]
-
-    def finding(self, symptom: str) -> Finding:
-        """That of one symptom."""
-        return {finding.symptom: finding for finding in self.findings}[symptom]
-
-    def __str__(self) -> str:
-        """A table for a terminal, and the lines to paste."""
-        head = f"{self.env}: {self.steps:,} steps, driven by the {self.driver}"
-        return "\n".join([head, *map(str, self.findings)])
-
-
-def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> Diagnosis:
+def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> list[Finding]:
     """Look for symptoms in an env and a policy, and name the wrapper that treats each.
 
     The env is driven by the policy, or without one by an attacker: random corners of the action space, each held for
@@ -124,6 +88,9 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
         steps: Control steps.
         seed: Of the attacker and of resets.
 
+    Returns:
+        One finding per symptom, the most severe first; then what is not there, then what could not be measured.
+
     Raises:
         UnsupportedEnvError: No Gymnasium env, or one with other actions.
         ConfigurationError: A policy that is none.
@@ -131,9 +98,9 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
-        >>> found = sw.diagnose(gym.make("SafeRover-v0"), steps=200)
-        >>> found.present[0].symptom
-        'wheel_slip'
+        >>> first, *_ = sw.diagnose(gym.make("SafeRover-v0"), steps=200)
+        >>> print(first.code)
+        env = sw.SlipLimiter(env, wheels=['front_left', 'front_right', 'rear_left', 'rear_right'])
     """
     if not isinstance(env, gym.Env):
         raise UnsupportedEnvError(f"diagnose takes one env, as gym.make returns it; got {env!r}")
@@ -143,24 +110,20 @@ def diagnose(env: Env, policy: Any = None, steps: int = 2000, seed: int = 0) -> 
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         recording = record(env, attacker(env, seed) if attacked else policy_driver(policy), steps, seed)
     findings = [_found(name, recording, attacked) for name in SYMPTOMS]
-    findings.sort(key=lambda one: -math.inf if one.missing else one.severity, reverse=True)
-    return Diagnosis(name_of(env), steps, "attacker" if attacked else "policy", findings)
+    ranks = {one: -1.0 if one.missing else one.figure / SYMPTOMS[one.symptom].threshold for one in findings}
+    return sorted(findings, key=ranks.__getitem__, reverse=True)
 
 
 def _found(name: str, recording: "Recording", attacked: bool) -> Finding:
     """One symptom, with its lines if it is there."""
-    symptom, code = SYMPTOMS[name], ""
+    symptom = SYMPTOMS[name]
     try:
         if attacked and symptom.policies_only:
             raise NotMeasuredError("an attacker says nothing of it: give a policy")
         figure = symptom.measure(recording)
-        if figure >= symptom.threshold:
-            code = symptom.tool(recording)
     except NotMeasuredError as error:
         return Finding(name, missing=str(error))
-    except ConfigurationError as error:
-        code = f"# What treats it is refused: {error}"
-    return Finding(name, figure, code)
+    return Finding(name, figure, symptom.tool(recording) if figure >= symptom.threshold else "")
 
 
 # Drivers, and what they do to an env ------------------------------------------------------------------------------
@@ -202,7 +165,7 @@ class Recording:
 
     env: Env
     infos: list[dict[str, Any]]  # with those of a contact and a balance monitor, where the env allows them
-    struck: list[tuple[str, str] | None]  # bodies with the largest force
+    struck: list[tuple[str, ...] | None]  # bodies with the largest force
     first: np.ndarray  # steps of episodes, shape (k,)
     terminated: np.ndarray
     executed: Array  # actions that the unwrapped env was given, shape (k, m)
@@ -293,7 +256,7 @@ class Symptom(NamedTuple):
     threshold: float  # from which on it is a symptom
     unit: str  # of the threshold and of the figure
     measure: Callable[[Recording], float]  # the figure; or a `NotMeasuredError`
-    tool: Callable[[Recording], str]  # lines that treat it in `env`, or a comment; or a `ConfigurationError`
+    tool: Callable[[Recording], str]  # lines that treat it in `env`, or a comment
     policies_only: bool = False  # an attacker has this symptom of itself
 
 
@@ -362,7 +325,11 @@ def _measure_steps(recording: Recording) -> float:
 def _treat_steps(recording: Recording) -> str:
     """A handover of single actions that lets commands change by 5 % of their range in a control step."""
     low, high = _box(recording.env)
-    rate = float(f"{0.05 * float((high - low).min()) / check_timing(recording.env):.4g}")
+    try:
+        control_dt = check_timing(recording.env)
+    except ConfigurationError as error:
+        return f"# ChunkHandover(env, chunk_size=1, execution_horizon=1) is refused: {error}"
+    rate = float(f"{0.05 * float((high - low).min()) / control_dt:.4g}")
     return (
         "# If the policy gives chunks, pass them whole: ChunkHandover(env, chunk_size=..., execution_horizon=...).\n"
         f"env = sw.ChunkHandover(env, chunk_size=1, execution_horizon=1, rate_limit={rate})"
@@ -388,7 +355,7 @@ def _treat_forces(recording: Recording) -> str:
     forces = np.nan_to_num(recording.of_info("contact/peak_force"), nan=0.0)
     k = int(np.argmax(forces))
     depth, pair = float(recording.of_info("contact/penetration")[k]), recording.struck[k]
-    if pair is None or not depth > 0.0:
+    if pair is None or not all(pair) or not depth > 0.0:  # a body without a name cannot be given
         return "# Limit the speed of what hits: ImpactSpeedLimit, or a lower speed of the whole machine."
     model = recording.model
     fixed = fixed_bodies(model)

@@ -26,7 +26,7 @@ class ConfigurationError(SafeWrappersError, ValueError):
 
 
 class UnknownNameError(ConfigurationError):
-    """A body, joint, geom, solver, constraint or config key does not exist; the message lists those that do."""
+    """A body, joint, geom, constraint or config key does not exist; the message lists those that do."""
 
 
 class UnsupportedEnvError(ConfigurationError):

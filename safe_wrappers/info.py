@@ -42,13 +42,13 @@ class EpisodeFigure:
     """One figure of an episode: in ``info["interventions"]`` and a column of a run's `episodes.csv`.
 
     Attributes:
-        how: "count" is the number of steps at which a key is above zero, or the sum of a key of whole numbers;
-            "onsets" counts the entries of an array that become True; "any" is whether it ever was.
+        how: "count" is the number of steps at which a key is above zero, or the sum of a key of whole numbers; "any"
+            is whether it ever was.
         of: The info keys that it is made from: for "count" all that exist, else the first that exists.
     """
 
     name: str
-    how: Literal["mean", "p95", "count", "sum", "min", "last", "any", "onsets"]
+    how: Literal["mean", "p95", "count", "sum", "min", "last", "any"]
     of: tuple[str, ...]
 
 
@@ -107,7 +107,7 @@ least violation."""
 EXECUTED_ACTION: Final = _key("executed_action", "float64", shape="(m,)", unit="action")
 """What the env was really given."""
 PROPOSED_ACTION: Final = _key("proposed_action", "float64", shape="(m,)", unit="action")
-"""What the filter was given, before boxing."""
+"""What the filter was given, before boxing; entries that are not finite are taken as 0."""
 
 _NUMBERS: Final = [key for key in KEYS.values() if not key.shape]
 CBF_BOOLS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "bool")
@@ -117,11 +117,6 @@ CBF_STUCK: Final = _key("cbf/stuck", "bool", chunk="any", log="stuck")
 """For `after_s` the filter has changed most actions, and the rewards have not added up to more than `progress`."""
 CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
 """A drawn action was proposed in the policy's place."""
-
-# PredictiveShield on an IdentifiedPlant, every step: of the predictions of h by one step ---------------------------
-PLANT_COVERAGE: Final = _key("plant/coverage", "float64")
-"""Share of the episode's steps so far after which h was at least its prediction less the margin; NaN before the first
-one."""
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")
@@ -173,8 +168,7 @@ keeps `limits`."""
 LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")
 """Remaining time of the lease in force after this control step; 0 without a lease."""
 LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
-"""A command was refused: no lease was granted, or it was not finite, older than the one in force or from the future,
-or a chunk's end was out of reach."""
+"""A command was refused: no lease was granted, or it was not finite, older than that in force or from the future."""
 LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_braking")
 """The fallback acted at this control step."""
 
@@ -203,9 +197,9 @@ BALANCE_LINEAR_MOMENTUM: Final = _key("balance/linear_momentum", "float64", shap
 BALANCE_ANGULAR_MOMENTUM: Final = _key("balance/angular_momentum", "float64", shape="(3,)", unit="kg m^2/s")
 """About the centre of mass, after the step."""
 BALANCE_FRICTION_USED: Final = _key("balance/friction_used", "float64", chunk="max")
-"""The largest ``|f_t| / (share mu f_n)`` of a contact with at least 1 % of the weight, over all evaluations."""
+"""The largest ``|f_t| / (mu f_n)`` of a contact with at least 1 % of the weight, over all evaluations."""
 BALANCE_ZMP_MARGIN: Final = _key("balance/zmp_margin", "float64", unit="m", chunk="min")
-"""Least distance of the zero moment point from the edge of the support polygon, less the inset; NaN without one."""
+"""Least distance of the zero moment point from the edge of the support polygon, negative outside; NaN without one."""
 BALANCE_PARTIAL: Final = _key("balance/partial", "bool", chunk="any")
 """Not every evaluation was seen (then only the last one counts), or numbers were not finite (reported as 0)."""
 
@@ -245,7 +239,6 @@ EPISODE: Final = (
     EpisodeFigure("success", "any", (SUCCESS, IS_SUCCESS)),
     EpisodeFigure("collisions", "count", (COLLISIONS,)),
     EpisodeFigure("seen", "mean", (OCCLUSION_VISIBLE,)),
-    EpisodeFigure("expiries", "onsets", (OCCLUSION_EXPIRED,)),
 )
 """An episode's figures beside its length and return, in the order of `episodes.csv`."""
 EPISODE_SUMMARY: Final = _key("interventions", "dict")

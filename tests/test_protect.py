@@ -75,17 +75,10 @@ def test_known_envs_get_their_recipe_pass_gymnasiums_checks_and_run(env_id):
         check_env(env, skip_render_check=True)
     rng = np.random.default_rng(0)
     with pytest.warns(UnsafeStateWarning) if starts_unsafe else contextlib.nullcontext():
-        _, first = again.reset(seed=0)
-    ours = {*keys.CBF_BOOLS, *keys.CBF_FLOATS, keys.CBF_REFUSED, keys.PROPOSED_ACTION, keys.EXECUTED_ACTION}
+        again.reset(seed=0)
     for _ in range(80):
         action = rng.uniform(again.action_space.low, again.action_space.high).astype(again.action_space.dtype)
         *_, terminated, truncated, info = again.step(action)
-        assert ours <= info.keys() and ours <= first.keys()
-        assert all(type(info[key]) is bool for key in keys.CBF_BOOLS)
-        assert all(type(info[key]) is float and np.isfinite(info[key]) for key in keys.CBF_FLOATS)
-        for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION):
-            assert info[key].shape == action.shape and info[key].dtype == np.float64
-        assert info[keys.CBF_REFUSED].shape == (len(env.constraints),)
         assert again.action_space.contains(info[keys.EXECUTED_ACTION].astype(action.dtype))
         assert not info[keys.CBF_INFEASIBLE]  # random actions are no attack
         assert not info[keys.CBF_UNSAFE] or starts_unsafe

@@ -61,9 +61,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             },
         )
     },
-    "AdaptionPenalty": {
-        "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25}),
-    },
+    "AdaptionPenalty": {"a constant": (TASK, lambda: {"penalty": 0.5})},
     "BalanceMonitor": {
         "everything": ("HalfCheetah-v5", dict),
         "a trunk and its legs": (
@@ -101,8 +99,16 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                 "chunk_size": 8,
                 "execution_horizon": 3,
                 "inference_delay": [0, 2],
-                "limits": {"velocity": 20.0},
                 "rate_limit": [20.0, 30.0],
+            },
+        ),
+        "limits of the machine": (
+            "Reacher-v5",
+            lambda: {
+                "chunk_size": 8,
+                "execution_horizon": 3,
+                "limits": sw.SeamLimits(velocity=20.0, acceleration=[800.0, 900.0], arrival="moving"),
+                "fallback": "hold",
             },
         ),
         "chunks of one": (
@@ -148,16 +154,6 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             lambda: {
                 "budget": {"clearance": clearance(), "closing_speed": 4.0},
                 "blend_time": 0.0,
-            },
-        ),
-        "limits of reach": (
-            "Reacher-v5",
-            lambda: {
-                "budget": sw.StoppingBudget(
-                    sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"], margin=0.01), closing_speed=10.0
-                ),
-                "motion_limits": {"max_acceleration": [8.0, 20.0], "max_speed": 4.0},
-                "fallback": "hold",
             },
         ),
     },

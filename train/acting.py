@@ -92,7 +92,7 @@ def diagnose_command(
 ) -> None:
     """Diagnose an env by its id, and print what was found."""
     env, acts = (make_env(env_id, {}), None) if policy is None else of_run(policy, env_id, imports)
-    say(console, str(diagnose(env, acts, steps)))
+    say(console, "\n".join([f"{env_id}: {steps:,} steps", *map(str, diagnose(env, acts, steps))]))
     env.close()
 
 

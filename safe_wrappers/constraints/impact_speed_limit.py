@@ -29,9 +29,6 @@ class Contact(NamedTuple):
     """A contact, now or at the present speed."""
 
     gap: float  # m, negative inside
-    speed: float  # of the approach, m/s, >= 0
-    mass: float  # effective, kg
-    push: float  # what presses on besides the motion, N, >= 0
     peak: float  # force by the deepest deflection, under a push that goes on, N
 
 
@@ -119,13 +116,12 @@ class ImpactSpeedLimit(RolloutConstraint):
         row, given = normal @ closing, np.zeros((1, m.nv))
         mujoco.mj_solveM(m, d, given, row[None])
         mobility = float(row @ given[0])
-        mass, speed, push = 1.0 / max(mobility, _FIXED), 0.0, 0.0
-        if mobility >= _FIXED:
-            speed = max(float(row @ self._speeds), 0.0)
-            moving = float(given[0] @ self._moving + normal @ turning @ self._speeds)
-            push = mass * max(moving, float(given[0] @ self._resting), 0.0)
-        peak = float(peak_force(speed, mass, self.stiffness, push, max(-gap, 0.0)))
-        return Contact(gap, speed, mass, push, peak)
+        if mobility < _FIXED:
+            return Contact(gap, 0.0)  # no motion makes it deeper or less deep
+        mass, speed = 1.0 / mobility, float(row @ self._speeds)
+        moving = float(given[0] @ self._moving + normal @ turning @ self._speeds)
+        push = mass * max(moving, float(given[0] @ self._resting), 0.0)
+        return Contact(gap, float(peak_force(speed, mass, self.stiffness, push, max(-gap, 0.0))))
 
     def proposals(self, control: Array | None) -> Iterable[Array]:
         """The braking with which every trajectory goes on: what was admitted for its sake stays admissible."""

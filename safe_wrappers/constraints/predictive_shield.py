@@ -116,13 +116,8 @@ class PredictiveShield(Constraint, Model):
                 "plant=SimulatorPlant(), and put other constraints' requirements into h"
             )
         super().setup(plant)
-        if not self.plant.simulates_env and (self.sees == "env" or isinstance(self.h, str)):
-            raise UnsupportedEnvError(
-                f"the rollouts of an {type(plant).__name__} have observations alone, and neither an env nor its "
-                'info: take sees="observation", and as h a function of it'
-            )
         if not self.plant.exact:
-            self.promise = "best effort"  # of an unchecked, noisy or fitted model a set proves nothing
+            self.promise = "best effort"  # of an unchecked or noisy simulation a set proves nothing
         self._between = self.sees == "env" and self.plant.judges_substeps
         # The env's own judge, an info key, decides by itself when it looks.
         if self.plant.substeps > 1 and not (self._between or isinstance(self.h, str)):
@@ -133,7 +128,6 @@ class PredictiveShield(Constraint, Model):
                 "a discrete action has no zero: give as backup the action that is safe, or hold, or a function"
             )
         self._backups = [self._function(one) for one in self.backup]
-        self._needed = self.margin + self.plant.margins(self._measure, self.horizon)
         self._points = np.random.default_rng(0).random((self.candidates, self.plant.lower.size))
 
     def observe(self, memory: Memory) -> None:
@@ -159,7 +153,7 @@ class PredictiveShield(Constraint, Model):
         return None if control is None else self.plan(control)
 
     def h_along(self, path: Plan | None) -> Array:
-        """The least h, less what the plant's errors may take."""
+        """The least h."""
         now: Array = self._now[None]
         return now if path is None else np.array([[path.slack + self.margin]])
 
@@ -213,15 +207,16 @@ class PredictiveShield(Constraint, Model):
 
     def _after(self, control: Array, backup: Callable[[View], Array] | None) -> float:
         """The slack of a control with a backup after it; NaN where an h is."""
-        plant, terminal, least = self.plant, self.terminal, float(self._needed.min())
+        plant, terminal = self.plant, self.terminal
         policy = None if backup is None else lambda view: plant.action(backup(view))
         until = None if terminal is None else lambda view: bool(terminal(_seen(self.sees, view)))
         try:
-            rollout = plant.rollout(control, self.horizon, policy, self._measure, least, until, self._between)
+            rollout = plant.rollout(
+                control, self.horizon, policy, self._measure, self.margin, until, self._between
+            )
         except NotFiniteError:
             return -math.inf  # the backup has no answer
-        values = np.array(rollout.values)
-        slack = float((values - self._needed[: len(values)]).min())
+        slack = float((np.array(rollout.values) - self.margin).min())
         if terminal is not None and not (rollout.reached or rollout.ended):
             return min(slack, _NOT_REACHED)
         return slack

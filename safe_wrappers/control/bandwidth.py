@@ -28,30 +28,6 @@ from safe_wrappers.errors import (
 )
 
 
-def phase_lag(crossover: float, control_dt: float, late_s: float = 0.0) -> float:
-    """Phase in rad that hold and delays take from a loop at its crossover: `w (late + hold / 2)`.
-
-    Delays do not change the gain, and the hold hardly does in the baseband, so the crossover stays where it is, and
-    the phase margin of a continuous design becomes less by this much.
-
-    Args:
-        crossover: Crossover frequency w of the open loop, rad/s, > 0, below the Nyquist frequency pi / control_dt.
-        control_dt: Sampling period in s; 0 for a loop that is not sampled.
-        late_s: Fixed delays of computation, bus and plant together, s, >= 0.
-
-    Raises:
-        ConfigurationError: For a crossover at or above the Nyquist frequency.
-    """
-    half = 0.5 * control_dt
-    if crossover * half >= 0.5 * math.pi:
-        raise ConfigurationError(
-            f"crossover must lie below the Nyquist frequency pi / control_dt; got {crossover} rad/s with "
-            f"control_dt = {control_dt} s; the half-sample "
-            "lag holds in the baseband only, so choose a slower loop or a shorter hold"
-        )
-    return crossover * (late_s + half)
-
-
 @dataclass(frozen=True)
 class ControlLoop:
     """The loop that a controller closes through a plant, as it was designed: in continuous time and without delay.
@@ -97,28 +73,32 @@ class ControlLoop:
     def margin_left_deg(self, control_dt: float, delay_s: float = 0.0) -> float:
         """What hold and delays of a plant, s, leave of the phase margin, degrees; at 0 or below nothing is left.
 
+        They take `w (delays + hold / 2)` in phase at the crossover w, rad. Delays do not change the gain, and the
+        hold hardly does in the baseband, so the crossover stays where it is.
+
         Raises:
             ConfigurationError: A crossover at or above the Nyquist frequency, where a hold is no delay any more.
         """
-        late = self.compute_s + delay_s + self.bus_s
-        return math.degrees(math.radians(self.phase_margin_deg) - phase_lag(self.crossover, control_dt, late))
+        if self.crossover * control_dt >= math.pi:
+            raise ConfigurationError(
+                f"crossover must lie below the Nyquist frequency pi / control_dt; got {self.crossover} rad/s with "
+                f"control_dt = {control_dt} s: choose a slower loop or a shorter hold"
+            )
+        late_s = self.compute_s + delay_s + self.bus_s + 0.5 * control_dt
+        return self.phase_margin_deg - math.degrees(self.crossover * late_s)
 
     def warn_if_short(self, control_dt: float, delay_s: float) -> None:
         """Warn if less is left than `warn_below_deg`; raises as `margin_left_deg`."""
         left = self.margin_left_deg(control_dt, delay_s)
-        if left >= self.warn_below_deg:
-            return
-        spare = math.radians(self.phase_margin_deg - self.warn_below_deg)
-        late = self.compute_s + self.bus_s + delay_s + 0.5 * control_dt
-        warnings.warn(
-            f"{left:.1f} degrees of phase margin are left of {self.phase_margin_deg:g}, which is less than "
-            f"{self.warn_below_deg:g}: a loop that crosses over at {self.crossover:g} rad/s is {late:.4g} s late "
-            f"(plant {delay_s:g} + compute {self.compute_s:g} + bus {self.bus_s:g} + half a hold "
-            f"{0.5 * control_dt:g}) and bears {spare / self.crossover:.4g} s; design it for at most "
-            f"{spare / late:.3g} rad/s, or shorten hold and delays",
-            PhaseMarginWarning,
-            stacklevel=3,
-        )
+        if left < self.warn_below_deg:
+            most = (self.phase_margin_deg - self.warn_below_deg) / (self.phase_margin_deg - left)
+            warnings.warn(
+                f"hold and delays leave {left:.1f} degrees of a phase margin of {self.phase_margin_deg:g}, less than "
+                f"{self.warn_below_deg:g}: design a loop of {self.crossover:g} rad/s for at most "
+                f"{most * self.crossover:.3g} rad/s, or shorten hold and delays",
+                PhaseMarginWarning,
+                stacklevel=3,
+            )
 
 
 class Modes(NamedTuple):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -38,6 +38,26 @@ def smoothstep(s: ArrayLike) -> Array:
     near = np.minimum(s, 1.0 - s)  # alpha(1 - s) = 1 - alpha(s): the half without cancellation
     half = near**3 * (near * (6.0 * near - 15.0) + 10.0)
     return np.asarray(np.where(s <= 0.5, half, 1.0 - half))
+
+
+class Fade:
+    """A smoothstep of so many `steps` from a command that is latched, shape (m,), to those that are given to it."""
+
+    def __init__(self, latched: Any = None, steps: int = 0) -> None:
+        self._latched, self._steps, self._done = latched, steps, 0
+
+    @property
+    def over(self) -> bool:
+        """Whether it does nothing any more."""
+        return self._done >= self._steps
+
+    def __call__(self, control: Array) -> Array:
+        """The next command, between the two, shape (m,); the given one itself when it is over."""
+        if self.over:
+            return control
+        self._done += 1
+        weight = float(smoothstep(self._done / (self._steps + 1.0)))
+        return np.asarray(self._latched * (1.0 - weight) + weight * control)
 
 
 def shortest_blend(change: Array | float, limit: Array | float, derivative: int = 1) -> Array:
@@ -150,6 +170,15 @@ def knot_torque_step(inertia: Array, spacing: float, positions: Array) -> Array:
     return np.asarray((inertia @ jumps[:, :, None])[:, :, 0])
 
 
+_UNITS: Final = {
+    "velocity": "action units per s",
+    "acceleration": "action units per s^2",
+    "jerk": "action units per s^3",
+    "torque": "N m",
+    "torque_slew": "N m/s",
+}
+
+
 @dataclass(frozen=True)
 class SeamLimits:
     """What a machine was measured to bear, for `ChunkHandover(limits=)`; what is None is not judged.
@@ -163,6 +192,9 @@ class SeamLimits:
     jerk: float | Sequence[float] | None = None  #: action units per s^3
     torque: float | Sequence[float] | None = None  #: N m
     torque_slew: float | Sequence[float] | None = None  #: N m/s
+    #: For commands that are lengths of MuJoCo's actuators: refuse chunks whose end the measured machine cannot reach
+    #: in time, by velocity and acceleration alone, to pass it ("moving") or to stand there ("rest").
+    arrival: str | None = None
 
 
 def limit_of_each(name: str, value: Any, controls: int, unit: str) -> Array:
@@ -181,14 +213,16 @@ class SeamCheck:
 
     Where torques are limited, `dynamics` has methods `torques` of positions, velocities and accelerations of the
     joints, all of shape (k, m), N m, and `inertia` of their positions, shape (k, m, m), kg m^2.
+
+    Attributes:
+        bounds: Of velocity, acceleration and jerk, shape (m,) each.
     """
 
     def __init__(self, limits: SeamLimits, controls: int, control_dt: float, dynamics: Any = None) -> None:
         self._control_dt, self._dynamics = control_dt, dynamics
-        units = ("action units per s", "action units per s^2", "action units per s^3", "N m", "N m/s")
-        *self._bounds, self._torque, self._slew = (
-            limit_of_each(f"limits.{field.name}", getattr(limits, field.name), controls, unit)
-            for field, unit in zip(fields(limits), units, strict=True)
+        *self.bounds, self._torque, self._slew = (
+            limit_of_each(f"limits.{name}", getattr(limits, name), controls, unit)
+            for name, unit in _UNITS.items()
         )
 
     def join(
@@ -211,7 +245,7 @@ class SeamCheck:
 
         Torques are judged at every quarter of a control step, and where an acceleration is largest or smallest.
         """
-        if any((peaks(curve, d) > bound * _ROUNDING).any() for d, bound in enumerate(self._bounds, 1)):
+        if any((peaks(curve, d) > bound * _ROUNDING).any() for d, bound in enumerate(self.bounds, 1)):
             return False
         if self._dynamics is None:
             return True
@@ -228,7 +262,3 @@ class SeamCheck:
             return True
         steps = knot_torque_step(self._dynamics.inertia(knots[1:-1]), spacing, knots)
         return bool((self._slew * self._control_dt * _ROUNDING >= np.abs(steps)).all())
-
-    def shortest_fade(self, change: Array) -> float:
-        """The shortest smoothstep, s, that changes a held command by (m,) within the limits but those of torque."""
-        return float(np.max([shortest_blend(change, bound, d) for d, bound in enumerate(self._bounds, 1)]))

@@ -29,6 +29,7 @@ _UNBOUNDED: Final = 1e30  # what daqp takes as "no bound"
 _ROUNDING: Final = 1e-15  # primal tolerance of daqp
 _SOFT: Final = 1e-10  # weight of the distance from the nominal beside squared violations
 _SOFTENED: Final = 8  # daqp's mark of a row that may be violated
+Problem = tuple[Array, Array, Array, Array, Array, Any]
 
 
 class Status(StrEnum):
@@ -108,15 +109,11 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Pro
                 f"u_nom must be finite, and bounds must not cross; got {u}, {lo} and {hi}"
             )
         return Projection(control, Status.FAILED, violation)
-    for widths, sense in ((False, 0), (True, 0), (False, _SOFTENED)):
-        hessian, (linear, normals, upper, lower, unit) = _identity(u.size), _program(u, a, b, lo, hi)
-        if widths:  # one unit for all leaves little of a box that is narrow beside the others
-            if (hi - lo == hi[0] - lo[0]).all():
-                continue
-            width = _widths(u, lo, hi)
-            linear, normals, upper, lower, unit = _program(u / width, a * width, b, lo / width, hi / width)
-            weights = (width / width.max()) ** 2
-            hessian, linear, unit = np.diag(weights), linear * weights, unit * width
+    for posed, sense in ((_in_one_unit, 0), (_in_widths, 0), (_in_one_unit, _SOFTENED)):
+        problem = posed(u, a, b, lo, hi)
+        if problem is None:
+            continue
+        hessian, linear, normals, upper, lower, unit = problem
         senses = np.zeros(len(upper), np.int32)
         senses[u.size :] = sense
         rows, tolerance = (normals, upper, lower, senses), _SOFT if sense else _ROUNDING
@@ -135,12 +132,26 @@ def _plain(*arrays: Array) -> Iterator[Array]:
     return (part if part.flags.carray else part.copy() for part in arrays)
 
 
-def _widths(u: Array, lo: Array, hi: Array) -> Array:
-    """A unit per component: half of what the box spans, or the largest number known of a component that is open."""
+def _in_one_unit(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Problem | None:
+    """What daqp is to minimise: Hessian and linear term, rows and box, and the unit of its answer."""
+    return _identity(u.size), *_program(u, a, b, lo, hi)
+
+
+def _in_widths(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Problem | None:
+    """The same in a unit per component; None where all are as wide.
+
+    One unit leaves little of a component that is narrow beside the others. Each is measured by half of what the box
+    spans, or by the largest number known of a component that is open.
+    """
+    if (hi - lo == hi[0] - lo[0]).all():
+        return None
     half = 0.5 * hi - 0.5 * lo
     known = np.max([np.where(np.abs(part) < _NO_BOUND, np.abs(part), 0.0) for part in (u, lo, hi)], axis=0)
     width = np.where((half > 0.0) & (half < _NO_BOUND), half, known)
-    return np.where(width > 0.0, width, 1.0)
+    width[width == 0.0] = 1.0
+    linear, normals, upper, lower, unit = _program(u / width, a * width, b, lo / width, hi / width)
+    weights = (width / width.max()) ** 2
+    return np.diag(weights), linear * weights, normals, upper, lower, unit * width
 
 
 @compiled

@@ -25,7 +25,7 @@ import numpy as np
 import ruckig
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.errors import Array, ConfigurationError
+from safe_wrappers.errors import Array
 
 _ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
 """Relative bound on the accumulated rounding of the formulas below."""
@@ -63,8 +63,8 @@ def longest_lease(
         top_speed: Bound on the approach speed that this acceleration may lead to, m/s; a measured speed above it
             counts as the bound. inf: none.
     """
-    given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
     # Scalar arithmetic: for the few leases of a control step it is faster than arrays.
+    given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
     several = np.broadcast(*(np.asarray(x, dtype=np.float64) for x in given))
     return np.array([_lease(*map(float, one)) for one in several]).reshape(several.shape)
 
@@ -112,18 +112,15 @@ def furthest(
 ) -> tuple[Array, Array]:
     """Bounds on the displacement, m, at any moment within a time, from a moving start to any speed at the end.
 
-    The lowest (<= 0) and the highest (>= 0), shape (...) each; (inf, -inf) where the duration is negative or anything
-    is not finite. They are exact: no admissible motion gets farther. A start outside the limits widens them.
+    The lowest (<= 0) and the highest (>= 0), shape (...) each; NaN where the velocity is not finite. They are exact:
+    no admissible motion gets farther. A start outside the limits widens them.
 
-    All arguments have shapes that broadcast: s, m/s (at the start), m/s (inf: none) and m/s^2 (finite).
+    All arguments have shapes that broadcast: s (>= 0), m/s (at the start), m/s (> 0, inf: none) and m/s^2 (> 0).
     """
-    a_max, v_max = checked_limits(max_acceleration, max_speed)
-    time, v = (np.asarray(x, dtype=np.float64) for x in (duration, velocity))
-    known = np.isfinite(time) & np.isfinite(v) & (time >= 0.0)
-    time, v = (np.where(known, x, 0.0) for x in (time, v))
-    up, down = _highest(time, v, v_max, a_max), _highest(time, -v, v_max, a_max)
-    known = np.broadcast_to(known, up.shape)
-    return np.where(known, -down, np.inf), np.where(known, up, -np.inf)
+    given = (duration, velocity, max_speed, max_acceleration)
+    time, v, v_max, a_max = (np.asarray(x, dtype=np.float64) for x in given)
+    with np.errstate(invalid="ignore"):
+        return -_highest(time, -v, v_max, a_max), _highest(time, v, v_max, a_max)
 
 
 def _highest(time: Array, v: Array, v_max: Array, a_max: Array) -> Array:
@@ -131,8 +128,7 @@ def _highest(time: Array, v: Array, v_max: Array, a_max: Array) -> Array:
     top = np.maximum(v_max, v)
     climb = np.minimum(time, (top - v) / a_max)
     cruise = time - climb
-    with np.errstate(invalid="ignore"):
-        cruised = np.where(cruise > 0.0, top * cruise, 0.0)
+    cruised = np.where(cruise > 0.0, top * cruise, 0.0)
     way = climb * (v + 0.5 * a_max * climb) + cruised
     size = climb * (np.abs(v) + a_max * climb) + np.abs(cruised)
     return np.asarray(np.maximum(way, 0.0) + 2.0 * _ROUNDING * size)
@@ -148,8 +144,8 @@ def admits(
 ) -> NDArray[np.bool_]:
     """Whether a position may be reached within a time, at any speed, axis by axis: a necessary condition.
 
-    False: no admissible motion gets there, anything is not finite, or the duration is negative. `goal` and `position`
-    are in m, shape (...), the other arguments those of `furthest`.
+    False: no admissible motion gets there, or goal, position or velocity are not finite. `goal` and `position` are in
+    m, shape (...), the other arguments those of `furthest`.
     """
     lowest, highest = furthest(duration, velocity, max_speed, max_acceleration)
     end, start = np.asarray(goal, dtype=np.float64), np.asarray(position, dtype=np.float64)
@@ -169,9 +165,9 @@ def jerk_limited_time(
 
     A start outside the limits is first brought back inside. inf where ruckig finds no profile, where a state is not
     finite, and where the end state violates the limits: too fast, too strongly accelerated, or reached only from
-    above the speed limit. The limits are of all axes or of each, in m/s^2 (finite), m/s and m/s^3 (inf: none).
+    above the speed limit. The limits are of all axes or of each, > 0, in m/s^2 (finite), m/s and m/s^3 (inf: none).
     """
-    limits = *checked_limits(max_acceleration, max_speed), np.asarray(max_jerk)
+    limits = max_acceleration, max_speed, max_jerk
     given = [np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (*start, *end, *limits)]
     p0, v0, a0, p1, v1, a1, a_max, v_max, jerk = np.broadcast_arrays(*given)
     if not all(np.isfinite(x).all() for x in (p0, v0, a0, p1, v1, a1)):
@@ -185,13 +181,3 @@ def jerk_limited_time(
     except ruckig.RuckigError:
         return math.inf
     return float(trajectory.duration)
-
-
-def checked_limits(max_acceleration: ArrayLike, max_speed: ArrayLike) -> tuple[Array, Array]:
-    """Acceleration (finite) and speed limits as float64, all positive."""
-    acceleration, speed = (np.asarray(x, dtype=np.float64) for x in (max_acceleration, max_speed))
-    if not ((acceleration > 0.0) & np.isfinite(acceleration)).all():
-        raise ConfigurationError(f"max_acceleration must be positive and finite, got {max_acceleration!r}")
-    if not (speed > 0.0).all():
-        raise ConfigurationError(f"max_speed must be positive (inf: no limit), got {max_speed!r}")
-    return acceleration, speed

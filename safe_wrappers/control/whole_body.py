@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.contact import cone_excess, friction_pyramid, tangents
 from safe_wrappers.control.projection import Status
-from safe_wrappers.errors import Array, ConfigurationError
+from safe_wrappers.errors import Array, ConfigurationError, finite_array
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""
@@ -41,7 +41,11 @@ _RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class WholeBodyProblem:
-    """One instant of a robot in contact."""
+    """One instant of a robot in contact.
+
+    Raises:
+        ConfigurationError: A number that is not finite, but for bounds; bounds that cross, or a friction below 0.
+    """
 
     inertia: Array  #: M, shape (nv, nv), positive definite
     bias: Array  #: h, shape (nv,): Coriolis, centrifugal and gravity forces minus passive ones
@@ -64,6 +68,11 @@ class WholeBodyProblem:
     )  #: wanted `J qacc`, `contact_acceleration` minus the drift, shape (k, 3)
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name not in ("lower", "upper", "breaking"):
+                finite_array(name, value)
+        if (self.friction < 0.0).any():
+            raise ConfigurationError(f"friction must be at least 0, got {self.friction}")
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
         opens = np.zeros(len(self.normals), bool) if self.breaking is None else self.breaking
@@ -251,9 +260,11 @@ def by_clarabel(p: Program) -> Array | Status:
     """The y of a program, shape (n,), or why there is none."""
     from scipy import sparse  # here: SciPy takes a while to import
 
-    there = np.isfinite(p.limits)
+    there = ~np.isinf(p.limits)
     matrix = np.concatenate([p.equal, p.rows[there], -p.cones.reshape(-1, len(p.linear))])
     right = np.concatenate([p.values, p.limits[there], np.zeros(3 * len(p.cones))])
+    if not all(np.isfinite(part).all() for part in (p.linear, matrix, right)):
+        return Status.FAILED  # clarabel would call it infeasible
     kinds = [clarabel.ZeroConeT(len(p.values)), clarabel.NonnegativeConeT(int(there.sum()))]
     kinds += [clarabel.SecondOrderConeT(3)] * len(p.cones)
     settings = clarabel.DefaultSettings()

@@ -48,7 +48,7 @@ class Plant(Model):
         model_version: Number of changes of the model, after each of which a filter binds its constraints anew.
         has_acceleration: Whether a control acts as a force, so that `f` and `g` are known.
         can_brake: Whether it knows which states are velocities, as a braking fallback needs.
-        simulates: Whether it rolls out actions and policies, as `RolloutPlant` does.
+        simulates: Whether it rolls out actions and policies, as `SimulatorPlant` does.
     """
 
     control_dt: float

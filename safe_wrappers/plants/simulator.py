@@ -1,9 +1,8 @@
-"""Plants that simulate a control and then a policy, step by step; SimulatorPlant does it in the env itself."""
+"""SimulatorPlant: a control and then a policy, simulated step by step in the env itself."""
 
 import contextlib
 import copy
 import warnings
-from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple, NoReturn
@@ -27,9 +26,12 @@ from safe_wrappers.plants.env_checks import check_timing, name_of, read_attribut
 from safe_wrappers.plants.mujoco.binding import physics_steps
 from safe_wrappers.plants.plant import Plant
 
+_ROUNDING = 1e-6  # of float32
+_CHECK_S = 2.0  # for the check at binding
+
 
 class View(NamedTuple):
-    """What can be seen of a state: the unwrapped env (None of an identified model), observation and info."""
+    """What can be seen of a state: the unwrapped env, observation and info."""
 
     env: Any
     observation: Any
@@ -51,7 +53,7 @@ class Rollout:
 
     Attributes:
         observations: After each step.
-        rewards: Of each step; NaN where the plant does not know them.
+        rewards: Of each step.
         values: What was measured after each step, shape (k,).
         ended: The episode terminated or was truncated.
         reached: The set in which it may stop was reached.
@@ -71,22 +73,52 @@ class Rollout:
         return len(self.observations)
 
 
-class RolloutPlant(Plant):
-    """A plant that predicts by rollouts alone; it has neither f nor g.
+class SimulatorPlant(Plant):
+    """Rolls out actions in the env itself, from its present state, with all wrappers inside the filter.
+
+    No dynamics are written down. By default the env is copied, MuJoCo's state included. At binding random steps are
+    made in a simulation and once more in a simulation of that: both must agree bit for bit, or the env is refused.
+
+    **It knows what will be drawn**: the random generator of the env belongs to its state, so that a rollout has the
+    noise that the env will have. Only a simulator has this privilege.
+
+    **After every step** what the env has returned is compared with the rollout of the executed action. From the first
+    difference on (a generator that copies share, a clock, another process) nothing is proved, and `cbf/mismatch` says
+    at which steps it was.
+
+    Args:
+        snapshot: "fork" simulates in a child process, for envs that cannot be copied, such as Box2D's (a model as
+            backup then computes in the child, where torch must have one thread). None: see above.
+        control_dt: Control interval, s; None takes the env's `dt`. An env without `dt` has none, and wrappers that
+            count in seconds ask for it.
+        check_steps: Random steps of the check at binding; 0 checks nothing. At most 2 s: a warning says where
+            that was too few.
+
+    It predicts by rollouts alone, and has neither f nor g.
 
     Attributes:
-        simulates_env: Whether a `View` of a rollout has the env and its info; else only the observation.
+        checked_steps: How many steps the check has compared.
         exact: Whether rollouts were checked to be what the env does, its noise included.
         substeps: Physics substeps of a control step that are known of.
         discrete: Whether actions are whole numbers.
         judges_substeps: Whether rollouts can be measured at each of them, by a measure of the env alone.
         view: What was returned last by the env's reset or step.
+
+    Raises:
+        UnsupportedEnvError: The env cannot be copied, or its simulation differs from it; the message says where.
+        ConfigurationError: A wrapper inside that records; a wrong control interval.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> upright = lambda x: 0.2 - abs(x[2])  # rad, of CartPole's observation
+        >>> shield = sw.constraints.PredictiveShield(upright, horizon=10, backup=[0, 1])
+        >>> plant = sw.SimulatorPlant(control_dt=0.02)
+        >>> env = sw.ActionShield(gym.make("CartPole-v1"), [shield], plant=plant)
     """
 
     has_acceleration: ClassVar[bool] = False
     simulates: ClassVar[bool] = True
-    simulates_env: ClassVar[bool] = True
-    exact: bool = False
+    checked_steps = 0
     substeps: int = 1
     discrete: bool = False
     judges_substeps: bool = False
@@ -96,10 +128,20 @@ class RolloutPlant(Plant):
     view: View
     _env: gym.Env[Any, Any]
     _control_dt: float | None = None
+    _simulation: Simulation
 
-    def __init__(self, control_dt: float | None) -> None:
+    def __init__(
+        self,
+        snapshot: Literal["fork"] | None = None,
+        control_dt: float | None = None,
+        check_steps: int = 1000,
+    ) -> None:
         self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
         self._foreseen: dict[bytes, tuple[Any, float | None, Measure | None]] = {}
+        self._snapshot = snapshot
+        self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
+        self.exact = self.check_steps > 0
+        self._sent = b""
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         refuse_second_env(getattr(self, "_env", None), env)
@@ -121,6 +163,51 @@ class RolloutPlant(Plant):
             if isinstance(getattr(env.unwrapped, "model", None), mujoco.MjModel):
                 self.substeps = physics_steps(env.unwrapped)
         self._env, self._space = env, space
+        self._simulation = Simulation(env, self._snapshot)
+        self.view = View(env.unwrapped, np.zeros(0), {})
+        stepping = getattr(type(env.unwrapped), "_step_mujoco_simulation", None)
+        self.judges_substeps = stepping is MujocoEnv._step_mujoco_simulation
+        if self.check_steps:
+            self.checked_steps = self._simulation.check(self.check_steps, _CHECK_S)
+            if self.checked_steps < self.check_steps:
+                warnings.warn(
+                    f"the simulation of {name_of(env)} was compared with the env on {self.checked_steps:,} random "
+                    f"steps, which took {_CHECK_S:g} s, instead of {self.check_steps:,}",
+                    stacklevel=2,
+                )
+
+    @property
+    def state(self) -> Array:
+        """The last observation as numbers, shape (n,); empty where it is no array."""
+        observation = self.view.observation
+        if isinstance(observation, np.ndarray) and observation.dtype.kind in "fiub":
+            return observation.astype(np.float64).reshape(-1)
+        return np.zeros(0)
+
+    def received(self, observation: Any, info: dict[str, Any]) -> None:
+        self.view = View(self._env.unwrapped, observation, info)
+
+    def executed(self, control: Array | None) -> None:
+        """Remember it for `deviation`; a new episode may have changed what copies share."""
+        if control is None:
+            self._simulation.start()
+        self._sent = b"" if control is None else control.tobytes()
+
+    def deviation(self) -> str:
+        """Where the env's step was not the rollout of what was executed: in the observation, or in what was measured.
+
+        By more than rounding: an env may compute otherwise with a list. From the first one on it is not `exact`.
+        """
+        if not self.check_steps or self._sent not in self._foreseen:
+            return ""
+        observation, value, measure = self._foreseen[self._sent]
+        found = differing("observation", observation, self.view.observation, _ROUNDING)
+        if found is None and measure is not None:
+            found = differing("h", value, measure(self.view), _ROUNDING)
+        if found is None:
+            return ""
+        self.exact = False
+        return f"the env's step was not its simulation's: {found}"
 
     @property
     def control_dt(self) -> float:  # type: ignore[override]
@@ -255,17 +342,9 @@ class RolloutPlant(Plant):
                         action = policy(view)
             return found
 
-        found = self.run(simulated)
+        found: Rollout = self._simulation.run(simulated)
         self._foreseen[control.tobytes()] = found.observations[0], found.first, measure
         return found
-
-    @abstractmethod
-    def run(self, task: Callable[[Any], Rollout]) -> Rollout:
-        """What a task returns that steps the env, or what stands for it, from the present state."""
-
-    @abstractmethod
-    def margins(self, measure: Measure, horizon: int) -> Array:
-        """By how much a measure may be worse than predicted after each step, shape (horizon,), in its unit."""
 
 
 @contextlib.contextmanager
@@ -283,114 +362,3 @@ def _each_substep(raw: Any, look: Callable[[], None]) -> Iterator[None]:
         yield
     finally:
         del raw._step_mujoco_simulation
-
-
-_ROUNDING = 1e-6  # of float32
-_CHECK_S = 2.0  # for the check at binding
-
-
-class SimulatorPlant(RolloutPlant):
-    """Rolls out actions in the env itself, from its present state, with all wrappers inside the filter.
-
-    No dynamics are written down. By default the env is copied, MuJoCo's state included. At binding random steps are
-    made in a simulation and once more in a simulation of that: both must agree bit for bit, or the env is refused.
-
-    **It knows what will be drawn**: the random generator of the env belongs to its state, so that a rollout has the
-    noise that the env will have. Only a simulator has this privilege.
-
-    **After every step** what the env has returned is compared with the rollout of the executed action. From the first
-    difference on (a generator that copies share, a clock, another process) nothing is proved, and `cbf/mismatch` says
-    at which steps it was.
-
-    Args:
-        snapshot: "fork" simulates in a child process, for envs that cannot be copied, such as Box2D's (a model as
-            backup then computes in the child, where torch must have one thread). None: see above.
-        control_dt: Control interval, s; None takes the env's `dt`. An env without `dt` has none, and wrappers that
-            count in seconds ask for it.
-        check_steps: Random steps of the check at binding; 0 checks nothing. At most 2 s: a warning says where
-            that was too few.
-
-    Attributes:
-        checked_steps: How many steps the check has compared.
-
-    Raises:
-        UnsupportedEnvError: The env cannot be copied, or its simulation differs from it; the message says where.
-        ConfigurationError: A wrapper inside that records; a wrong control interval.
-
-    Example:
-        >>> import gymnasium as gym, safe_wrappers as sw
-        >>> upright = lambda x: 0.2 - abs(x[2])  # rad, of CartPole's observation
-        >>> shield = sw.constraints.PredictiveShield(upright, horizon=10, backup=[0, 1])
-        >>> plant = sw.SimulatorPlant(control_dt=0.02)
-        >>> env = sw.ActionShield(gym.make("CartPole-v1"), [shield], plant=plant)
-    """
-
-    checked_steps = 0
-    _simulation: Simulation
-
-    def __init__(
-        self,
-        snapshot: Literal["fork"] | None = None,
-        control_dt: float | None = None,
-        check_steps: int = 1000,
-    ) -> None:
-        super().__init__(control_dt)
-        self._snapshot = snapshot
-        self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
-        self.exact = self.check_steps > 0
-        self._sent = b""
-
-    def bind(self, env: gym.Env[Any, Any]) -> None:
-        super().bind(env)
-        self._simulation = Simulation(env, self._snapshot)
-        self.view = View(env.unwrapped, np.zeros(0), {})
-        stepping = getattr(type(env.unwrapped), "_step_mujoco_simulation", None)
-        self.judges_substeps = stepping is MujocoEnv._step_mujoco_simulation
-        if self.check_steps:
-            self.checked_steps = self._simulation.check(self.check_steps, _CHECK_S)
-            if self.checked_steps < self.check_steps:
-                warnings.warn(
-                    f"the simulation of {name_of(env)} was compared with the env on {self.checked_steps:,} random "
-                    f"steps, which took {_CHECK_S:g} s, instead of {self.check_steps:,}",
-                    stacklevel=2,
-                )
-
-    @property
-    def state(self) -> Array:
-        """The last observation as numbers, shape (n,); empty where it is no array."""
-        observation = self.view.observation
-        if isinstance(observation, np.ndarray) and observation.dtype.kind in "fiub":
-            return observation.astype(np.float64).reshape(-1)
-        return np.zeros(0)
-
-    def received(self, observation: Any, info: dict[str, Any]) -> None:
-        self.view = View(self._env.unwrapped, observation, info)
-
-    def executed(self, control: Array | None) -> None:
-        """Remember it for `deviation`; a new episode may have changed what copies share."""
-        if control is None:
-            self._simulation.start()
-        self._sent = b"" if control is None else control.tobytes()
-
-    def deviation(self) -> str:
-        """Where the env's step was not the rollout of what was executed: in the observation, or in what was measured.
-
-        By more than rounding: an env may compute otherwise with a list. From the first one on it is not `exact`.
-        """
-        if not self.check_steps or self._sent not in self._foreseen:
-            return ""
-        observation, value, measure = self._foreseen[self._sent]
-        found = differing("observation", observation, self.view.observation, _ROUNDING)
-        if found is None and measure is not None:
-            found = differing("h", value, measure(self.view), _ROUNDING)
-        if found is None:
-            return ""
-        self.exact = False
-        return f"the env's step was not its simulation's: {found}"
-
-    def run(self, task: Callable[[Any], Rollout]) -> Rollout:
-        return self._simulation.run(task)
-
-    def margins(self, measure: Measure, horizon: int) -> Array:
-        """Zeros: a rollout is what the env does."""
-        return np.zeros(horizon)

@@ -22,7 +22,8 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
 
     SB3 stores the policy's action a ("naive" in Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023).
     Where the filter changed it to a_safe, this buffer stores (s, a_safe, s', r) instead, and unchanged steps as SB3
-    stores them, bit for bit. Returns are one-step whatever SB3's `n_steps` says.
+    stores them, bit for bit. Returns are one-step whatever SB3's `n_steps` says. Of an `ActionRepeat`, whose control
+    steps may be executed with different actions, a_safe is the last one's.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -38,8 +39,9 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         args, more: As in SB3.
 
     Raises:
-        ConfigurationError: Other actions; at the first step, an env without a filter, with an `AdaptionPenalty`
-            (it would charge the safe action), or with a wrapper outside the filter that changes actions.
+        ConfigurationError: Other actions or observations; at the first step, an env without a filter, with an
+            `AdaptionPenalty` (it would charge the safe action), or with a wrapper outside the filter that changes
+            actions.
         ActionError: An executed action that is not finite.
     """
 
@@ -53,6 +55,11 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
     ) -> None:
         if not (isinstance(action_space, spaces.Box) and action_space.is_bounded()):
             raise ConfigurationError(f"expected a bounded Box of actions, got {action_space}")
+        if isinstance(observation_space, spaces.Dict) and not isinstance(self, DictReplayBuffer):
+            raise ConfigurationError(
+                f"expected observations that are no Dict, got {observation_space}; those are for"
+                " ExecutedActionDictReplayBuffer, or ExecutedActionHerReplayBuffer"
+            )
         super().__init__(buffer_size, observation_space, action_space, *args, **more)
 
     def add(

@@ -5,23 +5,26 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.control.handover import (
     LOOK_BACK,
+    Fade,
     SeamCheck,
     SeamLimits,
     hermite_spline,
     join,
     limit_of_each,
     shortest_blend,
-    smoothstep,
 )
+from safe_wrappers.control.watchdog import admits, jerk_limited_time
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,
+    UnsupportedEnvError,
     numbers_of,
     positive,
     settings_from,
@@ -30,7 +33,9 @@ from safe_wrappers.errors import (
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
+from safe_wrappers.plants.mujoco.binding import actions_are_controls
 from safe_wrappers.plants.mujoco.dynamics import InverseDynamics
+from safe_wrappers.plants.mujoco.model import control_range
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.layer import (
@@ -82,7 +87,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
         limits: Of the machine, a `SeamLimits` or the dict of one. With it blends are quintics with second derivatives
             matched at both ends, which are stretched until they keep the limits in between, too; without one that
-            does the chunk is refused.
+            does, or with an end out of reach, the chunk is refused.
 
     Info, at every step: ``handover/peak_jerk``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
     ``action/clipped``; that of the layers inside is merged over the control steps (`safe_wrappers.info`).
@@ -136,8 +141,12 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._step = np.where(step / self.control_dt > self._rate_limit, np.nextafter(step, 0.0), step)
         self._fallback = FallbackController(env, fallback, bound_plant(env, plant, fallback))
         self._check: SeamCheck | None = None
+        self._admission: Admission | None = None
         if limits is not None:
-            self._check = self._bound_check(settings_from(SeamLimits, limits, "limits"))
+            limits = settings_from(SeamLimits, limits, "limits")
+            self._check = self._bound_check(limits)
+            if limits.arrival is not None:
+                self._admission = Admission(env, limits, self._check)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
 
@@ -149,24 +158,19 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._coming: list[Chunk] = []
         self._sent = self._plan = np.zeros((0, self._controls))
         self._starving: bool | None = None
-        self._fade: tuple[Array, int, int] | None = None  # the latched command, steps, done
+        self._fade = Fade()
         self._executed: list[Array] = []
-        self._clipped = 0.0
-        self._count()
+        self._starved = self._limited = 0
+        self._refused, self._clipped = False, 0.0
         info.update(self._measured())
         return observation
-
-    def _count(self) -> None:
-        """Begin to count what happens in a step."""
-        self._starved = self._limited = 0
-        self._refused = False
 
     def step(self, action: Any) -> Step:
         """Execute the next `execution_horizon` control steps, with this chunk from when it is there."""
         self._refuse_without_reset()
         chunk = self._checked(action)
         self._clipped = self._beyond(chunk)
-        self._count()
+        self._starved = self._limited = 0
         self._refused = not self._submit(chunk)
         answer = self._make_steps(self.execution_horizon, self._control_step)
         self._observed_s = self.now_s
@@ -188,29 +192,28 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     def _set_sizes(
         self, chunk_size: Any, execution_horizon: Any, inference_delay: Any, steps_per_entry: Any
     ) -> None:
-        """Keep the counts, the delay as least and most; or an error that says what would fit."""
-        entries = self.chunk_size = whole_number("chunk_size", chunk_size, 1, "control steps")
-        horizon = whole_number("execution_horizon", execution_horizon, 1, "control steps")
-        self.execution_horizon = horizon
-        apart = self._apart = whole_number("steps_per_entry", steps_per_entry, 1, "control steps")
-        if entries == 1 and apart > 1:
-            raise ConfigurationError(f"steps_per_entry = {apart}: one entry leads to no other")
+        """Keep the counts, the delay as least and most; or an error where they do not fit together."""
+        self._apart = whole_number("steps_per_entry", steps_per_entry, 1, "control steps")
+        # One entry leads to no other.
+        self.chunk_size = whole_number("chunk_size", chunk_size, 1 if self._apart == 1 else 2, "entries")
+        self.execution_horizon = whole_number("execution_horizon", execution_horizon, 1, "control steps")
         both = inference_delay if isinstance(inference_delay, list | tuple) else [inference_delay] * 2
         delay = tuple(whole_number("inference_delay", one, 0, "control steps") for one in both)
         if len(delay) != 2 or delay[0] > delay[1]:
             raise ConfigurationError(
                 f"inference_delay is d control steps or [least, most], got {inference_delay!r}"
             )
-        self._delay, size, most = delay, (entries - 1) * apart + 1, delay[1]
-        if not most <= horizon <= size - most:
-            has = f"inference_delay d = {most}, execution_horizon s = {horizon}, chunk_size {entries}"
-            fits = f"choose s from {max(most, 1)} to {size - most}" if 2 * most < size else "no s fits"
-            raise ConfigurationError(f"{has}, H = {size} control steps: d <= s <= H - d must hold; {fits}")
+        self._delay, self._size = delay, (self.chunk_size - 1) * self._apart + 1
+        if not delay[1] <= self.execution_horizon <= self._size - delay[1]:
+            raise ConfigurationError(
+                f"d <= s <= H - d must hold; got inference_delay d = {delay[1]}, execution_horizon s = "
+                f"{self.execution_horizon}, and a chunk of H = {self._size} control steps"
+            )
 
     def _fewest_steps(self, blend_time: float) -> int:
         """The fewest control steps of a blend."""
         fewest = max(whole_steps(positive("blend_time", blend_time, "s"), self.control_dt) - 1, 1)
-        rest = (self.chunk_size - 1) * self._apart + 1 - self._delay[1]
+        rest = self._size - self._delay[1]
         if fewest >= rest and self.chunk_size > 1:
             raise ConfigurationError(
                 f"a blend of {fewest} control steps does not fit into what is left of a chunk when it takes over, "
@@ -265,9 +268,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             control, self._plan = self._plan[0], self._plan[1:]
         if starving != self._starving and len(self._sent) and not seam:
             # A longer chunk that takes over blends by itself; everything else starts from the last command.
-            self._fade = (self._sent[-1], self._fade_steps(control), 0)
+            self._fade = Fade(self._sent[-1], self._fade_steps(control))
         self._starving = starving
-        sent = self._sendable(self._faded(control))
+        sent = self._sendable(self._fade(control))
         self._sent = np.concatenate([self._sent[-LOOK_BACK + 1 :], sent[None].astype(np.float64)])
         return sent
 
@@ -279,8 +282,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         now, seam = self._steps_done, False
         for chunk in reversed([one for one in self._coming if one.due <= now]):
             fresh = chunk.commands[now - chunk.observed :]
-            admitted = len(fresh) > 0 and (self._inside is None or self._inside.admits(fresh[-1], len(fresh)))
-            if not admitted:
+            end_s, admission = len(fresh) * self.control_dt, self._admission
+            if not len(fresh) or (admission is not None and not admission.admits(fresh[-1], end_s)):
                 self._refused = True
                 continue
             joined = (fresh, 0) if self.chunk_size == 1 else self._joined(fresh)
@@ -290,7 +293,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             self._coming = [one for one in self._coming if one.observed > chunk.observed]
             self._observed, self._plan = chunk.observed, joined[0]
             if self.chunk_size > 1:
-                self._fade, seam = None, len(self._sent) > 0
+                self._fade, seam = Fade(), len(self._sent) > 0
             break
         self._coming = [one for one in self._coming if one.due > now]
         return seam
@@ -303,22 +306,10 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     def _fade_steps(self, target: Array) -> int:
         """Control steps between the latched command and the new one that keep the limits, were both at rest."""
+        limits = [(1, self._rate_limit), *enumerate([] if self._check is None else self._check.bounds, 1)]
         change = np.abs(target - self._sent[-1])
-        shortest = float(shortest_blend(change, self._rate_limit).max())
-        if self._check is not None:
-            shortest = max(shortest, self._check.shortest_fade(change))
+        shortest = max(float(shortest_blend(change, limit, order).max()) for order, limit in limits)
         return max(self._fewest, whole_steps(shortest, self.control_dt) - 1)
-
-    def _faded(self, control: Array) -> Array:
-        if self._fade is None:
-            return control
-        latched, steps, done = self._fade
-        if done >= steps:
-            self._fade = None
-            return control
-        self._fade = (latched, steps, done + 1)
-        weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
-        return np.asarray(latched + weight * (control - latched))
 
     def _sendable(self, control: Array) -> NDArray[Any]:
         """The command in the env's dtype, within the box and the limit; one that has to be held back is counted."""
@@ -342,8 +333,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         beyond = np.clip(finite, space.low, space.high) - finite
         clipped = max(math.hypot(*entry) for entry in beyond)
         if clipped > 0.0:
-            message = f"the policy's action left the action space by {clipped:.3g} (action/clipped)"
-            self._warn_once("clipped", f"{message}; its entries are clipped to it")
+            message = f"the policy's action left the action space by {clipped:.3g}; it is clipped"
+            self._warn_once("clipped", f"{message} (action/clipped)")
         return clipped
 
     def _measured(self) -> dict[str, Any]:
@@ -361,6 +352,38 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             keys.HANDOVER_REFUSED: self._refused,
             keys.ACTION_CLIPPED: self._clipped,
         }
+
+
+class Admission:
+    """Refuses chunks that no motion within the limits could follow to their end; a necessary condition only.
+
+    With arrival "moving" the end may be passed at any speed; with "rest" the machine must be able to stand there in
+    time. Where it is, the lengths and velocities of the MuJoCo actuators say.
+    """
+
+    def __init__(self, env: Env, limits: SeamLimits, check: SeamCheck) -> None:
+        self._raw: Any = env.unwrapped
+        model: Any = getattr(self._raw, "model", None)
+        if not isinstance(model, mujoco.MjModel):
+            raise UnsupportedEnvError("limits.arrival is for MuJoCo's actuators, whose lengths are read")
+        if not actions_are_controls(env.action_space, *control_range(model)):
+            raise ConfigurationError(
+                "limits.arrival is for setpoints: actions in units of the actuators' lengths"
+            )
+        if limits.arrival not in ("moving", "rest") or limits.acceleration is None:
+            raise ConfigurationError(
+                f'limits.arrival is "moving" or "rest", beside an acceleration; got {limits}'
+            )
+        self._rest = limits.arrival == "rest"
+        self._speed, self._acceleration, _ = check.bounds
+
+    def admits(self, end: Array, duration_s: float) -> bool:
+        """Whether a chunk may be executed that ends with a command (m,) after so many seconds."""
+        position, velocity = self._raw.data.actuator_length, self._raw.data.actuator_velocity
+        if self._rest:
+            states = (position, velocity, 0.0), (end, 0.0, 0.0)
+            return jerk_limited_time(*states, self._acceleration, self._speed) <= duration_s
+        return bool(admits(end, position, velocity, duration_s, self._speed, self._acceleration).all())
 
 
 def upsampled(chunk: Array, steps: int) -> Array:

@@ -6,7 +6,6 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, non_negative, numbers_of, positive
@@ -59,8 +58,6 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     layer: ClassVar = Layer.FAULT
 
-    _last: Any
-
     def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
@@ -70,10 +67,9 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
         self._passes_numbers = not any(
             getattr(inner, "layer", None) in _DECIDING for inner in wrappers_of(env)
         )
+        self._nested = any(isinstance(inner, Fault) for inner in wrappers_of(env))
         # Nested faults of one kind must not strike together.
-        faults = [inner for inner in wrappers_of(env) if isinstance(inner, Fault)]
-        same = sum(isinstance(inner, type(self)) for inner in faults)
-        self._nested = bool(faults)
+        same = sum(isinstance(inner, type(self)) for inner in wrappers_of(env))
         self.random = WrapperRng(type(self).__name__ + (f" {same + 1}" if same else ""))
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
@@ -105,9 +101,6 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
     @property
     def now_s(self) -> float:
         return super().now_s if self._inside is None else self._inside.now_s
-
-    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
-        return self._inside is None or self._inside.admits(end, steps)
 
     def _refuse_what_is_no_action(self, action: Any) -> None:
         """Now, and not when it arrives, at a step whose action is a right one."""

@@ -36,6 +36,8 @@ Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
 _WRAPPERS = __name__.rpartition(".")[0]
+_UNKNOWN: Final[dict[str, Any]] = {"*arguments": []}
+"""Recorded of a constructor whose arguments are not known: none takes it, so that `gym.make` takes no defaults."""
 
 
 class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -49,13 +51,12 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         """A wrapper whose constructor's arguments are recorded as they were given, as plain data."""
         made = super().__new__(cls)
         if arguments or named:  # a copy is made without any, and gets the recorded ones with its state
-            given = inspect.signature(cls.__init__).bind(made, *arguments, **named)
-            given.apply_defaults()
-            own = list(given.arguments.items())[2:]  # without self and env
-            gym.utils.RecordConstructorArgs.__init__(made, **{name: _plain(value) for name, value in own})
+            given = _plain(_by_name(made, arguments, named))
+            gym.utils.RecordConstructorArgs.__init__(made, **given)
         return made
 
     def __init__(self, env: Env) -> None:
+        vars(self).setdefault("_saved_kwargs", _UNKNOWN)  # a subclass's `__new__` may pass on none
         refuse_vector_env(env, type(self).__name__)
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
@@ -150,6 +151,26 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         inside = isinstance(self.env.observation_space, spaces.Dict)
         entries = observation if inside else {"observation": observation}
         return {**entries, name: numbers.astype(space[name].dtype)}
+
+
+def _by_name(made: Env, arguments: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
+    """What a constructor is given, but for the env; what has no name is under ``*name``, as in `_UNKNOWN`."""
+    signature = inspect.signature(type(made).__init__)
+    try:
+        given = signature.bind(made, *arguments, **named)
+    except TypeError:
+        return _UNKNOWN  # `__init__` raises it anew, and names the class
+    given.apply_defaults()
+    found: dict[str, Any] = {}
+    for name, value in given.arguments.items():
+        kind = signature.parameters[name].kind
+        if kind is inspect.Parameter.VAR_KEYWORD:
+            found |= value
+        elif kind is not inspect.Parameter.VAR_POSITIONAL:
+            found[name] = value
+        elif nameless := [one for one in value if not isinstance(one, gym.Env)]:
+            found[f"*{name}"] = nameless
+    return {name: value for name, value in found.items() if name != "env" and value is not made}
 
 
 def _plain(given: Any) -> Any:
@@ -249,10 +270,6 @@ class CommandReceiver:
                 f"observed_s is a time in seconds, or None for nothing; got {shown(observed_s)}"
             )
         self._observed_s = observed_s
-
-    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
-        """Whether a chunk may be executed that ends with this command, shape (m,), so many control steps from now."""
-        return True
 
 
 def receiver_inside(env: Env) -> CommandReceiver | None:

@@ -50,20 +50,20 @@ class ActionRepeat(LayerWrapper):
 class AdaptionPenalty(LayerWrapper):
     """Takes a penalty off the reward at every step at which the filter changed the action, or an escape replaced it.
 
-    The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty + per_correction * c` for a
-    correction c = |a_safe - a| (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023).
+    The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty` (Krasowski et al., Provably Safe
+    Reinforcement Learning, TMLR 2023).
+    An action that is not finite is changed, and costs no more than any other.
 
     Wrappers that scale or clip rewards belong inside. Not for hindsight replay, which asks the task for rewards anew.
 
     Args:
         env: With a `CBFActionFilter` inside.
-        penalty: For every changed step, in units of the task's reward, at least 0.
-        per_correction: For each unit of `cbf/correction` (L2 norm, action units) of a changed step, at least 0.
+        penalty: For every changed step, in units of the task's reward, above 0.
 
     Info, at every step: ``adaption/penalty`` (float); with it added back, the reward is the task's own.
 
     Raises:
-        ConfigurationError: No filter inside, a second AdaptionPenalty, no penalty, or one that is negative.
+        ConfigurationError: No filter inside, a second AdaptionPenalty, or a penalty that is not above 0.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -78,15 +78,10 @@ class AdaptionPenalty(LayerWrapper):
 
     layer: ClassVar = Layer.ADAPTION
 
-    def __init__(self, env: Env, penalty: float = 0.0, per_correction: float = 0.0) -> None:
+    def __init__(self, env: Env, penalty: float) -> None:
         LayerWrapper.__init__(self, env)
         needed_filter(env, "AdaptionPenalty(sw.protect(env), penalty=...)")
-        self.penalty = non_negative("penalty", penalty, "the task's reward")
-        self.per_correction = non_negative("per_correction", per_correction, "reward per action unit")
-        if not (self.penalty or self.per_correction):
-            raise ConfigurationError(
-                "AdaptionPenalty: give penalty (per step), per_correction (per unit of cbf/correction), or both"
-            )
+        self.penalty = positive("penalty", penalty, "the task's reward")
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         info[keys.ADAPTION_PENALTY] = 0.0
@@ -95,14 +90,11 @@ class AdaptionPenalty(LayerWrapper):
     def step(self, action: Any) -> Step:
         """Steps the env; an unchanged step's reward passes through untouched."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        penalty = 0.0
-        changed, correction = info[keys.CBF_INTERVENED], info[keys.CBF_CORRECTION]
-        if info.get(keys.CBF_ESCAPING, False):  # StuckEscape gave the filter another action than this one
-            changed, correction = True, np.linalg.norm(info[keys.EXECUTED_ACTION] - np.nan_to_num(action))
+        # StuckEscape gives the filter another action than this one.
+        changed = info[keys.CBF_INTERVENED] or info.get(keys.CBF_ESCAPING, False)
         if changed:
-            penalty = self.penalty + self.per_correction * float(correction)
-            reward = float(reward) - penalty
-        info[keys.ADAPTION_PENALTY] = penalty
+            reward = float(reward) - self.penalty
+        info[keys.ADAPTION_PENALTY] = self.penalty if changed else 0.0
         return observation, reward, terminated, truncated, info
 
 

@@ -1,21 +1,15 @@
 """LeaseExpiry: a command is in force only while the machine could still stop behind it."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
-import mujoco
-import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.control.handover import smoothstep
-from safe_wrappers.control.watchdog import admits, checked_limits, jerk_limited_time
+from safe_wrappers.control.handover import Fade
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,
-    UnsupportedEnvError,
     non_negative,
     positive,
     settings_from,
@@ -23,8 +17,6 @@ from safe_wrappers.errors import (
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
-from safe_wrappers.plants.mujoco.binding import actions_are_controls
-from safe_wrappers.plants.mujoco.model import control_range
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.layer import Env, Step, action_array, whole_steps
 from safe_wrappers.wrappers.stack import Layer
@@ -35,19 +27,6 @@ from safe_wrappers.wrappers.stopping import (
     StoppingBudget,
     bound_plant,
 )
-
-
-@dataclass(frozen=True)
-class MotionLimits:
-    """Of machines that follow setpoints: numbers, or one for each, and how a chunk may end: "moving" or at "rest"."""
-
-    max_acceleration: Any
-    max_speed: Any = math.inf
-    arrival: Literal["moving", "rest"] = "moving"
-
-    def __post_init__(self) -> None:
-        if self.arrival not in ("moving", "rest"):
-            raise ConfigurationError(f'arrival is "moving" or "rest", got {self.arrival!r}')
 
 
 class LeaseExpiry(CommandGate):
@@ -70,8 +49,6 @@ class LeaseExpiry(CommandGate):
         min_lease_s: Every fresh command gets a lease of at least so long, s; above 0 only with a CBFActionFilter
             inside. Behind a `ChunkHandover` give the time of one `execution_horizon`.
         blend_time: s, of the way back from the fallback to a fresh command.
-        motion_limits: For actions that are setpoints of the lengths of MuJoCo's actuators: {"max_acceleration": ...,
-            "max_speed": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
         fallback: "brake", "hold", "zero", or a function of the plant.
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
 
@@ -94,8 +71,6 @@ class LeaseExpiry(CommandGate):
     """
 
     layer: ClassVar = Layer.LEASE
-    _whose: ClassVar = "policy's"
-    _not_sent: ClassVar = "the command in force goes on under its lease"
 
     _fallback: FallbackController
 
@@ -107,7 +82,6 @@ class LeaseExpiry(CommandGate):
         max_lease_s: float = 1.0,
         min_lease_s: float = 0.0,
         blend_time: float = 0.1,
-        motion_limits: Mapping[str, Any] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
     ) -> None:
@@ -115,27 +89,26 @@ class LeaseExpiry(CommandGate):
         refuse_changed_actions(env)
         plant, budget = own_plant(plant), settings_from(StoppingBudget, budget, "budget")
         self._max_lease_s = positive("max_lease_s", max_lease_s, "s")
-        if self._max_lease_s < self.control_dt - self._same_s:
-            step = f"one control step, {self.control_dt} s"
-            raise ConfigurationError(f"max_lease_s = {max_lease_s} s is less than {step}")
         self._min_lease_s = non_negative("min_lease_s", min_lease_s, "s")
-        if self._min_lease_s > self._max_lease_s:
-            raise ConfigurationError(f"min_lease_s = {min_lease_s} s is above max_lease_s = {max_lease_s} s")
+        if self._max_lease_s < max(self.control_dt - self._same_s, self._min_lease_s):
+            raise ConfigurationError(
+                f"max_lease_s = {max_lease_s} s is less than one control step or than min_lease_s = {min_lease_s} s"
+            )
         if self._min_lease_s > 0.0 and not self._filtered:
-            example = "LeaseExpiry(sw.protect(env), ...)"
-            raise ConfigurationError(f"min_lease_s above 0 needs a CBFActionFilter inside: {example}")
+            raise ConfigurationError(
+                "min_lease_s above 0 needs a CBFActionFilter inside: LeaseExpiry(sw.protect(env), ...)"
+            )
         self._blend_steps = whole_steps(non_negative("blend_time", blend_time, "s"), self.control_dt)
         plant = bound_plant(env, plant, fallback, budget.clearance)
         self._budget = BoundBudget(budget, env, plant)
         self._fallback = FallbackController(env, fallback, plant, self._budget.bound)
-        self._admission = None if motion_limits is None else Admission(env, motion_limits, self._low.size)
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._until_s = self._newest_s = -math.inf
         self._command = self._rest()
         self._executed: Array | None = None
-        self._braking = self._chunk_refused = False
-        self._blend: tuple[Array, int] | None = None  # from what, and how many of its steps are done
+        self._braking = False
+        self._fade = Fade()
         self._budget.observe()
         info[keys.LEASE_REMAINING_S] = 0.0
         info[keys.LEASE_REFUSED] = info[keys.LEASE_BRAKING] = False
@@ -150,12 +123,14 @@ class LeaseExpiry(CommandGate):
         covered = now + self.control_dt <= self._until_s + self._same_s
         if covered:
             self._command = self._command if command is None else command
-            if self._braking and self._executed is not None and self._blend_steps:
-                self._blend = self._boxed(self._executed), 0
-            # The env gets a copy as well: it may scale in place what is still in force.
-            sent = self._command.copy() if self._blend is None else self._blended(*self._blend)
+            if self._braking and self._executed is not None:
+                self._fade = Fade(self._boxed(self._executed), self._blend_steps)
+            # The env gets a copy as well: it may scale in place what is still in force. A fade stays in the box, so
+            # that rounding makes no infinity of anything.
+            faded = None if self._fade.over else self._fade(self._boxed(self._command)).astype(self._dtype)
+            sent = self._command.copy() if faded is None else faded
         else:
-            self._blend = None
+            self._fade = Fade()
             sent = self._fallback.command().astype(self._dtype)
         self._braking = not covered
         self._executed, answer = self._execute(sent)
@@ -166,25 +141,18 @@ class LeaseExpiry(CommandGate):
         info[keys.LEASE_BRAKING] = not covered
         return answer
 
-    def admits(self, end: Array, steps: int) -> bool:
-        """Whether the end of a chunk of setpoints is within `motion_limits`; a refusal is in the next step's info."""
-        admitted = self._admission is None or self._admission.admits(end, steps * self.control_dt)
-        self._chunk_refused |= not admitted
-        return admitted
-
     def _accepted(self, given: NDArray[Any] | None, now: float) -> tuple[NDArray[Any] | None, bool]:
         """The command that may be executed, if there is one; whether one was refused. A fresh one gets a lease."""
-        observed_s, refused = self._observed_s, self._chunk_refused
-        self._chunk_refused = False
+        observed_s = self._observed_s
         if observed_s is None:
-            return None, refused
+            return None, False
         from_future = observed_s > now + self._same_s
         if given is None or from_future or observed_s < self._newest_s - self._same_s:
             return None, True
         if observed_s > self._newest_s + self._same_s:
             self._newest_s = observed_s
-            refused |= not self._grant(now)
-        return given, refused
+            return given, not self._grant(now)
+        return given, False
 
     def _grant(self, now: float) -> bool:
         """A new lease for the fresh command; False, and none at all, where it would not last."""
@@ -196,42 +164,3 @@ class LeaseExpiry(CommandGate):
         granted = not math.isnan(longest_s) and lease + self._same_s >= self.control_dt
         self._until_s = now + lease if granted else -math.inf
         return granted
-
-    def _blended(self, start: Array, done: int) -> Any:
-        """The way back to the command in force; in the box, so that rounding makes no infinity of anything."""
-        weight = float(smoothstep((done + 1.0) / (self._blend_steps + 1.0)))
-        self._blend = (start, done + 1) if done + 1 < self._blend_steps else None
-        return (start * (1.0 - weight) + weight * self._boxed(self._command)).astype(self._dtype)
-
-
-class Admission:
-    """Refuses chunks that no motion within the limits could follow to their end; a necessary condition only.
-
-    With arrival "moving" the end may be passed at any speed; with "rest" the machine must be able to stand there in
-    time. Where it is, the lengths and velocities of the MuJoCo actuators say; `controls` is m.
-    """
-
-    def __init__(self, env: Env, motion_limits: Any, controls: int) -> None:
-        self._raw: Any = env.unwrapped
-        model: Any = getattr(self._raw, "model", None)
-        if not isinstance(model, mujoco.MjModel):
-            raise UnsupportedEnvError("motion_limits are for MuJoCo's actuators, whose lengths are read")
-        if not actions_are_controls(env.action_space, *control_range(model)):
-            units = "actions are in other units than the lengths of the actuators"
-            raise ConfigurationError(f"motion_limits: {units}, so that these are no setpoints")
-        limits = settings_from(MotionLimits, motion_limits, "motion_limits")
-        try:
-            of_each = checked_limits(limits.max_acceleration, limits.max_speed)
-            self._acceleration, self._speed = (np.broadcast_to(limit, (controls,)) for limit in of_each)
-        except (TypeError, ValueError) as error:
-            wanted = f"numbers, or one for each of the {controls} action components"
-            raise ConfigurationError(f"motion_limits are {wanted}; got {motion_limits!r}: {error}") from None
-        self._rest = limits.arrival == "rest"
-
-    def admits(self, end: Array, duration_s: float) -> bool:
-        """Whether a chunk may be executed that ends with a command (m,) after so many seconds."""
-        position, velocity = self._raw.data.actuator_length, self._raw.data.actuator_velocity
-        if self._rest:
-            states = (position, velocity, 0.0), (end, 0.0, 0.0)
-            return jerk_limited_time(*states, self._acceleration, self._speed) <= duration_s
-        return bool(admits(end, position, velocity, duration_s, self._speed, self._acceleration).all())

@@ -56,8 +56,9 @@ class StepMonitor(LayerWrapper, ABC):
         whole = self._replay.after(lambda data, _: self._visit(data))
         if not whole:
             message = (
-                f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
-                f"substeps, or MuJoCo has reset it; only the contacts left behind are read (info[{self.partial!r}])"
+                f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs, state or model "
+                "between substeps, or MuJoCo has reset it, or it has actuators with activations under Runge-Kutta; "
+                f"only the contacts left behind are read (info[{self.partial!r}])"
             )
             self._warn_once("partial", message)
             self._forget()
@@ -82,7 +83,8 @@ class ContactMonitor(StepMonitor):
     """Reports forces and violations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
-    of its own. An env that changes its inputs or its state between substeps cannot be replayed (`contact/partial`).
+    of its own. An env that changes its inputs or its state between substeps cannot be replayed, nor can actuators
+    with activations under Runge-Kutta (`contact/partial`).
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
@@ -93,6 +95,9 @@ class ContactMonitor(StepMonitor):
     Info, at every step: ``contact/peak_force`` (N), ``contact/penetration`` (m), ``contact/residual`` (N m; 0 for
     rigid contacts), NaN where the simulation's contacts are not finite, and ``contact/partial`` (bool), see
     `safe_wrappers.info`. After a reset they are 0 and False.
+
+    Attributes:
+        peak_bodies: Names of the two bodies that had the `contact/peak_force` of the last step; None: there was none.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model.
@@ -108,6 +113,7 @@ class ContactMonitor(StepMonitor):
         True
     """
 
+    peak_bodies: tuple[str, ...] | None
     partial: ClassVar = keys.CONTACT_PARTIAL
     nothing: ClassVar = dict.fromkeys(
         (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL), 0.0
@@ -123,21 +129,12 @@ class ContactMonitor(StepMonitor):
         self.bodies, self.against, self._model = bodies, against, None
         self._forget()
 
-    @property
-    def peak_bodies(self) -> tuple[str, str] | None:
-        """Names of the two bodies that had the `contact/peak_force` of the last step; None where there was none."""
-        if self._peak_bodies is None:
-            return None
-        model = self._raw.model
-        first, second = (model.body(i).name if i < model.nbody else "" for i in self._peak_bodies)
-        return first, second
-
     def _forget(self) -> None:
         if self._model is not self._raw.model:
             self._model = self._raw.model
             self._contacts = ContactReader(self._model, between(self._model, self.bodies, self.against))
         self._contacts.clear()
-        self._peak_bodies: Any = None
+        self.peak_bodies = None
 
     def _visit(self, data: mujoco.MjData) -> None:
         self._contacts.read(data)
@@ -157,7 +154,9 @@ class ContactMonitor(StepMonitor):
             key = step, min(one, other), max(one, other)
             pairs[key] = pairs.get(key, 0.0) + force
         peak = max(pairs, key=pairs.__getitem__)
-        self._peak_bodies = peak[1:] if pairs[peak] > 0.0 else None
+        model = self._raw.model
+        names = (model.body(i).name if i < model.nbody else "" for i in peak[1:])
+        self.peak_bodies = tuple(names) if pairs[peak] > 0.0 else None
         return {
             keys.CONTACT_PEAK_FORCE: max(pairs[peak], 0.0),
             keys.CONTACT_PENETRATION: float(penetration.max()),

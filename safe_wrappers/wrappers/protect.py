@@ -33,8 +33,8 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
         env: Made by `gymnasium.make`; its id without the version selects the recipe. Or a `SyncVectorEnv` of one id.
         options: Those of `CBFActionFilter`, with `margin` added to the recipe's own. SafePointGoal also takes
             `detour` (go around a hazard instead of stopping before it, default True) and `uncertainty` (of mass and
-            damping, a fraction, default 0); SafeCarGoal takes `detour`; Fetch takes `keep_out` (obstacles for its
-            fingers).
+            damping, a fraction, default 0; above 0 nothing is proved); SafeCarGoal takes `detour`; Fetch takes
+            `keep_out` (obstacles for its fingers).
 
     Raises:
         UnsupportedEnvError: No env, or no recipe for it; the message has the lines that protect it by hand.

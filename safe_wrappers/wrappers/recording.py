@@ -3,7 +3,6 @@
 import math
 import pkgutil
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -129,7 +128,6 @@ class RecordInterventions(LayerWrapper):
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
         self._return = 0.0
-        self._at_reset = _told(info)
         self._steps: list[dict[str, Any]] = []
         return observation
 
@@ -140,7 +138,7 @@ class RecordInterventions(LayerWrapper):
         self._return += float(reward) + float(penalties)
         self._steps.append(_told(info))
         if terminated or truncated:
-            figures = {one.name: _figure(one, self._at_reset, self._steps) for one in keys.EPISODE}
+            figures = {one.name: _figure(one, self._steps) for one in keys.EPISODE}
             summary = {"length": len(self._steps), "return": self._return}
             summary |= {name: value for name, value in figures.items() if value is not None}
             info[keys.EPISODE_SUMMARY] = summary
@@ -152,22 +150,15 @@ def _told(info: dict[str, Any]) -> dict[str, Any]:
     return {name: np.array(info[name]) for name in _OF_FIGURES if name in info}
 
 
-def _figure(
-    figure: keys.EpisodeFigure, at_reset: dict[str, Any], steps: list[dict[str, Any]]
-) -> int | float | None:
+def _figure(figure: keys.EpisodeFigure, steps: list[dict[str, Any]]) -> int | float | None:
     """A figure of an episode; None if nobody reported it, or for a 0 that is not of every step. NaN is no report."""
     how, of = figure.how, [keys.KEYS[name] for name in figure.of]
     numbers: list[Any] = []
-    if how == "onsets":  # of entries that are True at the reset none is counted
-        flags = [step[name] for step in (at_reset, *steps) for name in figure.of if name in step]
-        first = [] if figure.of[0] in at_reset else [0] * len(flags[:1])
-        numbers = first + [int((now & ~before).sum()) for before, now in pairwise(flags)]
-    else:
-        for step in steps:
-            told = [n for key in of if key.name in step and (n := key.number(step[key.name])) == n]
-            if told:
-                above_zero = how == "count" and of[0].dtype != "int64"
-                numbers.append(max(told) > 0.0 if above_zero else told[0])
+    for step in steps:
+        told = [n for key in of if key.name in step and (n := key.number(step[key.name])) == n]
+        if told:
+            above_zero = how == "count" and of[0].dtype != "int64"
+            numbers.append(max(told) > 0.0 if above_zero else told[0])
     if how == "min":
         return min(filter(math.isfinite, numbers), default=None)
     if how == "last":

@@ -2,26 +2,23 @@
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from itertools import chain, combinations, pairwise, product
+from itertools import combinations, pairwise, product
 from typing import Any, ClassVar, Final
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import ArrayLike
 
 from safe_wrappers.constraints.obstacles import Box, Plane, Round, TrackedDiscs
 from safe_wrappers.constraints.points import Workspace
 from safe_wrappers.errors import Array, ConfigurationError
-from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.env_checks import name_of
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step
 from safe_wrappers.wrappers.stack import Layer
-from safe_wrappers.wrappers.strip import ACTIONS, STEPS, with_strip, words_of
+from safe_wrappers.wrappers.strip import STEPS, state_of, with_strip
 
 Mark = dict[str, Any]
 """One shape, as `add_marker` of Gymnasium's viewers takes it."""
@@ -38,21 +35,19 @@ _THIN: Final = 0.012  # m: half the width of a line
 _FLOOR: Final = 0.02  # m: the height at which what has no height is drawn, just above a floor at 0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _CIRCLE: Final = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.linspace(0.0, 2.0 * np.pi, 17)])
-_LENGTH, _THICKNESS = 4.0, 0.3  # of the longest arrow, in sizes of the body
 
 
 class SafetyOverlay(LayerWrapper):
     """Draws what the filter inside knows and does into the env's own frames.
 
     In MuJoCo's scene, in frames and in the window: the obstacles of every constraint with what is kept free around
-    them, and the way that its trajectory takes from here; the proposed action as an orange arrow and the executed one
-    as a blue one, where it is known which way an action pushes. Over the lower edge of a frame a strip: what was done
-    to the last action, margin, lease and slip as far as they are in info, a column per step as high as the margin,
-    and the actions as bars. Envs that are not MuJoCo's get the strip alone; so does an env without a filter.
+    them, and the way that its trajectory takes from here. Over the lower edge of a frame a strip: a column per step,
+    in the colour of what was done to its action. Envs that are not MuJoCo's get the strip alone; so does an env
+    without a filter.
 
     It only looks: actions, observations, rewards, infos and random numbers are bit for bit those without it.
 
-    A window shows the marks of the state before the step, and the strip's words in its corner. Set no state by hand
+    A window shows the marks of the state before the step, and in its corner what was done. Set no state by hand
     between `render` and `step`.
 
     Args:
@@ -78,14 +73,11 @@ class SafetyOverlay(LayerWrapper):
                 f"make the env with gym.make(..., render_mode={' or '.join(map(repr, modes))})"
             )
         self._inside = filter_inside(env)
-        self._infos: deque[dict[str, Any]] = deque(maxlen=STEPS)
-        self._bounds: tuple[Array, Array] | None = None
-        if isinstance(env.action_space, spaces.Box) and env.action_space.is_bounded():
-            self._bounds = np.ravel(env.action_space.low), np.ravel(env.action_space.high)
+        self._states: deque[str] = deque(maxlen=STEPS)
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
-        self._infos.clear()
-        self._infos.append(dict(info))
+        self._states.clear()
+        self._states.append(state_of(info))
         return observation
 
     def step(self, action: Any) -> Step:
@@ -93,35 +85,31 @@ class SafetyOverlay(LayerWrapper):
         if self.render_mode == "human":
             self._prepare()
         observation, reward, terminated, truncated, info = self._pass_on(action)
-        self._infos.append(dict(info))
+        self._states.append(state_of(info))
         return observation, reward, terminated, truncated, info
 
     def render(self) -> Any:
         """The env's frame with the overlay, of the same shape."""
         self._prepare()
         frame = self.env.render()
-        return with_strip(frame, self._infos, self._bounds) if isinstance(frame, np.ndarray) else frame
+        return with_strip(frame, self._states) if isinstance(frame, np.ndarray) else frame
 
     def marks(self) -> list[Mark]:
         """What is drawn into the scene in the present state; nothing before a reset, or without a filter."""
-        if not self._infos or self._inside is None:
+        if not self._states or self._inside is None:
             return []
-        specs = [bound.spec for bound in self._inside.look()]
-        found = [one for spec in specs for one in marks_of(spec)]
-        if specs and all(key in self._infos[-1] for key in ACTIONS):
-            found += _arrows(self._inside.plant, specs, self._infos[-1])
-        return found
+        return [one for bound in self._inside.look() for one in marks_of(bound.spec)]
 
     def _prepare(self) -> None:
-        """Have the next frame show the present marks, and a window the strip's words."""
+        """Have the next frame show the present marks, and a window what was done."""
         renderer = find_renderer(self.env)
         if renderer is None:
             return
         viewer = renderer._get_viewer(str(self.render_mode))
         for one in self.marks()[:MOST_MARKS]:
             viewer.add_marker(**one)
-        for word in words_of(self._infos[-1]) if self.render_mode == "human" and self._infos else ():
-            viewer.add_overlay(2, word, "")  # mjGRID_BOTTOMLEFT
+        if self.render_mode == "human" and self._states:
+            viewer.add_overlay(2, self._states[-1], "")  # mjGRID_BOTTOMLEFT
 
 
 def find_renderer(env: Env) -> Any | None:
@@ -149,15 +137,11 @@ def marks_of(spec: Any) -> list[Mark]:
     found = [line for j in range(way.shape[1]) for line in _lines(WAY, way[:, j])]
     found += [mark("SPHERE", WAY, point, [max(radius, _THIN), 0.0, 0.0]) for point in way[-1]]
     obstacles = [one for name in ("obstacles", "keep_out", "untouched") for one in getattr(spec, name, ())]
-    if isinstance(spec, Workspace):
-        low, high = spec.low or [None] * 3, spec.high or [None] * 3
-        if None in (*low, *high):
-            walls = zip([*low, *high], np.vstack([np.eye(3), -np.eye(3)]), strict=True)
-            obstacles += [Plane(abs(normal) * v, normal) for v, normal in walls if v is not None]
-        else:
-            corners = [*product(*np.transpose([np.array(low) + inset, np.array(high) - inset]))]
-            edges = [ends for ends in combinations(np.array(corners), 2) if (ends[0] != ends[1]).sum() == 1]
-            found += [line for ends in edges for line in _lines(LIMIT, ends, _THIN / 3.0)]
+    sides = [*(spec.low or [None]), *(spec.high or [None])] if isinstance(spec, Workspace) else [None]
+    if None not in sides:
+        corners = [*product(*np.transpose([np.array(spec.low) + inset, np.array(spec.high) - inset]))]
+        edges = [ends for ends in combinations(np.array(corners), 2) if (ends[0] != ends[1]).sum() == 1]
+        found += [line for ends in edges for line in _lines(LIMIT, ends, _THIN / 3.0)]
     here = way[0, 0] if way.shape[1] else np.zeros(3)
     return found + [one for obstacle in obstacles for one in _around(obstacle, spec.plant, inset, here)]
 
@@ -183,40 +167,8 @@ def _around(obstacle: Any, plant: Plant, inset: float, here: Array) -> list[Mark
     return [line for center in _spatial(centers) for line in _lines(LIMIT, center + radius * _CIRCLE)]
 
 
-def _arrows(plant: Plant, specs: Sequence[Any], info: dict[str, Any]) -> list[Mark]:
-    """Two at a machine, the executed one above; none where it is not known which way an action pushes."""
-    if isinstance(plant, DisplacementPlant):
-        body, ways = plant.named("body", plant.gripper), np.eye(3, plant.lower.size)
-        at, _ = plant.motion("body", plant.gripper)
-    elif isinstance(plant, MujocoPlant) and plant.lower.size <= 2:  # an arrow shows no more numbers
-        bodies = [(getattr(spec, "body", None), *getattr(spec, "bodies", ())) for spec in specs]
-        named = [plant.named("body", name) for name in chain(*bodies) if name]
-        moving = np.unique(plant.model.jnt_bodyid)
-        if not named and len(moving) != 1:
-            return []
-        body = named[0] if named else int(moving[0])
-        data, jacobian = plant.forward(), np.zeros((3, plant.model.nv))
-        mujoco.mj_jacBodyCom(plant.model, data, jacobian, None, body)
-        at, ways = data.xipos[body].copy(), jacobian @ plant.acceleration[1]  # 0 where it only turns
-    else:
-        return []
-    # The longest push of a corner of the box has the full length; beyond `acting_range` nothing pushes harder.
-    low, high = plant.acting_range
-    reach = float(np.linalg.norm(np.abs(ways) @ np.maximum(np.abs(low), np.abs(high))))
-    size = float(plant.model.geom_rbound[plant.model.geom_bodyid == body].max(initial=0.0))
-    width, scale, found = _THICKNESS * size, _LENGTH * size / max(reach, 1e-9), []
-    for height, (key, colour) in zip((1.0, 1.7), ACTIONS.items(), strict=True):
-        vector = ways @ np.clip(info[key], low, high) * scale
-        length = float(np.linalg.norm(vector))
-        if length > width:  # a shorter one is all head
-            rgba, tail = (*np.array(colour) / 255.0, 1.0), at + height * size * _UP
-            # MuJoCo draws an arrow half as long as its size says.
-            found.append(mark("ARROW", rgba, tail, [width, width, 2.0 * length], vector))
-    return found
-
-
 def mark(shape: str, colour: Sequence[float], position: Array, size: ArrayLike, along: Array = _UP) -> Mark:
-    """A shape about a point (an arrow from it), its z axis along a vector, its size as for `mujoco.mjv_initGeom`."""
+    """A shape about a point, its z axis along a vector, its size as for `mujoco.mjv_initGeom`."""
     turn, axes = np.zeros(4), np.zeros(9)
     mujoco.mju_quatZ2Vec(turn, along)
     mujoco.mju_quat2Mat(axes, turn)

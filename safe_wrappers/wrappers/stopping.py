@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,8 +73,10 @@ class StoppingBudget:
         if isinstance(given, dict | Constraint):
             object.__setattr__(self, "clearance", constraint_from(given))
         elif isinstance(given, type) or not callable(given):
-            function = "a function of the env that returns clearances in m and approach speeds in m/s"
-            raise ConfigurationError(f"clearance is a constraint or {function}; got {given!r}")
+            raise ConfigurationError(
+                "clearance is a constraint, or a function of the env that returns clearances in m and approach "
+                f"speeds in m/s; got {given!r}"
+            )
         for names, check, unit in _CHECKS:
             check_fields(self, check, names, unit)
         takes, more = {"closing_speed"}, set()
@@ -113,9 +115,6 @@ class BoundBudget:
         clearance: At the last `measure`, m, shape (k,); of a constraint that measures no approach, its room.
         speed: Approach speeds then, m/s, shape (k,); `closing_speed` of a constraint that measures none.
     """
-
-    clearance: Array
-    speed: Array
 
     def __init__(self, budget: StoppingBudget, env: Env, plant: Plant | None) -> None:
         self._budget, self._env = budget, env
@@ -213,8 +212,9 @@ class FallbackController:
         self.plant, self._bound = plant, bound
         known = bound is not None and bound.may_back_up
         if choice == "brake" and plant is not None and not (known or plant.can_brake):
-            others = f'with a {type(plant).__name__} choose "hold", "zero" or a function of the plant'
-            raise ConfigurationError(f'"brake" needs a MujocoPlant; {others}')
+            raise ConfigurationError(
+                '"brake" needs a MujocoPlant; choose "hold", "zero" or a function of the plant'
+            )
         self._fallback = Fallback(choice, [] if bound is None else [bound])
         self.reset()
 
@@ -245,10 +245,6 @@ class CommandGate(LayerWrapper, CommandReceiver):
     """Base of `LeaseExpiry` and `TeleopChannel`; the env has a one-dimensional Box action space."""
 
     _fallback: FallbackController | None = None
-    _whose: ClassVar[str]
-    """Whose actions it is given, in warnings."""
-    _not_sent: ClassVar[str]
-    """What happens instead with one that is not finite."""
 
     def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
@@ -280,8 +276,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
         """The action itself, or clipped where no filter inside does that; None if it is not finite. It warns once."""
         self._clipped = 0.0
         if not np.isfinite(action).all():
-            message = f"the {self._whose} action is not finite ({action}); {self._not_sent}"
-            self._warn_once("nonfinite", message)
+            self._warn_once("nonfinite", f"the policy's action is not finite ({action}); it is not executed")
             return None
         if self._filtered:
             return action
@@ -289,7 +284,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
         self._clipped = math.hypot(*(boxed - action).ravel())  # 1e300 does not overflow in it
         if not self._clipped:
             return action
-        message = f"the {self._whose} action left the action space by {self._clipped:.3g}; it is clipped"
+        message = f"the policy's action left the action space by {self._clipped:.3g}; it is clipped"
         self._warn_once("outside", f"{message} (action/clipped)")
         return boxed.astype(self._dtype)
 

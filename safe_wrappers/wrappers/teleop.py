@@ -67,12 +67,10 @@ class Line:
     """The packets of one direction, with random numbers of their own; times closer than `slack_s` are the same.
 
     Attributes:
-        coming: Those on their way, in the order of sending, each with the time at which it arrives, s.
+        coming: Those on their way, in the order of sending, each with the time, s, from which it only waits for those
+            before it.
         newest: The last one that has arrived.
     """
-
-    coming: deque[tuple[float, Packet]]
-    newest: Packet
 
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:
         self._link, self._slack_s = link, slack_s
@@ -81,8 +79,7 @@ class Line:
     def reset(self, env: Env, seed: int | None, first: Any = None) -> None:
         """Nothing is on its way, and `first`, made at 0 s, has arrived; call it after the env's own reset."""
         self._random.reset(env, seed)
-        self.coming = deque()
-        self._latest_s = -math.inf
+        self.coming: deque[tuple[float, Packet]] = deque()
         self.newest = Packet(first, 0.0)
 
     def send(self, packet: Packet, now_s: float) -> bool:
@@ -92,8 +89,7 @@ class Line:
         jitter_s = self._random.draw.uniform(0.0, link.jitter_s) if link.jitter_s else 0.0
         lost = bool(link.loss and self._random.draw.random() < link.loss)
         if not lost:
-            self._latest_s = max(now_s + link.delay_s + jitter_s, self._latest_s)
-            self.coming.append((self._latest_s, packet))
+            self.coming.append((now_s + link.delay_s + jitter_s, packet))
         return lost
 
     def receive(self, now_s: float) -> list[Packet]:
@@ -149,8 +145,6 @@ class TeleopChannel(CommandGate):
     """
 
     layer: ClassVar = Layer.CHANNEL
-    _whose: ClassVar = "operator's"
-    _not_sent: ClassVar = "it is not sent"
 
     def __init__(
         self,
@@ -173,8 +167,10 @@ class TeleopChannel(CommandGate):
         self._waves: WaveCoding | None = None
         if impedance is not None:
             if self._port is None:
-                published = "port_flow, port_effort_observed, port_feedthrough and port_effort_acted"
-                raise ConfigurationError(f"waves need a port: {env.unwrapped!r} publishes no {published}")
+                raise ConfigurationError(
+                    f"waves need a port: {env.unwrapped!r} publishes no port_flow, port_effort_observed, "
+                    "port_feedthrough and port_effort_acted"
+                )
             refuse_changed_actions(env)
             self._waves = WaveCoding(self._port, self.control_dt, positive("impedance", impedance, "N s/m"))
         self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
@@ -185,8 +181,9 @@ class TeleopChannel(CommandGate):
         if budget is not None:
             budget = settings_from(StoppingBudget, budget, "budget", ", or None")
             if not budget.measures_approach:
-                name = type(budget.clearance).__name__
-                raise ConfigurationError(f"{name} does not say how fast it is approached: give a Clearance")
+                raise ConfigurationError(
+                    f"{budget.clearance} does not say how fast it is approached: give a Clearance"
+                )
             refuse_changed_actions(env)
             plant = bound_plant(env, plant, fallback, budget.clearance)
             self._fallback = FallbackController(env, fallback, plant)
@@ -243,13 +240,11 @@ class TeleopChannel(CommandGate):
 
     def _judge(self, budget: BoundBudget, command: Array, seen_s: float, now_s: float) -> None:
         """Revoke authority, or give it back, for a command (m,) made from the image that was taken at `seen_s`."""
-        allowed_s = self._ceiling_s
-        if self.revoked and allowed_s > 0.0:
-            allowed_s *= _RELEASE
-        trusted = budget.readable and now_s - seen_s <= allowed_s + self._same_s
+        allowed_s, since_s = self._ceiling_s, -math.inf
         if self.revoked:
-            trusted = trusted and seen_s >= self._revoked_s - self._same_s
-        trusted = trusted and budget.can_stop_after(command, self.control_dt)
+            allowed_s, since_s = min(_RELEASE * allowed_s, allowed_s), self._revoked_s
+        in_time = now_s - seen_s <= allowed_s + self._same_s and seen_s >= since_s - self._same_s
+        trusted = budget.readable and in_time and budget.can_stop_after(command, self.control_dt)
         if not trusted and not self.revoked:
             self._revoked_s = now_s
         self.revoked = not trusted

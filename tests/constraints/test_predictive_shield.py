@@ -126,9 +126,6 @@ def test_nothing_is_proved_on_a_plant_that_was_not_checked():
     for options, promise in (({}, "proved"), ({"check_steps": 0}, "best effort")):
         env = sw.CBFActionFilter(Cart(), [shield()], plant=sw.SimulatorPlant(**options))
         assert env.constraints[0].promise == promise
-    logs = sw.plants.log_steps(Cart(), episodes=20, max_steps=20)
-    env = sw.CBFActionFilter(Cart(), [shield(horizon=5)], plant=sw.IdentifiedPlant(logs))
-    assert env.constraints[0].promise == "best effort"
 
 
 def test_without_one_the_horizon_is_all_that_is_looked_at():

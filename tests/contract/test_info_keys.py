@@ -10,20 +10,11 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.wrappers.faults import RepeatedCommands
 
-
-def identified(env):
-    """A filter whose plant was fitted to logged steps."""
-    plant = sw.IdentifiedPlant(sw.plants.log_steps(env, episodes=20, max_steps=20))
-    shield = sw.constraints.PredictiveShield(lambda x: 7.0 - abs(x[2]), 2)
-    return sw.CBFActionFilter(env, [shield], plant=plant)
-
-
 MORE = [
     lambda: sw.RecordInterventions(RepeatedCommands(gym.make("Pendulum-v1", max_episode_steps=20), 0.5)),
     lambda: gym.make("FlexJointReach-v0"),
     lambda: gym.make("SafeRover-v0"),
     lambda: gym.make("PatrolledPointMaze-v0"),
-    lambda: identified(gym.make("Pendulum-v1")),
 ]
 """What writes the keys that no exported wrapper writes on the tasks of the contract."""
 

@@ -18,7 +18,6 @@ import daqp
 import gymnasium as gym
 import numpy as np
 import pytest
-import scipy.optimize
 from episodes import actions, plain, trace
 from wrapper_examples import CHUNKED, EXAMPLES, EXPORTED, FILTERS, INSIDE, ONLY_LOOKING, build
 
@@ -220,7 +219,6 @@ def test_a_solver_that_fails(session, kind):
 
     with (
         mock.patch.object(daqp, "solve", failing),
-        mock.patch.object(scipy.optimize, "nnls", mock.Mock(side_effect=BrokenError("broken, too"))),
         mock.patch.object(clarabel, "DefaultSolver", mock.Mock(side_effect=BrokenError("broken, too"))),
     ):
         answer = session.step(session.actions[BEFORE])

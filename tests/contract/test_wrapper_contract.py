@@ -100,6 +100,62 @@ def test_what_is_not_plain_data_is_still_recorded_for_gym_make():
     assert again.plant is not env.plant  # each filter reads its own env
 
 
+class Forwarding(sw.ActionRepeat):
+    """A user's own, which passes on what it is given."""
+
+    def __init__(self, env, *more, **named):
+        super().__init__(env, *more, **named)
+
+
+class EnvLast(sw.ActionRepeat):
+    def __init__(self, repeat, env):
+        super().__init__(env, repeat)
+
+
+class Swallowing(sw.ActionRepeat):
+    def __init__(self, *more, **named):
+        super().__init__(*more, **named)
+
+
+class OwnNew(sw.ActionRepeat):
+    def __new__(cls, env, repeat, passed_on=True):
+        return super().__new__(cls, env, repeat=repeat) if passed_on else super().__new__(cls)
+
+    def __init__(self, env, repeat, passed_on=True):
+        super().__init__(env, repeat)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda env: Forwarding(env, repeat=3),
+        lambda env: EnvLast(3, env),
+        lambda env: Swallowing(env, repeat=3),
+        lambda env: Swallowing(env=env, repeat=3),
+        lambda env: OwnNew(env, 3),
+    ],
+)
+def test_a_subclass_is_made_again_with_what_it_was_given_by_name(made):
+    env = made(gym.make(TASK))
+    assert env.spec.additional_wrappers[-1].kwargs.items() >= {"repeat": 3}.items()
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert type(again) is type(env) and again.repeat == 3
+
+
+@pytest.mark.parametrize("made", [lambda env: Forwarding(env, 3), lambda env: OwnNew(env, 3, False)])
+def test_what_has_no_name_is_not_made_again_by_defaults(made):
+    env = made(gym.make(TASK))
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    with pytest.raises(TypeError, match=r"unexpected keyword argument '\*"):
+        gym.make(env.spec)
+
+
+def test_arguments_that_do_not_fit_are_said_with_the_class_s_name():
+    with pytest.raises(TypeError, match=r"ActionRepeat\.__init__\(\).*'times'"):
+        sw.ActionRepeat(gym.make(TASK), times=3)
+
+
 # 3: spaces and check_env --------------------------------------------------------------------------------------
 
 

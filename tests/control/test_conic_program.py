@@ -58,3 +58,12 @@ def test_what_has_no_answer_is_said_to_have_none():
     assert by_clarabel(nearest([0.0], rows=rows, limits=limits)) == "infeasible"
     assert by_clarabel(nearest([0.0], equal=rows, values=limits)) == "infeasible"
     assert by_clarabel(nearest([0.0], rows=rows, limits=np.array([-1.0, np.inf]))) == pytest.approx([-1.0])
+
+
+@pytest.mark.parametrize("part", ["equal", "values", "rows", "limits", "cones"])
+def test_what_is_no_number_is_failed_and_not_infeasible(part):
+    rows = np.array([[1.0], [-1.0]])
+    parts = {"equal": rows[:1], "values": np.ones(1), "rows": rows, "limits": np.ones(2)}
+    parts["cones"] = np.ones((1, 3, 1))
+    parts[part].flat[0] = np.nan
+    assert by_clarabel(nearest([0.0], **parts)) == "failed"

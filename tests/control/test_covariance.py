@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import blind_covariance, double_integrator_covariance
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from safe_wrappers.control.estimation import discretise
@@ -22,20 +21,6 @@ def random_system(seed, n):
     a = rng.normal(size=(n, n))
     root, start = rng.normal(size=(n, rng.integers(1, n + 1))), rng.normal(size=(n, n))
     return a, root @ root.T, start @ start.T
-
-
-def integrated(rate, start, time):
-    """The matrix equation P' = rate(P) by a stiff solver that knows nothing of exponentials."""
-    shape = start.shape
-    solved = solve_ivp(
-        lambda _, p: rate(p.reshape(shape)).ravel(),
-        (0, time),
-        start.ravel(),
-        method="LSODA",
-        rtol=1e-11,
-        atol=1e-13,
-    )
-    return solved.y[:, -1].reshape(shape)
 
 
 def quadrature(integrand, time):
@@ -101,30 +86,3 @@ def test_the_double_integrator_agrees_with_its_closed_form(p, correlation, v, in
     deviation = np.sqrt(np.diag(closed))
     scale = np.outer(deviation, deviation)
     np.testing.assert_array_less(np.abs(closed - exact), 1e-10 * scale + 1e-300)
-
-
-def test_the_regimes_of_growth():
-    for t in (1.0, 4.0):
-        grown = blind_covariance(np.zeros((1, 1)), [[0.0]], [[3.0]], t).item()
-        assert grown == pytest.approx(3.0 * t, rel=1e-13)
-        unstable = blind_covariance(np.full((1, 1), 2.0), [[0.5]], [[0.0]], t).item()
-        assert unstable == pytest.approx(2.0 * np.exp(t), rel=1e-12)
-    bounded = blind_covariance(np.zeros((1, 1)), [[-2.0]], [[1.0]], 50.0).item()
-    assert bounded == pytest.approx(0.25)
-
-
-@given(seeds, sizes, times, times)
-def test_blind_over_one_time_and_then_another_is_blind_over_both(seed, n, first, second):
-    a, q, start = random_system(seed, n)
-    both = blind_covariance(start, a, q, first + second)
-    split = blind_covariance(blind_covariance(start, a, q, first), a, q, second)
-    np.testing.assert_allclose(split, both, rtol=1e-8, atol=1e-10 * np.abs(both).max())
-
-
-@settings(max_examples=25)
-@given(seeds, st.integers(1, 3), st.floats(0.01, 4.0))
-def test_growth_is_the_integrated_equation(seed, n, time):
-    a, q, start = random_system(seed, n)
-    expected = integrated(lambda p: a @ p + p @ a.T + q, start, time)
-    grown = blind_covariance(start, a, q, time)
-    np.testing.assert_allclose(grown, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
-from scipy.stats import chi2
 
 from safe_wrappers.control.estimation import discretise, predict, update
 
@@ -78,56 +77,3 @@ def test_ever_faster_sampling_becomes_the_filter_in_continuous_time():
             cov = update(mean, cov, np.zeros(1), c, r * steps)[1]
         errors.append(np.abs(cov - exact).max() / np.abs(exact).max())
     assert errors[0] < 5e-3 and errors[1] == pytest.approx(errors[0] / 2, rel=0.05)
-
-
-# Consistency ------------------------------------------------------------------------------------------------------
-
-RUNS, SIGHT, STEP_S, SUBSTEPS, INTENSITY, NOISE = 1000, 40, 0.05, 25, 0.3, 0.02
-SEEN, C, R = np.eye(2), np.array([[1.0, 0.0]]), np.array([[NOISE]])
-
-
-def errors_over_time(believed_intensity, seed):
-    """NEES of RUNS runs of a double integrator with a constant pull, SIGHT steps seen and as many blind.
-
-    The truth is integrated in small steps of its own, so it shares no formula with the filter.
-    """
-    rng = np.random.default_rng(seed)
-    pull = np.array([0.0, -0.5])
-    transition, drift, noise = discretise(INTEGRATOR, np.diag([0.0, believed_intensity]), STEP_S, pull)
-    prior = np.array([[0.2, 0.05], [0.05, 0.1]])
-    truth = rng.multivariate_normal([1.0, -1.0], prior, size=RUNS)
-    mean, cov = np.tile([1.0, -1.0], (RUNS, 1)), np.tile(prior, (RUNS, 1, 1))
-    h = STEP_S / SUBSTEPS
-    for k in range(2 * SIGHT):
-        for _ in range(SUBSTEPS):
-            speed = truth[:, 1] + h * pull[1] + rng.normal(0.0, np.sqrt(INTENSITY * h), RUNS)
-            truth = np.stack([truth[:, 0] + 0.5 * h * (truth[:, 1] + speed), speed], axis=-1)
-        mean, cov = predict(mean, cov, transition, noise, drift)
-        if k < SIGHT:
-            measured = truth[:, :1] + rng.normal(0.0, np.sqrt(NOISE), (RUNS, 1))
-            mean, cov = update(mean, cov, measured, C, R)
-        error = truth - mean
-        yield (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(axis=-1)
-
-
-def band(confidence=0.95):
-    """In which the mean of RUNS squared errors of two numbers lies: chi-square."""
-    return chi2.interval(confidence, 2 * RUNS, scale=1.0 / RUNS)
-
-
-@pytest.mark.parametrize("phase", ["seen", "blind"])
-def test_the_errors_are_as_large_as_the_filter_says(phase):
-    low, high = band()
-    means = np.array([nees.mean() for nees in errors_over_time(INTENSITY, seed=6)])
-    ends = {"seen": means[SIGHT - 1], "blind": means[-1]}
-    assert low <= ends[phase] <= high
-    # Along the phase the means are correlated: more than 5 % may leave the band, but not far.
-    part = means[:SIGHT] if phase == "seen" else means[SIGHT:]
-    wide = band(0.99999)
-    assert wide[0] <= part.min() and part.max() <= wide[1]
-
-
-def test_a_filter_that_believes_in_less_noise_is_found_out():
-    _, high = band()
-    means = np.array([nees.mean() for nees in errors_over_time(0.5 * INTENSITY, seed=6)])
-    assert means[SIGHT - 1] > high and means[-1] > high

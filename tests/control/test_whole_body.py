@@ -20,6 +20,7 @@ from safe_wrappers.control.whole_body import (
     solve_cone,
     solve_pyramid,
 )
+from safe_wrappers.errors import ConfigurationError
 
 UP = np.array([0.0, 0.0, 1.0])
 SOLVERS = {
@@ -301,3 +302,24 @@ def test_a_backend_is_not_believed(monkeypatch, lie):
     assert found.status == ("infeasible" if lie == "claims infeasible" else "failed")
     assert np.isfinite(found.control).all() and (np.abs(found.control) <= 100.0).all()
     assert np.isfinite(found.forces).all() and np.isfinite(found.acceleration).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["inertia", "jacobians", "friction", "nominal", "contact_acceleration"])
+def test_what_is_not_finite_is_refused_by_name(name, value):
+    problem = foot([0.0] * 3)
+    given = np.array(getattr(problem, name), dtype=float)
+    given.flat[0] = value
+    with pytest.raises(ConfigurationError, match=f"^{name} must"):
+        dataclasses.replace(problem, **{name: given})
+
+
+def test_a_friction_below_zero_is_refused():
+    with pytest.raises(ConfigurationError, match="friction must be at least 0"):
+        foot([0.0] * 3, friction=-0.1)
+
+
+@pytest.mark.parametrize("solve", SOLVERS.values())
+def test_numbers_that_overflow_inside_are_failed_with_a_finite_control(solve):
+    found = solve(dataclasses.replace(robot(1), bias=np.full(8, 1.7e308)))
+    assert found.status == "failed" and np.isfinite(found.control).all()

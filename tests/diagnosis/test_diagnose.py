@@ -10,7 +10,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers import diagnosis
-from safe_wrappers.diagnosis import SYMPTOMS, Diagnosis, Finding, attacker, diagnose, policy_driver, record
+from safe_wrappers.diagnosis import SYMPTOMS, Finding, attacker, diagnose, policy_driver, record
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
 
 pytest.importorskip("gymnasium_robotics")
@@ -19,20 +19,25 @@ from tests.diagnosis.planted import CART, HEALTHY, PLANTED, STOPPED, Bench, wavi
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 
+def found(*driven, **options):
+    """The findings by the name of their symptom, the most severe first."""
+    return {finding.symptom: finding for finding in diagnose(*driven, **options)}
+
+
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_fault_ranks_first_and_its_lines_halve_the_figure(name):
     symptom, steps, make = PLANTED[name]
-    first = diagnose(*make(), steps=steps).present[0]
-    assert first.symptom == symptom
+    first = diagnose(*make(), steps=steps)[0]
+    assert first.present and first.symptom == symptom
     env, policy = make()
     scope = {"env": env, "sw": sw}
     exec(first.code, scope)
-    assert diagnose(scope["env"], policy, steps).finding(symptom).figure <= 0.5 * first.figure
+    assert found(scope["env"], policy, steps)[symptom].figure <= 0.5 * first.figure
 
 
 @pytest.mark.parametrize("name", HEALTHY)
 def test_a_healthy_env_has_no_symptom(name):
-    assert not diagnose(*HEALTHY[name](), steps=200).present
+    assert not any(finding.present for finding in diagnose(*HEALTHY[name](), steps=200))
 
 
 def test_the_env_is_left_as_it_was_and_two_diagnoses_are_the_same():
@@ -66,49 +71,60 @@ class Drifting(gym.Env):
 def test_an_env_of_ones_own_is_simulated_while_it_is_diagnosed_and_nothing_leaks():
     env = Drifting()
     with warnings.catch_warnings(action="error"):
-        finding = diagnose(env, steps=300).finding("limits")
+        finding = found(env, steps=300)["limits"]
     scope = {"env": env, "sw": sw}
     exec(finding.code, scope)
     assert "PredictiveShield" in finding.code
-    assert diagnose(scope["env"], steps=300).finding("limits").figure < finding.figure
+    assert found(scope["env"], steps=300)["limits"].figure < finding.figure
     stopping = lambda seen: [np.clip(-10.0 * seen[1], -1.0, 1.0)]  # noqa: E731
     shield = sw.constraints.PredictiveShield("cost", horizon=10, backup=stopping)
     filtered = sw.CBFActionFilter(gym.wrappers.TimeLimit(Drifting(), 100), [shield])
-    assert diagnose(filtered, steps=200).finding("limits").figure == 0.0
+    assert found(filtered, steps=200)["limits"].figure == 0.0
     assert filtered.env.env is filtered.unwrapped, "what looked on is gone"
 
 
 def test_an_env_without_physics_says_what_is_missing_and_judges_commands_and_costs():
     env = gym.make("Pendulum-v1")
     jumping = iter(range(10_000))
-    found = diagnose(env, lambda observation: np.array([2.0 * (-1) ** next(jumping)]), steps=60)
-    assert [finding.symptom for finding in found.present] == ["command_steps"]
-    assert found.finding("command_steps").figure == pytest.approx(1.0)
+    seen = found(env, lambda observation: np.array([2.0 * (-1) ** next(jumping)]), steps=60)
+    assert [name for name, finding in seen.items() if finding.present] == ["command_steps"]
+    assert seen["command_steps"].figure == pytest.approx(1.0)
     for name in ("limits", "contact_forces", "wheel_slip"):
-        assert "MuJoCo" in found.finding(name).missing, name
-    assert math.isnan(found.finding("limits").figure) and not found.finding("limits").present
+        assert "MuJoCo" in seen[name].missing, name
+    assert math.isnan(seen["limits"].figure) and not seen["limits"].present
 
 
 def test_without_a_policy_its_symptoms_are_not_measured():
-    found = diagnose(gym.make("Swimmer-v5"), steps=30)
-    assert found.driver == "attacker"
-    for name, symptom in SYMPTOMS.items():
-        told = "give a policy" in found.finding(name).missing
-        assert told == symptom.policies_only, name
+    for name, finding in found(gym.make("Swimmer-v5"), steps=30).items():
+        assert ("give a policy" in finding.missing) == SYMPTOMS[name].policies_only, name
 
 
 def test_the_policy_counts_where_there_is_one():
     env = Bench(STOPPED)
-    still = diagnose(env, lambda observation: np.zeros(1), steps=400)
-    assert still.driver == "policy"
-    assert still.finding("limits").figure == 0.0 < diagnose(env, steps=400).finding("limits").figure
+    still = found(env, lambda observation: np.zeros(1), steps=400)
+    assert still["limits"].figure == 0.0 < found(env, steps=400)["limits"].figure
 
 
 def test_what_treats_a_symptom_is_refused_with_the_reason():
     jumping = iter(range(10_000))
-    found = diagnose(Drifting(), lambda observation: np.array([(-1.0) ** next(jumping)]), steps=60)
-    code = found.finding("command_steps").code
-    assert code.startswith("# What treats it is refused: ") and "has no attribute dt" in code
+    seen = found(Drifting(), lambda observation: np.array([(-1.0) ** next(jumping)]), steps=60)
+    code = seen["command_steps"].code
+    assert code.startswith("# ChunkHandover(") and "is refused: " in code and "has no attribute dt" in code
+
+
+def test_what_hits_without_a_name_is_found_all_the_same():
+    env = Bench(CART.format(stiffness=20_000).replace('name="cart"', ""))
+    finding = found(env, lambda observation: np.array([20.0]), steps=200)["contact_forces"]
+    assert finding.present and finding.code.startswith("# Limit the speed of what hits")
+
+
+def test_an_error_in_a_measurement_is_not_taken_for_a_refusal(monkeypatch):
+    def broken(recording):
+        raise ConfigurationError("of a bug")
+
+    monkeypatch.setitem(SYMPTOMS, "limits", SYMPTOMS["limits"]._replace(measure=broken))
+    with pytest.raises(ConfigurationError, match="of a bug"):
+        diagnose(gym.make("Swimmer-v5"), steps=2)
 
 
 def test_bad_input_is_refused_by_name():
@@ -161,7 +177,7 @@ def test_a_simulation_that_diverges_is_found_though_mujoco_resets_it():
     xml = CART.format(stiffness=20_000).replace('timestep="0.002"', 'timestep="0.002" integrator="Euler"')
     wild = xml.replace('type="slide" axis', 'type="slide" stiffness="1e9" axis')
     env = Bench(wild)
-    finding = diagnose(env, steps=60).findings[0]
+    finding = diagnose(env, steps=60)[0]
     assert finding.symptom == "contact_forces" and finding.present and finding.figure == math.inf
     assert finding.code.startswith("# The simulation diverged: a shorter timestep")
 
@@ -175,17 +191,15 @@ class Model:
 
 
 def test_a_model_with_predict_is_a_policy():
-    assert diagnose(gym.make("Swimmer-v5"), Model(), steps=20).finding("command_steps").figure == 0.0
+    assert found(gym.make("Swimmer-v5"), Model(), steps=20)["command_steps"].figure == 0.0
 
 
 def test_findings_are_ranked_and_told():
     env = Bench(STOPPED)
-    found = diagnose(env, waving(env, 0.5, 100.0), steps=300)
-    ranks = [2 * finding.present + (not finding.missing) for finding in found.findings]
+    seen = diagnose(env, waving(env, 0.5, 100.0), steps=300)
+    ranks = [2 * finding.present + (not finding.missing) for finding in seen]
     assert ranks == sorted(ranks, reverse=True) and {0, 1, 3} == set(ranks)
-    words = str(Diagnosis("Env-v0", 1000, "policy", [Finding("wheel_slip", 0.5, "env = env\n# b")]))
-    assert words.splitlines() == [
-        "Env-v0: 1,000 steps, driven by the policy",
+    assert str(Finding("wheel_slip", 0.5, "env = env\n# b")).splitlines() == [
         "  FOUND     wheel_slip        wheels that spin or lock: 50 % (a symptom from 5 % on)",
         "      env = env",
         "      # b",
@@ -197,7 +211,7 @@ def test_findings_are_ranked_and_told():
 def test_what_presses_all_the_time_is_no_impact():
     env = Bench(CART.format(stiffness=20_000), [0.955])
     policy = lambda observation: np.array([20.0])  # noqa: E731
-    finding = diagnose(env, policy, steps=300).finding("contact_forces")
+    finding = found(env, policy, steps=300)["contact_forces"]
     assert finding.figure < 60.0 and not finding.present  # 20 N on a cart of 9.8 N
 
 

@@ -113,8 +113,8 @@ def test_too_little_margin_is_said_once_with_its_numbers():
         plant.bind(env)
     assert len(said) == 1
     text = str(said[0].message)
-    # 4 rad/s * (0.1 + 0.05 + 0.02 + 0.005) s = 0.7 rad = 40.1 degrees; 30 degrees over 4 rad/s = 0.1309 s
-    for number in ("19.9 degrees", "left of 60", "less than 30", "4 rad/s is 0.175 s late", "bears 0.1309 s"):
+    # 4 rad/s * (0.1 + 0.05 + 0.02 + 0.005) s = 0.7 rad = 40.1 degrees
+    for number in ("19.9 degrees", "margin of 60", "less than 30", "a loop of 4 rad/s"):
         assert number in text
     # at the crossover that is advised exactly the wanted margin is left, to its printed digits
     assert "at most 2.99 rad/s" in text

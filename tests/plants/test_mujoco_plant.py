@@ -7,7 +7,8 @@ import pytest
 from asking import bound
 from scenes import Scene
 
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.mujoco.binding import physics_steps
 
 ENVS = [
     "Reacher-v5",
@@ -351,3 +352,18 @@ def test_forgetting_clears_the_commands_in_flight():
     plant.executed(None)
     plant.observe()
     np.testing.assert_array_equal(plant.state, [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("frame_skip", "control_dt", "got"),
+    [
+        (0, None, "no control_dt, and 0 by"),
+        (5, 0.02, "2 by control_dt, and 5 by"),
+        (None, 0.025, "2.5 by control_dt, and nothing by"),
+    ],
+)
+def test_a_control_step_that_is_no_whole_number_of_physics_steps_is_refused(frame_skip, control_dt, got):
+    env = Scene(CART)
+    env.frame_skip = env.dt = frame_skip
+    with pytest.raises(ConfigurationError, match=rf"steps of 0\.01 s.*got {got} .*: leave control_dt"):
+        physics_steps(env, None, control_dt)

@@ -83,3 +83,14 @@ def test_a_servos_own_damping_counts():
     frequencies, ratios = ringing_of_finite_differences(env)
     assert check.resonances == pytest.approx([frequencies[1]], rel=1e-2)
     assert check.damping_ratios == pytest.approx([ratios[1]], rel=0.1) and ratios[1] > 0.01
+
+
+def test_a_spring_that_servos_share_out_among_all_vibrations_is_one():
+    tip = '<body><joint name="t" axis="0 0 1" armature=".02"/><geom pos=".1 0 0" size=".05" mass="1"/></body>'
+    servos = '<position joint="motor" kp="800"/><position joint="t" kp="100"/>'
+    whole = TWO_MASSES.replace("</body>{other}", tip + "</body>")
+    env = Scene(whole.format(stiffness=200, damping=0, across=0, actuator=servos), frame_skip=20)
+    check = rigid_model_check(env)  # no vibration has half of its energy in the spring
+    assert check.resonances and not check.rigid_is_good_enough
+    env.model.jnt_stiffness[:] = 0.0
+    assert not rigid_model_check(env).resonances

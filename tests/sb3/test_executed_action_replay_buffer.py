@@ -8,7 +8,7 @@ import line_world
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete
 from line_world import HOLD, WALL, filtered
 from scipy import stats
 from stable_baselines3 import SAC
@@ -268,11 +268,24 @@ def test_what_an_escape_executed_is_stored_in_place_of_the_policys_action():
     np.testing.assert_allclose(buffer.actions[:, 0], executed, atol=1e-6)
 
 
+def test_of_a_repeated_action_what_its_last_control_step_executed_is_stored():
+    env = sw.ActionRepeat(filtered(), 4)
+    before, _ = env.reset(seed=0)
+    action = np.array([1.0], np.float32)  # the most that there is, to the right
+    after, reward, _, _, info = env.step(env.action_space.high)
+    buffer = ExecutedActionReplayBuffer(8, env.observation_space, env.action_space, device="cpu")
+    buffer.add(*(np.array([value]) for value in (before, after, action, reward, False)), [info])
+    last, moved = info["truth"]["given"], float(after[0] - before[0])
+    assert moved > 2.0 * HOLD * last  # the four were not the same
+    assert buffer.actions[0, 0] == pytest.approx((last + 2.0) / 2.5 - 1.0, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"action_space": Discrete(3)}, "expected a bounded Box of actions, got Discrete"),
         ({"action_space": Box(-np.inf, 1.0, (1,))}, "expected a bounded Box of actions"),
+        ({"observation_space": Dict({"x": Box(-1, 1, (1,))})}, "got Dict.*ExecutedActionDictReplayBuffer"),
     ],
 )
 def test_what_it_refuses(arguments, message):

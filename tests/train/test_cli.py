@@ -350,7 +350,8 @@ def test_diagnose_takes_the_policy_of_a_run_as_it_was_trained(tmp_path, capsys):
     first = policy(observation)
     assert np.array_equal(policy(observation + 1.0), first)  # repeated: it was trained with action_repeat 2
     assert main(["diagnose", "SafePointGoal1-v0", "--policy", str(run), "--steps", "40"]) == 0
-    assert "SafePointGoal1-v0: 40 steps, driven by the policy" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "SafePointGoal1-v0: 40 steps\n" in out and "give a policy" not in out
     with pytest.raises(ConfigurationError, match="was trained on SafePointGoal1-v0, not on Swimmer-v5"):
         of_run(run, "Swimmer-v5")
 
@@ -359,6 +360,6 @@ def test_diagnose_takes_the_policy_of_a_run_as_it_was_trained(tmp_path, capsys):
 def test_diagnose_prints_what_it_found(capsys):
     assert main(["diagnose", "SafeRover-v0", "--steps", "60"]) == 0
     out = capsys.readouterr().out
-    assert "FOUND     wheel_slip" in out and "sw.SlipLimiter(env" in out
+    assert "  FOUND     wheel_slip" in out and "sw.SlipLimiter(env" in out
     assert main(["diagnose", "Swimer-v5"]) == 1
     assert "Swimmer" in capsys.readouterr().err

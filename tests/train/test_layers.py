@@ -46,9 +46,9 @@ def test_the_stack_has_every_layer_in_its_place():
     outages = {"mean_between_s": 0.2, "mean_length_s": 0.2}
     faults = {"Outages": outages, "RepeatedCommands": {"share": 0.1}}
     filtered = FilterConfig(protect={"margin": 0.1}, lease=LEASE, escape={"progress": 0.1})
-    learner = LearnerConfig("adaption_penalty", penalty=2.0, per_correction=0.5)
+    learner = LearnerConfig("adaption_penalty", penalty=2.0)
     stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), filtered, learner)
-    assert (stack.penalty, stack.per_correction) == (2.0, 0.5)
+    assert stack.penalty == 2.0
     kinds = [type(wrapper).__name__ for wrapper in wrappers_of(stack)]
     order = ["AdaptionPenalty", "Monitor", "RepeatedCommands", "Outages", "RecordInterventions"]
     order += ["StuckEscape", "LeaseExpiry", "CBFActionFilter"]

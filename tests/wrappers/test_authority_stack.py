@@ -1,14 +1,12 @@
-"""The stack as one: faults over handover over lease over filter, on MuJoCo tasks; and admission on a servo arm."""
+"""The stack as one: faults over handover over lease over filter, on MuJoCo tasks."""
 
 import itertools
 import math
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 from braked_cart import BrakedCart, cart_plant, lease, read_cart, stop
-from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
 from safe_wrappers.wrappers.faults import Outages, RepeatedCommands
@@ -202,51 +200,3 @@ def test_chunks_under_a_lease_hit_nothing_whatever_is_lost(change):
                 env.step(np.tile([1.0, 0.0] if full else [0.0, 1.0], (8, 1)).astype(np.float32))
             hits[guarded] += cart.farthest >= cart.wall
     assert hits[True] == 0 and hits[False] > 0, hits
-
-
-# Admission ----------------------------------------------------------------------------------------------------
-
-ARM = """
-<mujoco>
-  <option timestep="0.005" gravity="0 0 0"/>
-  <worldbody>
-    <body name="slide"><joint name="slide" type="slide" axis="1 0 0" damping="5"/>
-      <geom size="0.05" mass="1"/>
-      <body name="turn" pos="0 0 0.1"><joint name="turn" type="hinge" axis="0 0 1" damping="0.5"/>
-        <geom type="capsule" size="0.02" fromto="0 0 0 0.3 0 0" mass="0.3"/></body></body>
-  </worldbody>
-  <actuator>
-    <position joint="slide" kp="400" ctrlrange="-2 2"/>
-    <position joint="turn" kp="40" ctrlrange="-3 3"/>
-  </actuator>
-</mujoco>
-"""
-
-
-class ServoArm(MujocoEnv):
-    """Two position servos; actions are setpoints. Steps of 20 ms."""
-
-    metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 50}  # noqa: RUF012
-
-    def __init__(self, path):
-        space = gym.spaces.Box(-np.inf, np.inf, (4,))
-        super().__init__(path, 4, space)
-
-    def step(self, action):
-        self.do_simulation(action, self.frame_skip)
-        return self._seen(), 0.0, False, False, {}
-
-    def reset_model(self):
-        self.set_state(self.init_qpos, self.init_qvel)
-        return self._seen()
-
-    def _seen(self):
-        return np.concatenate([self.data.qpos, self.data.qvel])
-
-
-@pytest.fixture
-def arm(tmp_path):
-    path = tmp_path / "arm.xml"
-    path.write_text(ARM)
-    assert mujoco.MjModel.from_xml_string(ARM).nu == 2
-    return ServoArm(str(path))

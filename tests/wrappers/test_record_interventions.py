@@ -116,7 +116,6 @@ def test_counts_of_an_episode():
         "spin_outs",
         "collisions",
         "seen",
-        "expiries",
     }
 
 

@@ -5,7 +5,6 @@ import subprocess
 import sys
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 
@@ -139,7 +138,7 @@ def test_another_env_gets_a_strip_on_a_frame_of_the_same_shape():
     quiet = env.render()
     env.step(np.ones(2, np.float32))
     frame = env.render()
-    assert frame.shape == (200, 300, 3) and (frame[:172] == 255).all()
+    assert frame.shape == (200, 300, 3) and (frame[:192] == 255).all()
     assert (frame != quiet).any()
 
 
@@ -151,8 +150,9 @@ def test_a_frame_s_marks_are_those_of_the_present_state_and_never_too_many():
     first = env.marks()
     for _ in range(10):
         env.step(np.array([1.0, 0.0], np.float32))
-    at = [mark["pos"][:2] for mark in env.marks() if mark["type"] == mujoco.mjtGeom.mjGEOM_ARROW]
-    np.testing.assert_allclose(at, [env.unwrapped.agent_position] * 2, atol=0.05)
+    rod = next(mark for mark in env.marks() if mark["rgba"] == WAY)  # the first of the way
+    begins = rod["pos"] - rod["size"][2] * rod["mat"].reshape(3, 3)[:, 2]
+    np.testing.assert_allclose(begins[:2], env.unwrapped.agent_position, atol=1e-9)
     env.marks = lambda: 100 * first
     env.render()
     assert len(renderer.markers) == MOST_MARKS < 100 * len(first) and renderer.modes == ["rgb_array"]
@@ -164,13 +164,12 @@ def test_a_window_gets_marks_and_words_before_each_step():
     env.reset(seed=0)
     assert not renderer.markers
     env.step(np.zeros(2, np.float32))
-    assert len(renderer.markers) > 8 * 12 and renderer.words[0] == "as proposed"
-    assert renderer.words[1].startswith("margin ") and set(renderer.modes) == {"human"}
+    assert len(renderer.markers) > 8 * 12 and renderer.words == ["as proposed"]
+    assert set(renderer.modes) == {"human"}
 
 
 SCRIPT = """
 import gymnasium as gym, numpy as np, safe_wrappers as sw
-from safe_wrappers.wrappers.safety_overlay import WAY, find_renderer, mark
 
 def run(overlay):
     env = sw.protect(gym.make("SafePointGoal1-v0", render_mode="rgb_array", width=320, height=240))
@@ -184,24 +183,9 @@ def run(overlay):
 (bare, plain), (drawn, shown) = run(False), run(True)
 assert (bare == drawn).all()
 different = (plain != shown).any(axis=-1)
-strip = round(0.14 * 240)
-assert different[:, -strip:].mean() > 0.9, different[:, -strip:].mean()
-above = different[:, :-strip].mean()
-assert 0.002 < above < 0.2, above  # rings and arrows, and the floor as it was
-
-# An arrow ends at half of its size.
-env = gym.make("SafePointGoal0-v0", render_mode="rgb_array", width=320, height=240, default_camera_config={
-    "distance": 6.0, "elevation": -90.0, "azimuth": 90.0, "lookat": np.zeros(3)})
-env.reset(seed=0)
-
-def at(*drawn):
-    before = env.render().astype(int)
-    find_renderer(env)._get_viewer("rgb_array").add_marker(**mark(*drawn))
-    return np.argwhere(np.abs(env.render() - before).sum(axis=-1) > 60)[:, 1]
-
-along, up = np.eye(3)[[0, 2]]
-tip = at("SPHERE", WAY, along + up / 2, [0.05, 0.0, 0.0]).mean()
-assert abs(at("ARROW", WAY, up / 2, [0.05, 0.05, 2.0], along).max() - tip) < 4
+assert different[:, -10:].mean() > 0.9, different[:, -10:].mean()
+above = different[:, :-10].mean()
+assert 0.002 < above < 0.2, above  # rings, and the floor as it was
 print("drawn")
 """
 

@@ -1,21 +1,16 @@
-"""What a stop takes by clearances and constraints, what commands may do, and which chunks are within reach."""
+"""What a stop takes by clearances and constraints, and what commands may do."""
 
 import copy
 import math
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
-import ruckig
 from asking import Asked
 from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection
-from hypothesis import given
-from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.wrappers.lease_expiry import Admission
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.stopping import BoundBudget
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
@@ -236,6 +231,17 @@ def test_a_budget_takes_the_bounds_that_belong_to_its_clearance(clearance, given
         sw.StoppingBudget(clearance, **given)
 
 
+def test_the_margin_of_a_value_is_no_room():
+    times = []
+    for margin in (0.0, 0.2):
+        limit = sw.constraints.JointPositionLimit(-0.8, 0.8, ["slider"], margin=margin)
+        env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), sw.StoppingBudget(limit, closing_speed=4.0))
+        env.reset(seed=0)
+        env._budget.measure()
+        times.append(env._budget.longest_time())
+    assert times[0] - times[1] == pytest.approx(0.2 / 4.0)
+
+
 class Checked(sw.Constraint):
     """A constraint that only a state can show to be wrong."""
 
@@ -296,80 +302,3 @@ def test_while_the_brake_only_begins_to_act_no_command_is_known_to_lead_away():
         budget = measured(0.0, {}, delays_s=delays_s)
         assert budget.longest_time() < HOLD
         assert budget.can_stop_after(throttle(-1.0), HOLD) == admitted
-
-
-LIMITS = {"max_acceleration": 2.0, "max_speed": 1.0}
-SLIDE = '<body><joint name="{0}" type="slide"/><geom size="0.1"/></body>'
-
-
-class Servos(gym.Env):
-    """Position servos of slides, which are where a test says."""
-
-    def __init__(self, positions, velocities):
-        names = [f"j{i}" for i in range(len(positions))]
-        bodies = "".join(map(SLIDE.format, names))
-        servos = "".join(f'<position joint="{name}" ctrlrange="-9 9"/>' for name in names)
-        text = f"<mujoco><worldbody>{bodies}</worldbody><actuator>{servos}</actuator></mujoco>"
-        self.model = mujoco.MjModel.from_xml_string(text)
-        self.data = mujoco.MjData(self.model)
-        self.data.actuator_length[:], self.data.actuator_velocity[:] = positions, velocities
-        self.action_space = gym.spaces.Box(-9.0, 9.0, (len(names),), np.float64)
-
-
-def admission(state, arrival="moving"):
-    return Admission(Servos(*state), {**LIMITS, "arrival": arrival}, len(state[0]))
-
-
-def quickest(start, end):
-    """Ruckig's time to a moving end, one axis."""
-    request = ruckig.InputParameter(1)
-    request.current_position, request.current_velocity, request.current_acceleration = ([x] for x in start)
-    request.target_position, request.target_velocity, request.target_acceleration = ([x] for x in end)
-    request.max_velocity, request.max_acceleration, request.max_jerk = [1.0], [2.0], [math.inf]
-    trajectory = ruckig.Trajectory(1)
-    ruckig.Ruckig(1).calculate(request, trajectory)
-    return trajectory.duration
-
-
-numbers = st.integers(-800, 800).map(lambda thousandths: thousandths / 1000.0)
-
-
-@given(numbers, numbers, st.floats(-0.9, 0.9), st.floats(0.0, 0.5))
-def test_what_a_motion_reaches_is_admitted_and_rest_needs_the_constrained_time(q, v, goal, late):
-    needed = quickest((q, v, 0.0), (goal, 0.0, 0.0))
-    state = ([q], [v])
-    end = np.array([goal])
-    assert admission(state, "rest").admits(end, needed + 1e-9 + late)
-    assert admission(state).admits(end, needed + 1e-9 + late)  # what can stop there can pass there
-    if needed > 1e-3:
-        assert not admission(state, "rest").admits(end, needed * (1.0 - 1e-6) - 1e-9)
-
-
-def test_moving_admits_ends_at_which_no_machine_could_stop_in_time():
-    state = ([0.0, 0.0], [0.9, 0.0])
-    end = np.array([0.09, 0.0])
-    assert admission(state).admits(end, 0.1)
-    assert not admission(state, "rest").admits(end, 0.1)
-
-
-@pytest.mark.parametrize(
-    ("motion_limits", "words"),
-    [
-        ({**LIMITS, "arrival": "soon"}, '"moving" or "rest"'),
-        ({"max_speed": 1.0}, "max_acceleration"),
-        ({**LIMITS, "max_speed": [1.0, 2.0]}, "1 action comp"),
-        ({**LIMITS, "max_speed": 0.0}, "max_speed"),
-        ({**LIMITS, "max_jerk": 1.0}, "motion_limits has no 'max_jerk'"),
-        (3.0, "motion_limits is"),
-    ],
-)
-def test_bad_limits(motion_limits, words):
-    with pytest.raises(ConfigurationError, match=words):
-        Admission(Servos([0.0], [0.0]), motion_limits, 1)
-
-
-def test_limits_are_for_mujocos_actuators():
-    with pytest.raises(UnsupportedEnvError, match="MuJoCo's actuators"):
-        Admission(BrakedCart(), LIMITS, 2)
-    with pytest.raises(ConfigurationError, match="no setpoints"):
-        Admission(gym.wrappers.RescaleAction(Servos([0.0], [0.0]), -1.0, 1.0), LIMITS, 1)

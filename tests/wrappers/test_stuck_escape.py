@@ -68,17 +68,14 @@ def test_a_drawn_action_is_held_filtered_and_not_counted_as_the_filters_change()
 
 
 def test_a_learner_is_told_that_its_action_was_replaced():
-    """The penalty is by how far the executed action is from the policy's, as where the filter changed it."""
     env = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
     env = sw.StuckEscape(env, after_s=1.0, progress=0.05, escape_s=0.5)
-    env = sw.AdaptionPenalty(env, penalty=0.1, per_correction=2.0)
+    env = sw.AdaptionPenalty(env, penalty=0.1)
     env.reset(seed=0, options={"layout": BEFORE_A_HAZARD})
     infos = [env.step(PUSH)[4] for _ in range(200)]
     escaping = [i for i in infos if i[keys.CBF_ESCAPING]]
-    assert escaping
-    for info in escaping:
-        away = np.linalg.norm(info[keys.EXECUTED_ACTION] - PUSH)
-        assert info[keys.ADAPTION_PENALTY] == pytest.approx(0.1 + 2.0 * away)
+    assert any(not info[keys.CBF_INTERVENED] for info in escaping)
+    assert {info[keys.ADAPTION_PENALTY] for info in escaping} == {0.1}
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

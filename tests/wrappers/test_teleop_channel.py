@@ -125,7 +125,7 @@ def test_an_action_that_is_not_finite_is_not_sent():
     env = channel()
     place(env)
     env.step(np.full(2, 0.5))
-    with pytest.warns(UserWarning, match="not sent"):
+    with pytest.warns(UserWarning, match="not executed"):
         info = env.step(np.array([np.nan, 0.0]))[4]
     assert (info["executed_action"] == 0.5).all() and info["teleop/round_trip_s"] > 0.0
     for wrong in (np.zeros(3), "left"):

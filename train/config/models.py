@@ -67,8 +67,6 @@ class LearnerConfig(Section):
     """`safe_action` is for SAC, TD3, DDPG, TQC and CrossQ."""
     penalty: Annotated[Number, Field(ge=0)] = 0.0
     """For `adaption_penalty`: taken off the reward of a changed step."""
-    per_correction: Annotated[Number, Field(ge=0)] = 0.0
-    """For the same: taken off per unit of correction."""
     cost_limit: Annotated[Number, Field(ge=0)] | None = None
     """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-price-on-cost)
     puts a price on cost, in training; with PPO this is PPO-Lagrangian. For any algorithm and arm, also without a
@@ -78,13 +76,12 @@ class LearnerConfig(Section):
 
     @model_validator(mode="after")
     def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
-        given = bool(self.penalty or self.per_correction)
-        if self.penalised and not given:
+        if self.penalised and not self.penalty:
             raise ConfigurationError(
-                f"{self.kind} needs a penalty in units of the task's reward, per changed step or by the size of the"
-                f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction."
+                f"{self.kind} needs a penalty per changed step, in units of the task's reward: {{kind: {self.kind},"
+                " penalty: 0.1}."
             )
-        if given and not self.penalised:
+        if self.penalty and not self.penalised:
             raise ConfigurationError(f"{self.kind} takes no penalty; adaption_penalty does.")
         return self
 

@@ -60,21 +60,16 @@ REGISTRY: Final[dict[str, Metric]] = {
     "collisions": Metric("Collisions, total", "Collisions begun", "collisions"),
     "collisions_per_million": Metric("Collisions / million steps", "Collisions begun", "per million steps"),
     "seen": Metric("Share of time that a track is seen", "Steps and tracks with a measurement at the end"),
-    "expiries": Metric(
-        "Permissions to rely on a track run out, total", "Times that an uncertainty grew beyond its tolerance"
-    ),
-    "expiries_per_1000": Metric("Permissions run out / 1000 steps", "Permissions run out", "per 1000 steps"),
 }
 METRICS: Final = {name: metric.label for name, metric in REGISTRY.items()}
 """What is reported of a condition. Totals and rates are over its episodes; all else is the mean over its episodes of
 the episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
-TOTALS: Final = tuple(figure.name for figure in EPISODE if figure.how in ("count", "onsets"))
+TOTALS: Final = tuple(figure.name for figure in EPISODE if figure.how == "count")
 RATES: Final = {
     "violations_per_1000": ("violations", 1000.0),
     "infeasible_per_1000": ("infeasible", 1000.0),
     "spin_outs_per_million": ("spin_outs", 1e6),
     "collisions_per_million": ("collisions", 1e6),
-    "expiries_per_1000": ("expiries", 1000.0),
 }
 """Of a count, per so many steps. Episodes that end early have less time for violations: rates are over all steps,
 whatever the episodes."""

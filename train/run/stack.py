@@ -94,11 +94,7 @@ def make_stack(
         fault = FAULTS[check_name(name, FAULTS, "env.faults")]
         recorded = _called(f"env.faults.{name}", fault, recorded, arguments)
     monitored = Monitor(recorded)
-    return (
-        AdaptionPenalty(monitored, learner.penalty, learner.per_correction)
-        if learner.penalised
-        else monitored
-    )
+    return AdaptionPenalty(monitored, learner.penalty) if learner.penalised else monitored
 
 
 def _called(where: str, make: Callable[..., Any], env: gym.Env[Any, Any], given: Mapping[str, Any]) -> Any:

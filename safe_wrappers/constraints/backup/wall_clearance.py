@@ -62,9 +62,8 @@ class WallClearance(Constraint, Model):
         self._point = point = planar_point(self.plant, math.inf if clip is None else clip)
         around, self._reach = walls(self.plant.model, point.body)
         self._walls = np.array(around).reshape(-1, 4)
-        slides(
-            point.axes, *np.zeros((3, 2)), np.ones((1, 4)), 0.0, clip is None
-        )  # compiled here, not in a step
+        nowhere = np.zeros(2)  # compiled here, not in a step
+        slides(point.axes, nowhere, nowhere, nowhere, np.ones((1, 4)), 0.0, clip is None)
 
     def rollout(self, control: Array | None, horizon: int = 1) -> Trajectory:
         """The way until rest, as positions at every physics step, shape (instants, 2)."""

@@ -101,7 +101,7 @@ def physics_steps(raw: Any, source: Any = None, control_dt: float | None = None)
 
     Raises:
         UnsupportedEnvError: Nobody says it.
-        ConfigurationError: `control_dt` is no whole number of physics steps, or not the env's.
+        ConfigurationError: Not a whole number of physics steps, none, or by `control_dt` another than by the env.
     """
     own = source is None or source is raw
     env = raw
@@ -123,9 +123,12 @@ def physics_steps(raw: Any, source: Any = None, control_dt: float | None = None)
     assert steps is not None
     count = round(steps)
     if count < 1 or not np.isclose(steps, count, rtol=1e-6) or said not in (None, count):
+        by_control_dt = "no control_dt" if control_dt is None else f"{steps:g} by control_dt"
         raise ConfigurationError(
-            f"control_dt = {control_dt} s is {steps:g} physics steps of {timestep} s, which is to be a whole number; "
-            f"{raw} says {'nothing' if said is None else said}: leave control_dt out where the env says it"
+            f"expected a control step of a whole number of physics steps of {timestep} s, at least 1, and control_dt "
+            f"to agree with the env; got {by_control_dt}, and {'nothing' if said is None else said} by {raw}: leave "
+            "control_dt (s) out where the env says it by frame_skip, n_substeps or dt; where it does not, give a "
+            "multiple of the timestep"
         )
     return count
 

@@ -24,9 +24,6 @@ class Tick:
     blend_steps: int = 0
     refused: bool = False
     latency: int = -1
-    entry: int = -1
-    """Which entry of which chunk it is made from, where no fallback made it."""
-    observed: int = -1
 
 
 @dataclass
@@ -43,7 +40,6 @@ class Slow:
     sent: list = field(default_factory=list)
     plan: list = field(default_factory=list)
     now: int = 0
-    newest_heard: int = -1
     in_force: int = -1
     acting: str = ""
     fade: tuple | None = None
@@ -70,10 +66,8 @@ class Slow:
     def tick(self, fallback):
         tick = Tick(control=[])
         self.arrive(tick)
-        control, exact = self.planned(tick)
-        tick.starved = control is None
-        if tick.starved:
-            control, exact = self.box(fallback), True
+        tick.starved = not self.plan
+        control, exact = (self.box(fallback), True) if tick.starved else self.plan.pop(0)
         acting = "the fallback" if tick.starved else "the chunks"
         if self.sent and acting != self.acting:
             if not tick.seam:
@@ -105,7 +99,6 @@ class Slow:
         tick.exact = exact
         self.sent.append(tick.control)
         self.now += 1
-        tick.observed = self.in_force
         return tick
 
     def fade_steps(self, change):
@@ -138,12 +131,6 @@ class Slow:
             tick.blend_steps = self.join(fresh)
             tick.seam = bool(self.sent)
             self.fade = None
-
-    def planned(self, tick):
-        if not self.plan:
-            return None, False
-        tick.entry = self.now - self.in_force
-        return self.plan.pop(0)
 
     def join(self, new):
         """Replace the plan by a blend into the new stream; its steps."""
