@@ -72,6 +72,8 @@ def test_its_folder_acts_as_the_run_does(settings, reacher, tmp_path):
     run = reacher if settings is None else trained(settings, tmp_path)
     of_run, of_folder = load_policy(run), load_policy(str(run / "policy"))
     assert of_folder.arm.fingerprint() == of_run.arm.fingerprint()
+    versions = json.loads((run / "policy" / "config.json").read_text())["versions"]
+    assert ("sbx-rl" in versions) == (settings is SBX)
     env = of_run.make_env()
     observation, _ = env.reset(seed=0)
     for _ in range(8):

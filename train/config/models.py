@@ -64,7 +64,7 @@ class LearnerConfig(Section):
     text_is: ClassVar[str] = "kind"
 
     kind: Literal["naive", "adaption_penalty", "safe_action"] = "naive"
-    """`safe_action` is for SAC, TD3, DDPG, TQC and CrossQ."""
+    """`safe_action` is for SAC, TD3, DDPG, TQC and CrossQ, sbx's too."""
     penalty: Annotated[Number, Field(ge=0)] = 0.0
     """For `adaption_penalty`: taken off the reward of a changed step."""
     cost_limit: Annotated[Number, Field(ge=0)] | None = None
@@ -224,8 +224,9 @@ class ArmConfig(Section):
     """The env: an id, or the keys of [`env`](#env)."""
     algorithm: Annotated[str, AfterValidator(_check_algorithm)]
     """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.7,<3'` also `TQC`, `CrossQ`,
-    `TRPO`, `QRDQN`. `DQN` and `QRDQN` are for discrete actions; filtered, those have an
-    [ActionShield](wrappers/filter.md#actionshield)."""
+    `TRPO`, `QRDQN`; with `pip install 'safe-wrappers[sbx]'` also `sbx.SAC`, `sbx.TD3`, `sbx.TQC`, `sbx.CrossQ`,
+    `sbx.PPO`, [in JAX](concepts/learner.md#which-algorithm-can-do-which). `DQN` and `QRDQN` are for discrete actions;
+    filtered, those have an [ActionShield](wrappers/filter.md#actionshield)."""
     total_steps: Count
     """Steps of all envs together, rounded up to whole rollouts: PPO with its default of `n_steps: 2048` and four
     envs trains 8,192 steps if 4,000 are asked for. Progress and report say how many were trained. May be [raised
@@ -249,7 +250,7 @@ class ArmConfig(Section):
     checkpoint_every: Count = 50_000
     """Steps between two checkpoints, saved between two rollouts. May be changed later."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Torch's. May be changed later."""
+    """Torch's; sbx's algorithms are refused another than `cpu`. May be changed later."""
     trackers: list[Literal["wandb", "mlflow"]] = Field(default_factory=list)
     """[Where curves go](cli.md#where-everything-lies) beside TensorBoard. May be changed later."""
 

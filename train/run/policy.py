@@ -16,6 +16,7 @@ from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
 from ..config import ArmConfig, FilterConfig
+from ..config.algorithms import SBX
 from ..files import write_json
 from .checkpoint import load_model, load_normalize, save_policy
 from .folder import POLICY
@@ -40,7 +41,7 @@ class TrainedPolicy:
     Attributes:
         arm: The arm.
         model: As SB3 loads it.
-        deterministic: False: actions are drawn as in training, from torch's generator.
+        deterministic: False: actions are drawn as in training, from torch's generator or the model's own key of JAX.
     """
 
     deterministic: bool = True
@@ -92,13 +93,14 @@ def write_policy(arm: ArmConfig, seed: int, run: Path, model: BaseAlgorithm) -> 
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     save_policy(temporary, model)
+    packages = (*_PACKAGES, "sbx-rl") if arm.algorithm.startswith(SBX) else _PACKAGES
     config = {
         "arm": arm.name,
         "seed": seed,
         "config": arm.fingerprint(),
         "constraints": constraints_of_arm(arm),
         "timesteps": model.num_timesteps,
-        "versions": {name: version(name) for name in _PACKAGES},
+        "versions": {name: version(name) for name in packages},
     }
     write_json(temporary / CONFIG, config)
     shutil.rmtree(folder, ignore_errors=True)
