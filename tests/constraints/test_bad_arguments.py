@@ -104,6 +104,7 @@ MADE = [
     (of.Traction, {"max_slip": 0.0}, r"\(0, 1\)"),
     (of.Traction, {"max_slip": np.nan}, "max_slip"),
     (of.Traction, {"friction": -0.5}, "friction"),
+    (of.Traction, {"margin": 0.15}, "margin must be below max_slip = 0.15, got 0.15"),
     (of.WallClearance, {"margin": -0.1}, "margin.*m, got -0.1"),
     (of.WallClearance, {"velocity_clip": np.inf}, "velocity_clip.*finite"),
     (of.Workspace, {"low": None}, r"give a bound in low or high \(m\), or something to keep_out of"),
@@ -150,6 +151,7 @@ BOUND = [
     (of.TrackPermission, {}, "OccludedCrossing-v0", UnknownNameError, "track_names"),
     (of.Traction, {"wheels": ["front_lft"]}, "SafeRover-v0", UnknownNameError,
      "no joint 'front_lft'; it has: .*front_left"),
+    (of.Traction, {"wheels": ["steer_left"]}, "SafeRover-v0", ConfigurationError, "'steer_left' is no driven wheel"),
     (of.Traction, {"wheels": ["front_left", "front_left"]}, "SafeRover-v0", ConfigurationError, "each once"),
     (of.WallClearance, {}, "Reacher-v5", UnsupportedEnvError, r"two slides.*Use Clearance"),
     (of.Workspace, {"bodies": []}, "Reacher-v5", ConfigurationError, "name the bodies, sites or geoms"),
@@ -182,6 +184,12 @@ def test_a_clearance_on_an_analytic_plant_needs_to_know_where_the_point_is():
     )
     with pytest.raises(ConfigurationError, match="say where the point is in the state"):
         sw.CBFActionFilter(sliders(), [of.Clearance([DISC], 1.0)], plant=plant)
+
+
+def test_a_slip_is_not_limited_under_a_delay():
+    with pytest.raises(ConfigurationError, match="use delay_s=0"):
+        plant = sw.MujocoPlant(delay_s=0.02)
+        sw.CBFActionFilter(gym.make("SafeRover-v0"), [of.Traction(["front_left"])], plant=plant)
 
 
 def test_steps_longer_than_the_horizon_and_wheels_limited_twice_are_refused():
