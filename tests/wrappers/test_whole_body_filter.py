@@ -10,8 +10,7 @@ from safe_wrappers.plants.mujoco.contacts import Replay
 
 KINDS = {
     "forecast": sw.WholeBodyFilter,
-    "pyramid": lambda env: sw.CBFActionFilter(env, [sw.constraints.Stance()]),
-    "cone": lambda env: sw.CBFActionFilter(env, [sw.constraints.Stance(cone="exact")]),
+    "stance": lambda env: sw.CBFActionFilter(env, [sw.constraints.Stance()]),
 }
 
 
