@@ -101,7 +101,7 @@ def _hopper() -> gym.Env[Any, Any]:
 
 
 def _stance() -> gym.Env[Any, Any]:
-    return sw.CBFActionFilter(gym.make("Hopper-v5"), [sw.constraints.Stance()])
+    return sw.CBFActionFilter(gym.make("Hopper-v5"), [sw.constraints.Stance(cone="exact")])
 
 
 def _teleop() -> gym.Env[Any, Any]:

@@ -1,4 +1,4 @@
-"""What the whole-body program changes, by the friction that it may count on."""
+"""What the whole-body program changes, by the friction that it may count on: pyramids and the exact cone."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 import safe_wrappers as sw
 from _ant import gait
-from _style import ON
+from _style import ON, OTHER
 from safe_wrappers.filter.bound import Bound
 
 BEFORE = 16
@@ -27,14 +27,19 @@ def draw() -> Figure:
     wanted = act(BEFORE).astype(np.float64)
     figure = Figure(figsize=(7.2, 3.0))
     ax = figure.subplots()
-    distances = []
-    for share in SHARES:
-        stance = Bound(sw.constraints.Stance(float(share)), plant)
-        stance.observe({})
-        stance.admits(wanted)
-        (answer,) = stance.candidates(wanted)
-        distances.append(np.linalg.norm(answer - wanted) if stance.admits(answer) else np.nan)
-    ax.plot(SHARES, distances, color=ON)
+    for options, color, label in (
+        ({}, OTHER, "pyramids"),
+        ({"cone": "exact"}, ON, "exact cone"),
+    ):
+        distances = []
+        for share in SHARES:
+            stance = Bound(sw.constraints.Stance(float(share), **options), plant)
+            stance.observe({})
+            stance.admits(wanted)
+            (answer,) = stance.candidates(wanted)
+            distances.append(np.linalg.norm(answer - wanted) if stance.admits(answer) else np.nan)
+        ax.plot(SHARES, distances, color=color, label=label)
     ax.set(xlabel="share of the model's friction", ylabel="correction of the torques")
+    ax.legend(loc="upper right")
     env.close()
     return figure

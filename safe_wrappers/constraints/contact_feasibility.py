@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -30,6 +30,7 @@ from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
+_EDGES = 8  # of the pyramids inside the friction cones
 _SETTLE_S = 0.05  # time constant in which what still moves at a contact is to come to rest, s
 _SAME = 1e-7  # distance from the program's answer that is the rounding of an action, control units
 _REFUSED = 1e-6  # by how much a control that no forces can hold misses at least, shares of the weight
@@ -170,14 +171,18 @@ class Stance(Constraint, Model):
 
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1].
+        cone: "pyramid" is conservative and quick, "exact" is the cone itself.
 
     Source: appendix "Hierarchical whole-body control quadratic program".
     """
 
     friction_share: float = 0.7
+    cone: Literal["pyramid", "exact"] = "pyramid"
 
     def __post_init__(self) -> None:
         self.friction_share = checked_friction_share(self.friction_share)
+        if self.cone not in ("pyramid", "exact"):
+            raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
 
     info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
     measures_state: ClassVar[bool] = False
@@ -226,10 +231,14 @@ class Stance(Constraint, Model):
         attainable = whole_body.attainable_contact_acceleration(problem)
         return replace(problem, contact_acceleration=attainable)
 
+    def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
+        exact = self.cone == "exact"
+        return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, _EDGES)
+
     def _solved(self, problem: WholeBodyProblem, control: Array) -> WholeBodySolution:
         key = control.tobytes()
         if key not in self._answers:
-            self._answers[key] = whole_body.solve(replace(problem, nominal=control))
+            self._answers[key] = self.solve(replace(problem, nominal=control))
         return self._answers[key]
 
     def _holds(self, problem: WholeBodyProblem, control: Array) -> bool:

@@ -16,10 +16,12 @@ Source: appendix "Rigid Body Contact Mechanics", "Non-smooth collision manifolds
 impact force and compliance deformation" and "Physical contact feasibility constraints".
 """
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.errors import Array
+from safe_wrappers.errors import Array, whole_number
 
 Numbers = Array | float
 
@@ -50,6 +52,28 @@ def tangents(normals: ArrayLike) -> Array:
     along = axis - (axis * n).sum(axis=-1, keepdims=True) * n
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     return np.stack([along, np.cross(n, along)], axis=-2)
+
+
+def friction_pyramid(normals: ArrayLike, friction: ArrayLike, edges: int = 4) -> Array:
+    """Half-spaces inside the friction cone: `rows @ f <= 0` is a pyramid whose edges lie on the cone.
+
+    Halfway between two edges it allows `cos(pi / edges)` of the friction (four edges: 71 %, eight: 92 %). The first
+    edge is along the first of the `tangents`.
+
+    Args:
+        normals: Unit normals, pointing at the robot, shape (..., 3).
+        friction: Coefficient mu, at least 0, shape (...).
+        edges: Of the pyramid, at least 3.
+
+    Returns:
+        One row for each side, shape (..., edges, 3); together they imply that nothing pulls.
+    """
+    edges = whole_number("edges", edges, 3)
+    n, mu = np.asarray(normals, dtype=np.float64), np.asarray(friction, dtype=np.float64)
+    middle = (np.arange(edges) + 0.5) * (2.0 * math.pi / edges)
+    facing = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+    slope = mu[..., None, None] * math.cos(math.pi / edges) * n[..., None, :]
+    return np.asarray(facing @ tangents(n) - slope)
 
 
 def complementarity_residuals(gap: Numbers, force: Numbers) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ import clarabel
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.contact import cone_excess, tangents
+from safe_wrappers.control.contact import cone_excess, friction_pyramid, tangents
 from safe_wrappers.control.projection import Status
 from safe_wrappers.errors import Array, ConfigurationError, finite_array
 
@@ -89,10 +89,21 @@ class WholeBodySolution(NamedTuple):
 
     control: Array  #: shape (nu,), finite and inside the box
     acceleration: Array  #: qacc under it and the forces, shape (nv,)
-    forces: Array  #: at the contacts, shape (k, 3), N, each inside its cone
+    forces: Array  #: at the contacts, shape (k, 3), N, each inside its cone (and pyramid)
     status: Status
     contact_error: float  #: largest error of a contact's acceleration, m/s^2; of an opening one its shortfall
-    cone_error: float  #: largest violation of a friction cone, N
+    cone_error: float  #: largest violation of an exact friction cone, N, also where a pyramid was used
+
+
+def solve_pyramid(problem: WholeBodyProblem, edges: int = 4) -> WholeBodySolution:
+    """Solve with friction pyramids of so many edges, at least 3: a quadratic program, conservative."""
+    grips = problem.stance[problem.friction[problem.stance] > 0.0]
+    return _solve(problem, friction_pyramid(problem.normals[grips], problem.friction[grips], edges))
+
+
+def solve_cone(problem: WholeBodyProblem) -> WholeBodySolution:
+    """Solve with the exact friction cones: a second-order cone program."""
+    return _solve(problem, None)
 
 
 def rigid_forces(problem: WholeBodyProblem, control: Array) -> Array:
@@ -160,24 +171,26 @@ class _Motion:
         return every
 
 
-def solve(problem: WholeBodyProblem) -> WholeBodySolution:
-    """Solve the program, or say that there is no answer."""
+def _solve(problem: WholeBodyProblem, sides: Array | None) -> WholeBodySolution:
+    """With the sides of pyramids, shape (k, edges, 3), for the contacts that stay and have friction; None: cones."""
     motion, nominal, nu = _Motion(problem), problem.nominal, len(problem.nominal)
     inside = bool(((nominal >= problem.lower) & (nominal <= problem.upper)).all())
     boxed = np.clip(nominal, problem.lower, problem.upper)
+    facing = _facing(problem, sides)
 
     def checked(control: Array, near: Array, status: Status) -> WholeBodySolution | None:
         """The answer of a control and of forces close to given ones, or None if its residuals are too large."""
         forces = motion.spread(motion.forces(control, near))
         answer = _answer(problem, control, forces, status)
-        within = answer.cone_error <= _tolerance(forces)
+        pull = facing @ forces[problem.stance].reshape(-1)
+        within = max(answer.cone_error, float(pull.max(initial=0.0))) <= _tolerance(forces)
         return answer if within and answer.contact_error <= _tolerance(problem.wanted) else None
 
     none = np.zeros(motion.axes.shape[1])
     found = checked(nominal, none, Status.INACTIVE) if inside else None
     if found is not None:
         return found
-    y = by_clarabel(_program(problem, motion))
+    y = by_clarabel(_program(problem, motion, facing, sides is None))
     if isinstance(y, Status):
         return _answer(problem, boxed, motion.spread(none), y)
     found = checked(nominal, y[nu:], Status.INACTIVE) if inside else None
@@ -204,6 +217,13 @@ def _answer(problem: WholeBodyProblem, control: Array, forces: Array, status: St
     return WholeBodySolution(control, acceleration, forces, status, error, cone)
 
 
+def _facing(problem: WholeBodyProblem, sides: Array | None) -> Array:
+    """Half-spaces `facing @ f <= 0` of the forces at contacts that stay, (n, 3 s): sides, or that nothing pulls."""
+    each = iter(() if sides is None else sides)
+    contacts = zip(problem.normals[problem.stance], problem.friction[problem.stance], strict=True)
+    return _blocks([-n[None] if sides is None or mu == 0.0 else next(each) for n, mu in contacts])
+
+
 class Program(NamedTuple):
     """The program above, with `1/2 y' diag(weights) y + linear' y`."""
 
@@ -216,7 +236,7 @@ class Program(NamedTuple):
     cones: Array  # C_i, (m, 3, n)
 
 
-def _program(problem: WholeBodyProblem, motion: _Motion) -> Program:
+def _program(problem: WholeBodyProblem, motion: _Motion, facing: Array, exact: bool) -> Program:
     nu, r = len(problem.nominal), motion.axes.shape[1]
     weights = np.concatenate([np.ones(nu), np.full(r, problem.force_weight)])
     linear = np.concatenate([-problem.nominal, np.zeros(r)])
@@ -225,10 +245,9 @@ def _program(problem: WholeBodyProblem, motion: _Motion) -> Program:
     limits = -np.einsum("ki,ki->k", opening, problem.wanted[problem.opening])
     box = np.eye(nu, nu + r)
     by_force = np.concatenate([np.zeros((motion.axes.shape[0], nu)), motion.axes], axis=1)
-    pulling = _blocks([-n[None] for n in problem.normals[problem.stance]])
-    every = rows @ motion.response, pulling @ by_force, box, -box
-    most = limits - rows @ motion.free, np.zeros(len(pulling)), problem.upper, -problem.lower
-    grips = np.flatnonzero(problem.friction[problem.stance] > 0.0)
+    every = rows @ motion.response, facing @ by_force, box, -box
+    most = limits - rows @ motion.free, np.zeros(len(facing)), problem.upper, -problem.lower
+    grips = np.flatnonzero(problem.friction[problem.stance] > 0.0) if exact else np.zeros(0, int)
     normals, friction = problem.normals[problem.stance[grips]], problem.friction[problem.stance[grips]]
     frame = np.concatenate([(friction[:, None] * normals)[:, None], tangents(normals)], axis=1)
     cones = frame @ by_force.reshape(-1, 3, nu + r)[grips]

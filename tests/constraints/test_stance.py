@@ -1,7 +1,5 @@
 """Stance on a table with driven legs, against the whole program put together from MuJoCo by hand, and on robots."""
 
-from dataclasses import replace
-
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -12,7 +10,6 @@ from qpsolvers import solve_qp
 from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
-from safe_wrappers.control.whole_body import solve
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.bound import Bound
 
@@ -94,30 +91,34 @@ PUSHES = [(1.0, 1.0, -1.0, -1.0), (0.9, -0.7, 0.8, 0.2), (1.0, 1.0, 1.0, 1.0), (
 
 
 @pytest.mark.parametrize("share", [0.7, 0.3])
-def test_its_answer_is_that_of_the_whole_program(share):
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_its_answer_is_that_of_the_whole_program(share, cone):
     changed = 0
     env = table()
-    stance = settled(env, sw.constraints.Stance(share), STILL, 100)
+    stance = settled(env, sw.constraints.Stance(share, cone), STILL, 100)
     for push in map(np.array, PUSHES):
         stance.plant.observe()
         admitted = stance.admits(push)
         (answer,) = stance.candidates(push)
-        # Between a pyramid inside the cone and one around it.
-        inner, outer = (whole_program(env, push, share, 64, 0.05, outer=o) for o in (False, True))
-        far = [np.linalg.norm(u - push) for u in (outer, answer, inner)]
-        assert far[0] - 1e-5 <= far[1] <= far[2] + 1e-5
-        np.testing.assert_allclose(answer, inner, atol=5e-3)
-        assert admitted or far[2] > 1e-5
-        assert not admitted or far[0] < 1e-5
+        if cone == "pyramid":
+            expected = whole_program(env, push, share, 8, 0.05)
+            np.testing.assert_allclose(answer, expected, atol=2e-5)
+            assert admitted == bool(np.abs(expected - push).max() < 2e-5)
+        else:  # between a pyramid inside and one around it
+            inner, outer = (whole_program(env, push, share, 64, 0.05, outer=o) for o in (False, True))
+            far = [np.linalg.norm(u - push) for u in (outer, answer, inner)]
+            assert far[0] - 1e-5 <= far[1] <= far[2] + 1e-5
+            np.testing.assert_allclose(answer, inner, atol=5e-3)
         if not admitted:
             changed += 1
             assert stance.admits(answer)
     assert changed >= 2
 
 
-def test_where_no_torques_will_do_it_says_so_and_stays_finite():
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone):
     env = table(gravity="0 4 -9", friction=0.05)
-    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7, cone)])
     filtered.reset()
     standing = 0
     for _ in range(25):
@@ -132,8 +133,9 @@ def test_where_no_torques_will_do_it_says_so_and_stays_finite():
 
 
 @pytest.mark.parametrize("env_id", ["Humanoid-v5", "Ant-v5", "HalfCheetah-v5"])
-def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id):
-    env = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.Stance(0.7)])
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):
+    env = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.Stance(0.7, cone)])
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     stance, counts = env.filter.bound[0].spec, {"flagged": 0, "changed": 0, "same": 0}
@@ -146,12 +148,20 @@ def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id):
             # The same program with the executed action as the nominal one: nothing is left to change.
             problem = stance.problem(info["executed_action"])
             asked = np.clip(info["executed_action"], problem.lower, problem.upper)
-            answer = solve(replace(problem, nominal=asked))
+            answer = stance.solve(type(problem)(**{**fields_of(problem), "nominal": asked}))
             assert answer.cone_error < 1e-4 and answer.contact_error < 1e-3
             # Rounded to float32 it may have to move again, and then the price of forces moves it too.
             assert np.abs(answer.control - asked).max() < 2e-3
             counts["same"] += 1
     assert counts["same"] > 10 and (counts["changed"] > 0 or env_id == "Humanoid-v5")
+
+
+def fields_of(problem):
+    return {
+        name: getattr(problem, name)
+        for name, field in type(problem).__dataclass_fields__.items()
+        if field.init
+    }
 
 
 class Witness(gym.Wrapper):
@@ -182,6 +192,7 @@ def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
     [
         ({"friction_share": 0.0}, "friction_share"),
         ({"friction_share": 1.1}, r"\(0, 1\]"),
+        ({"cone": "round"}, "pyramid"),
     ],
 )
 def test_bad_arguments_are_refused_in_words(arguments, words):

@@ -40,7 +40,7 @@ CONSTRAINTS = [
     of.SingularityMargin(geom="tip", task_speed=0.1, rate_limit=6.0, horizon=7),
     of.SingularityMargin(0.003, site="grip"),
     of.SpeedLimit(1.5, "torso", "-x", "substep", 0.1, 4, 0.7, 0.6, True),
-    of.Stance(0.6),
+    of.Stance(0.6, "exact"),
     of.SupportMargin(0.02, 0.01),
     of.TrackPermission("robot", 3.0, ("car0",)),
     of.Traction(["left", "right"], 0.1, 0.3, 0.4, 0.01),

@@ -2,27 +2,31 @@
 
 import dataclasses
 
-import clarabel
 import numpy as np
 import pytest
+import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import in_cone
 from scipy.optimize import minimize
-from scipy.sparse import csc_matrix
 
 from safe_wrappers.control import whole_body
-from safe_wrappers.control.contact import tangents
+from safe_wrappers.control.contact import friction_pyramid
 from safe_wrappers.control.projection import Status
 from safe_wrappers.control.whole_body import (
     WholeBodyProblem,
     attainable_contact_acceleration,
     rigid_forces,
-    solve,
+    solve_cone,
+    solve_pyramid,
 )
 from safe_wrappers.errors import ConfigurationError
 
 UP = np.array([0.0, 0.0, 1.0])
+SOLVERS = {
+    "daqp": solve_pyramid,
+    "cone": solve_cone,
+}
 
 
 def foot(nominal, friction=0.5, mass=2.0, bound=100.0, **more):
@@ -43,7 +47,7 @@ def foot(nominal, friction=0.5, mass=2.0, bound=100.0, **more):
 
 
 def robot(seed, nv=8, nu=5, k=3, **more):
-    """A made-up robot at an instant in which some control in the box has forces in the cones."""
+    """A made-up robot at an instant in which some control in the box has forces in the pyramids."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(nv, nv))
     inertia, actuation = root @ root.T / nv + np.eye(nv), rng.normal(size=(nv, nu)) * 3.0
@@ -63,8 +67,8 @@ def robot(seed, nv=8, nu=5, k=3, **more):
     )  # fmt: skip
 
 
-def in_full(problem):
-    """The same program in (u, qacc, f), nothing eliminated: control and half the weighted squares."""
+def in_full(problem, edges=4):
+    """The same program in (u, qacc, f), nothing eliminated, by qpsolvers: control and half the weighted squares."""
     nv, nu, k = len(problem.bias), len(problem.nominal), len(problem.normals)
     n = nu + nv + 3 * k
     stacked = problem.jacobians.reshape(3 * k, nv)
@@ -84,11 +88,12 @@ def in_full(problem):
     equal.append(rows)
     value.append(wanted)
     rows, limits = [np.zeros((0, n))], []
-    cones = []
-    for i, normal in enumerate(problem.normals):
-        block = np.zeros((3, n))
-        block[:, f][:, 3 * i : 3 * i + 3] = -np.vstack([problem.friction[i] * normal, *tangents(normal)])
-        cones.append(block)
+    sides = friction_pyramid(problem.normals, problem.friction, edges)
+    for i in range(k):
+        block = np.zeros((edges, n))
+        block[:, nu + nv + 3 * i : nu + nv + 3 * i + 3] = sides[i]
+        rows.append(block)
+        limits += [0.0] * edges
     for i in problem.opening:
         rows_i = np.zeros((1, n))
         rows_i[0, a] = -problem.normals[i] @ problem.jacobians[i]
@@ -98,41 +103,36 @@ def in_full(problem):
         none[:, nu + nv + 3 * i : nu + nv + 3 * i + 3] = np.eye(3)
         equal.append(none)
         value.append(np.zeros(3))
-    box = np.eye(nu, n)
-    rows, limits = np.vstack([*rows, box, -box]), np.concatenate([limits, problem.upper, -problem.lower])
-    equal, value = np.vstack(equal), np.concatenate(value)
-    every = csc_matrix(np.vstack([equal, rows, *cones]))
-    right = np.concatenate([value, limits, np.zeros(3 * k)])
-    kinds = [clarabel.ZeroConeT(len(value)), clarabel.NonnegativeConeT(len(limits))]
-    settings = clarabel.DefaultSettings()
-    settings.verbose, settings.tol_feas = False, 1e-10
-    settings.tol_gap_abs = settings.tol_gap_rel = 1e-10
-    kinds += [clarabel.SecondOrderConeT(3)] * k
-    found = clarabel.DefaultSolver(csc_matrix(hessian), linear, every, right, kinds, settings).solve()
-    x = np.asarray(found.x)
-    solved = str(found.status) in ("Solved", "AlmostSolved")
-    return (x[:nu], 0.5 * (x @ hessian @ x + constant) + linear @ x) if solved else None
+    free = np.full(n - nu, np.inf)
+    x = qpsolvers.solve_qp(
+        hessian, linear, np.vstack(rows), np.array(limits), np.vstack(equal), np.concatenate(value),
+        np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free]), solver="clarabel",
+        tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10,
+    )  # fmt: skip
+    return None if x is None else (x[:nu], 0.5 * (x @ hessian @ x + constant) + linear @ x)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), k=st.integers(0, 5))
 def test_elimination_changes_nothing(seed, k):
     # Five contacts of three axes on eight degrees of freedom: seven inner forces.
     problem = robot(seed, k=k)
     expected = in_full(problem)
-    found = solve(problem)
-    if expected is None:
-        assert found.status in ("infeasible", "failed")
-        return
-    assert found.status in ("projected", "inactive")
-    if found.status == "projected":
-        # No worse, and better by no more than what the large program leaves inexact.
-        assert -1e-5 <= cost(problem, found) - expected[1] <= 1e-7 * (1.0 + abs(expected[1]))
-        assert found.control == pytest.approx(expected[0], abs=3e-3)
-    else:
-        assert found.control is problem.nominal
-        assert cost(problem, found) >= expected[1] - 1e-6
-    assert_says_the_truth(problem, found)
+    for name in ("daqp",):
+        found = SOLVERS[name](problem)
+        if expected is None:
+            assert found.status in ("infeasible", "failed")
+            continue
+        assert found.status in ("projected", "inactive")
+        if found.status == "projected":
+            # No worse, and better by no more than what the large program leaves inexact.
+            assert -1e-5 <= cost(problem, found) - expected[1] <= 1e-7 * (1.0 + abs(expected[1]))
+            assert found.control == pytest.approx(expected[0], abs=3e-3)
+        else:
+            assert found.control is problem.nominal
+            assert cost(problem, found) >= expected[1] - 1e-6
+        assert_says_the_truth(problem, found)
 
 
 def cost(problem, found):
@@ -156,7 +156,8 @@ def assert_says_the_truth(problem, found):
         assert np.abs(missed).max(initial=0.0) < 1e-5 * scale
 
 
-def test_a_foot_that_is_pushed_within_its_friction_is_left_alone_bit_for_bit():
+@pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS)
+def test_a_foot_that_is_pushed_within_its_friction_is_left_alone_bit_for_bit(solve):
     problem = foot([3.0, 1.0, -2.0])
     found = solve(problem)
     assert found.status == "inactive"
@@ -168,7 +169,7 @@ def test_a_foot_that_is_pushed_within_its_friction_is_left_alone_bit_for_bit():
 def test_a_foot_that_is_pushed_too_hard_gets_the_closest_push_of_its_cone():
     # Allowed pushes are the cone |u_t| <= mu (m g - u_z) with its apex at m g e_z: its projection is known.
     mu, weight, nominal = 0.5, 19.62, np.array([12.0, 5.0, 3.0])
-    found = solve(foot(nominal, mu))
+    found = solve_cone(foot(nominal, mu))
     # Along (radius, height below the apex): the nearest point of the ray (mu, 1).
     sideways, below = np.linalg.norm(nominal[:2]), weight - nominal[2]
     t = (mu * sideways + below) / (1.0 + mu * mu)
@@ -194,15 +195,16 @@ def test_the_cone_by_a_solver_that_knows_no_cones():
         across = f - along[:, None] * problem.normals
         return np.concatenate([(problem.friction * along) ** 2 - (across**2).sum(axis=1), along])
 
+    start = solve_pyramid(problem).control
     other = minimize(
         lambda u: 0.5 * ((u - problem.nominal) ** 2).sum() + 0.5e-3 * (forces(u) ** 2).sum(),
-        np.zeros(5),
+        start,
         bounds=[(-1, 1)] * 5,
         constraints={"type": "ineq", "fun": slack},
         method="SLSQP",
         options={"ftol": 1e-12, "maxiter": 500},
     )
-    found = solve(problem)
+    found = solve_cone(problem)
     assert found.status == "projected"
     assert other.success
     assert cost(problem, found) == pytest.approx(other.fun, rel=1e-5)
@@ -224,7 +226,8 @@ def table(load_at, legs, friction=0.5):
     )  # fmt: skip
 
 
-def test_what_no_control_does_is_infeasible():
+@pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS)
+def test_what_no_control_does_is_infeasible(solve):
     # The floor is to rise at 3 m/s^2: with motors of 5 N the mass can follow, but sink at 20 it cannot.
     problem = foot([0.0, 0.0, 0.0], bound=5.0, contact_acceleration=np.array([[0.0, 0.0, 3.0]]))
     assert solve(problem).status == "inactive"
@@ -242,12 +245,12 @@ def test_wanted_accelerations_that_contradict_each_other_are_infeasible_until_ma
     apart = dataclasses.replace(
         problem, contact_acceleration=np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 0, 0]])
     )
-    found = solve(apart)
+    found = solve_pyramid(apart)
     assert found.status == "infeasible"
     assert found.contact_error > 0.5
     attainable = attainable_contact_acceleration(apart)
     assert np.abs(attainable[0, 0] - attainable[1, 0]) < 1e-9
-    assert solve(dataclasses.replace(apart, contact_acceleration=attainable)).status == "inactive"
+    assert solve_pyramid(dataclasses.replace(apart, contact_acceleration=attainable)).status == "inactive"
     # What is attainable already stays as it is.
     consistent = robot(0, k=3)
     assert attainable_contact_acceleration(consistent) == pytest.approx(consistent.contact_acceleration)
@@ -255,28 +258,30 @@ def test_wanted_accelerations_that_contradict_each_other_are_infeasible_until_ma
 
 def test_a_contact_that_opens_gives_no_force_and_moves_away():
     opening = {"breaking": np.array([True]), "contact_acceleration": np.array([[0.0, 0.0, 1.0]])}
-    found = solve(foot([2.0, 0.0, 0.0], **opening))
-    assert found.status == "projected"
-    assert not found.forces.any()
-    # m (g + 1) is the least that lifts; sideways it is free.
-    assert found.control == pytest.approx([2.0, 0.0, 2.0 * 10.81], abs=1e-5)
-    free = foot([2.0, 0.0, 30.0], **opening)
-    assert solve(free).control is free.nominal
-    weak = solve(foot([2.0, 0.0, 0.0], bound=10.0, **opening))
-    assert weak.status == "infeasible"
+    for solve in SOLVERS.values():
+        found = solve(foot([2.0, 0.0, 0.0], **opening))
+        assert found.status == "projected"
+        assert not found.forces.any()
+        # m (g + 1) is the least that lifts; sideways it is free.
+        assert found.control == pytest.approx([2.0, 0.0, 2.0 * 10.81], abs=1e-5)
+        free = foot([2.0, 0.0, 30.0], **opening)
+        assert solve(free).control is free.nominal
+        weak = solve(foot([2.0, 0.0, 0.0], bound=10.0, **opening))
+        assert weak.status == "infeasible"
 
 
 def test_a_frictionless_contact_holds_along_its_normal_alone():
-    found = solve(foot([4.0, 0.0, -1.0], friction=0.0))
+    found = solve_pyramid(foot([4.0, 0.0, -1.0], friction=0.0))
     assert found.status == "inactive"
     assert found.forces[0] == pytest.approx([0.0, 0.0, 20.62])
     assert found.acceleration == pytest.approx([2.0, 0.0, 0.0])
     assert found.contact_error < 1e-12
     pulled = foot([0.0, 0.0, 25.0], friction=0.0)
-    found = solve(pulled)
-    assert found.status == "projected"
-    assert found.control == pytest.approx([0.0, 0.0, 19.62], abs=1e-5)
-    assert found.forces[0, 2] >= -1e-6
+    for solve in SOLVERS.values():
+        found = solve(pulled)
+        assert found.status == "projected"
+        assert found.control == pytest.approx([0.0, 0.0, 19.62], abs=1e-5)
+        assert found.forces[0, 2] >= -1e-6
 
 
 @pytest.mark.parametrize("lie", ["zeros", "huge", "nothing", "claims infeasible"])
@@ -293,7 +298,7 @@ def test_a_backend_is_not_believed(monkeypatch, lie):
         }[lie]
 
     monkeypatch.setattr(whole_body, "by_clarabel", backend)
-    found = solve(problem)
+    found = solve_pyramid(problem)
     assert found.status == ("infeasible" if lie == "claims infeasible" else "failed")
     assert np.isfinite(found.control).all() and (np.abs(found.control) <= 100.0).all()
     assert np.isfinite(found.forces).all() and np.isfinite(found.acceleration).all()
@@ -314,6 +319,7 @@ def test_a_friction_below_zero_is_refused():
         foot([0.0] * 3, friction=-0.1)
 
 
-def test_numbers_that_overflow_inside_are_failed_with_a_finite_control():
+@pytest.mark.parametrize("solve", SOLVERS.values())
+def test_numbers_that_overflow_inside_are_failed_with_a_finite_control(solve):
     found = solve(dataclasses.replace(robot(1), bias=np.full(8, 1.7e308)))
     assert found.status == "failed" and np.isfinite(found.control).all()

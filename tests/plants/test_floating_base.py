@@ -8,7 +8,7 @@ from asking import bound
 from oracles import in_cone
 
 from safe_wrappers.control.legged import centroidal_momentum
-from safe_wrappers.control.whole_body import WholeBodyProblem, solve
+from safe_wrappers.control.whole_body import WholeBodyProblem, solve_cone, solve_pyramid
 from safe_wrappers.plants.mujoco.dynamics import MomentumReader, equations_of_motion
 
 ZOO = """
@@ -155,13 +155,15 @@ def test_every_answer_on_a_struggling_robot_is_inside_its_cones_whatever_its_sta
             plant.lower, plant.upper, plant.upper * np.sin(np.arange(len(plant.upper)) + plant.time),
             contact_acceleration=-(terms.jacobians @ plant.qvel) / 0.05,
         )  # fmt: skip
-        found = solve(problem)
-        seen.add(str(found.status))
-        size = 1.0 + np.abs(found.forces).max()
-        assert found.status != "failed"
-        assert in_cone(found.forces, c.normal, 0.7 * c.friction, 2e-6 * size).all()
-        assert ((found.control >= plant.lower) & (found.control <= plant.upper)).all()
-        pushed = np.einsum("kiv,ki->v", terms.jacobians, found.forces)
-        missed = terms.inertia @ found.acceleration + terms.bias - terms.actuation @ found.control - pushed
-        assert np.abs(missed).max() < 1e-9 * (1.0 + np.abs(found.acceleration).max() * size)
+        for found in (solve_pyramid(problem, 8), solve_cone(problem)):
+            seen.add(str(found.status))
+            size = 1.0 + np.abs(found.forces).max()
+            assert found.status != "failed"
+            assert in_cone(found.forces, c.normal, 0.7 * c.friction, 2e-6 * size).all()
+            assert ((found.control >= plant.lower) & (found.control <= plant.upper)).all()
+            pushed = np.einsum("kiv,ki->v", terms.jacobians, found.forces)
+            missed = (
+                terms.inertia @ found.acceleration + terms.bias - terms.actuation @ found.control - pushed
+            )
+            assert np.abs(missed).max() < 1e-9 * (1.0 + np.abs(found.acceleration).max() * size)
     assert {"projected", "infeasible"} <= seen

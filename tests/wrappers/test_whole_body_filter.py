@@ -10,7 +10,8 @@ from safe_wrappers.plants.mujoco.contacts import Replay
 
 KINDS = {
     "forecast": sw.WholeBodyFilter,
-    "stance": lambda env: sw.CBFActionFilter(env, [sw.constraints.Stance()]),
+    "pyramid": lambda env: sw.CBFActionFilter(env, [sw.constraints.Stance()]),
+    "cone": lambda env: sw.CBFActionFilter(env, [sw.constraints.Stance(cone="exact")]),
 }
 
 
