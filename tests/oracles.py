@@ -69,3 +69,20 @@ def damping_ratios(arm, inertia):
     values = np.linalg.eigvals(system)
     ringing = sorted(values[values.imag > 1.0], key=abs)
     return np.array([-value.real / abs(value) for value in ringing])
+
+
+def held(axis, x, v, u):
+    """Every physics step of one control step of an env that clips the speed at its start; the speed at its end."""
+    v, u = min(max(v, -axis.clip), axis.clip), min(max(u, axis.low), axis.high)
+    xs = []
+    for _ in range(axis.substeps):
+        v = axis.decay * v + axis.gain * u
+        x += axis.timestep * v
+        xs.append(x)
+    return xs, v
+
+
+def to_rest(axis, v):
+    """The control that ends a hold at rest, bounds left aside: from two trial steps, as a step is linear in it."""
+    (_, none), (_, full) = held(axis, 0.0, v, 0.0), held(axis, 0.0, v, axis.high)
+    return -none * axis.high / (full - none)

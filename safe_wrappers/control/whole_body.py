@@ -41,7 +41,11 @@ _RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class WholeBodyProblem:
-    """One instant of a robot in contact."""
+    """One instant of a robot in contact.
+
+    Raises:
+        ConfigurationError: A number that is not finite, but for bounds; bounds that cross, or a friction below 0.
+    """
 
     inertia: Array  #: M, shape (nv, nv), positive definite
     bias: Array  #: h, shape (nv,): Coriolis, centrifugal and gravity forces minus passive ones

@@ -16,9 +16,11 @@ RADIUS = 0.2
 pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
 
 
-def filtered(**options):
-    discs = [sw.constraints.Discs("hazard_positions", RADIUS)]
-    clearance = sw.constraints.HeadingDriveClearance(discs, **options)
+HAZARDS = sw.constraints.Discs("hazard_positions", RADIUS)
+
+
+def filtered(discs=HAZARDS, **options):
+    clearance = sw.constraints.HeadingDriveClearance([discs], **options)
     env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [clearance])
     env.reset(seed=0)
     return env, env.filter.bound[0]
@@ -165,8 +167,8 @@ def test_a_control_that_is_not_looked_at_leaves_the_margin(pairs, direction):
 
 @pytest.mark.parametrize("alone", [False, True])
 def test_from_inside_a_disc_the_filter_and_the_backup_alone_lead_out(alone):
-    env, limit = filtered()
-    start(env, [[-0.1, -0.05]], (0.0, 0.0, 0.4))
+    env, limit = filtered(sw.constraints.Disc([0.0, 0.0], 0.3))
+    start(env, [[1.0, -1.0]], (0.1, 0.05, 0.4))
     rng, values, changed = np.random.default_rng(0), [], 0
     for _ in range(60):
         env.filter.observe()
@@ -178,6 +180,6 @@ def test_from_inside_a_disc_the_filter_and_the_backup_alone_lead_out(alone):
             control, changed = decision.control, changed + decision.changed
         env.env.step(control)
         env.filter.executed(control)
-    assert values[0] < -0.05 and values[-1] > 0.0
-    assert np.diff(values)[np.array(values[:-1]) < limit.spec.margin].min() > -1e-6
-    assert changed or alone
+    assert values[0] < -0.15 and values[-1] > 0.04
+    assert np.diff(values)[np.array(values[:-1]) < limit.spec.margin].min() > 1e-4
+    assert changed >= 5 or alone

@@ -21,11 +21,10 @@ from safe_wrappers.control.backup.heading_drive import (
 from safe_wrappers.plants.mujoco.planar_robot import heading_drive
 
 
-def robot(level=0):
+def robot():
     """Env, plant and constants."""
-    env = gym.make(f"SafePointGoal{level}-v0").unwrapped
-    layout = {"goal": [900.0, 900.0]} if level == 0 else {}
-    env.reset(seed=0, options={"layout": {**layout}} if layout else None)
+    env = gym.make("SafePointGoal0-v0").unwrapped
+    env.reset(seed=0, options={"layout": {"goal": [900.0, 900.0]}})
     plant = sw.MujocoPlant()
     plant.bind(env)
     return env, plant, heading_drive(plant, "agent")
@@ -41,16 +40,10 @@ def now(env):
     return Motion(*env.data.qpos[:3].tolist(), *env.data.qvel[:3].tolist())
 
 
-def random_motion(rng, speed=1.3, yaw=3.0):
-    direction = rng.uniform(-math.pi, math.pi)
-    v = speed * rng.uniform() ** 0.5
-    return Motion(
-        *rng.uniform(-1, 1, 2),
-        rng.uniform(-math.pi, math.pi),
-        v * math.cos(direction),
-        v * math.sin(direction),
-        rng.uniform(-yaw, yaw),
-    )
+def random_motion(rng, yaw=3.0):
+    direction, speed = rng.uniform(-math.pi, math.pi), 1.3 * rng.uniform() ** 0.5
+    place = *rng.uniform(-1, 1, 2), rng.uniform(-math.pi, math.pi)
+    return Motion(*place, speed * math.cos(direction), speed * math.sin(direction), rng.uniform(-yaw, yaw))
 
 
 def test_prediction_is_mujocos_own_step():
@@ -118,21 +111,25 @@ def random_scenes(count):
     return digest.hexdigest()
 
 
-def test_refusals_name_what_does_not_fit():
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda model: model.dof_damping.__setitem__(0, 0.02),
+            "'agent' is no heading drive: the slides need equal",
+        ),
+        (lambda model: setattr(model.opt, "integrator", mujoco.mjtIntegrator.mjINT_RK4), "must be Euler"),
+        (lambda model: model.body_ipos[:, 1].fill(0.01), "centre of mass must lie on the heading"),
+    ],
+)
+def test_refusals_name_what_does_not_fit(change, words):
     _, plant, _ = robot()
-    plant.model.dof_damping[0] = 0.02
-    with pytest.raises(
-        sw.SafeWrappersError, match="'agent' is no heading drive: the slides need equal damping"
-    ):
+    change(plant.model)
+    with pytest.raises(sw.SafeWrappersError, match=words):
         heading_drive(plant, "agent")
-    _, plant, _ = robot()
-    plant.model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
-    with pytest.raises(sw.SafeWrappersError, match="the integrator must be Euler"):
-        heading_drive(plant, "agent")
-    _, plant, _ = robot()
-    plant.model.body_ipos[plant.named("body", "agent"), 1] = 0.01
-    with pytest.raises(sw.SafeWrappersError, match="the centre of mass must lie on the heading"):
-        heading_drive(plant, "agent")
+
+
+def test_a_machine_of_another_kind_is_refused():
     ant = sw.MujocoPlant()
     ant.bind(gym.make("Ant-v5"))
     with pytest.raises(sw.SafeWrappersError, match="'torso' must slide along world x and y"):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from oracles import held, to_rest
 
 from safe_wrappers.control.backup import point_among_walls as of
 from safe_wrappers.control.backup.damped_axis import damped_axis
@@ -21,27 +22,11 @@ def axes(substeps=1, clip=CLIP):
     return x_axis, damped_axis(0.99, 0.2 / substeps, 0.01, substeps, -0.7, 0.9, clip)
 
 
-def held(axis, x, v, u):
-    """Every physics step of one control step of an env that clips the speed at its start."""
-    v, u = min(max(v, -axis.clip), axis.clip), min(max(u, axis.low), axis.high)
-    xs = []
-    for _ in range(axis.substeps):
-        v = axis.decay * v + axis.gain * u
-        x += axis.timestep * v
-        xs.append(x)
-    return xs, v
-
-
 def played(axis, x, v, controls):
-    """The way along one axis until rest: braking control from two trial steps, since a step is linear in it."""
+    """The way along one axis until rest."""
     xs, controls = [x], list(controls)
     while controls or abs(v) > 1e-12:
-        if controls:
-            u = controls.pop(0)
-        else:
-            (_, none), (_, full) = held(axis, 0.0, v, 0.0), held(axis, 0.0, v, axis.high)
-            u = -none * axis.high / (full - none)
-        more, v = held(axis, xs[-1], v, u)
+        more, v = held(axis, xs[-1], v, controls.pop(0) if controls else to_rest(axis, v))
         xs += more
     return xs
 
@@ -65,34 +50,19 @@ def test_a_way_is_every_physics_step_until_rest(place, velocity, controls, subst
         np.testing.assert_allclose(way[n:, i], xs[-1], rtol=0, atol=1e-9)
 
 
-@given(PAIRS, SPEEDS, CONTROLS, st.sampled_from([1, 4]))
-def test_after_a_control_step_the_rest_of_a_way_is_the_way_from_there(place, velocity, controls, substeps):
-    both = axes(substeps)
-    way = of.way(both, place, velocity, controls)
-    u = [of.brake(a, of.clipped(a, v)) for a, v in zip(both, velocity, strict=True)]
-    ends = [
-        held(a, *at)
-        for a, *at in zip(both, place, velocity, controls[0] if len(controls) else u, strict=True)
-    ]
-    then = of.way(both, np.array([x[-1] for x, _ in ends]), np.array([v for _, v in ends]), controls[1:])
-    rest, then = way[substeps:], then[: max(len(way) - substeps, 1)]
-    n = min(len(rest), len(then))
-    np.testing.assert_allclose(rest[:n], then[:n], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(way[-1], then[-1], rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(("place", "velocity"), [((math.nan, 0.0), (0.0, 0.0)), ((0.0, 0.0), (0.0, math.nan)),
-                                                 ((0.0, 0.0), (math.inf, 0.0))])  # fmt: skip
-def test_of_a_state_that_is_not_finite_no_distance_is_a_number(place, velocity):
-    way = of.way(axes(), np.array(place), np.array(velocity), np.zeros((1, 2)))
+@pytest.mark.parametrize(
+    ("place", "velocity", "holds", "clip"),
+    [
+        ([math.nan, 0.0], [0.0, 0.0], 1, CLIP),
+        ([0.0, 0.0], [0.0, math.nan], 1, CLIP),
+        ([0.0, 0.0], [math.inf, 0.0], 1, CLIP),
+        ([0.0, 0.0], [1e9, 0.0], 0, math.inf),  # it does not end soon
+    ],
+)
+def test_of_a_way_that_is_not_finite_no_distance_is_a_number(place, velocity, holds, clip):
+    way = of.way(axes(clip=clip), np.array(place), np.array(velocity), np.zeros((holds, 2)))
     for whole in (False, True):
-        assert np.isnan(of.distances(way, AMONG, whole)).all()
-
-
-def test_a_way_that_does_not_end_soon_has_no_distance():
-    fast = np.array([1e9, 0.0])
-    way = of.way(axes(clip=math.inf), np.zeros(2), fast, np.zeros((0, 2)))
-    assert np.isnan(way[-1, 0]) and np.isnan(of.distances(way, AMONG, True)).all()
+        assert np.isnan(way[-1]).any() and np.isnan(of.distances(way, AMONG, whole)).all()
 
 
 def from_points(points, wall):

@@ -1,19 +1,58 @@
-"""Contacts and impacts: against the mass on its spring, integrated, drops in MuJoCo, and balances of momentum."""
+"""Contacts: pyramids inside their cones, impacts as integrated and as dropped in MuJoCo, and their residuals."""
+
+import math
 
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from safe_wrappers.control.contact import (
     braked_deflection,
     complementarity_residuals,
+    cone_excess,
+    friction_pyramid,
     peak_force,
     speed_limit,
+    tangents,
     time_to_peak,
 )
+
+UP = np.array([0.0, 0.0, 1.0])
+directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+def reach(rows, normal, tangent):
+    """How far along a tangent the rows allow a force with one newton along the normal."""
+    slope, at = rows @ tangent, -(rows @ normal)
+    return float(np.min(at[slope > 1e-12] / slope[slope > 1e-12]))
+
+
+@given(directions, st.floats(0.01, 3.0), st.integers(3, 40), st.floats(0.0, math.tau))
+def test_a_pyramid_is_inside_its_cone_for_any_number_of_edges(normal, friction, edges, angle):
+    n = np.array(normal) / np.linalg.norm(normal)
+    axes, rows, half = np.vstack([tangents(n), n]), friction_pyramid(n, friction, edges), math.pi / edges
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)  # right-handed
+    farthest, edge, middle = (
+        reach(rows, n, math.cos(turn) * axes[0] + math.sin(turn) * axes[1]) for turn in (angle, 0.0, half)
+    )
+    assert friction * math.cos(half) * (1 - 1e-9) <= farthest <= friction * (1 + 1e-9)
+    # Its edges are on the cone, the middles of its sides where the figure says.
+    assert edge == pytest.approx(friction) and middle == pytest.approx(friction * math.cos(half))
+
+
+def test_four_edges_on_a_floor_are_mujocos_pyramid_and_the_cone_is_its_formula():
+    rows = friction_pyramid(UP, 0.8, 4)
+    for force in np.random.default_rng(0).normal(0.5, 1.0, size=(500, 3)):
+        inside = abs(force[0]) + abs(force[1]) <= 0.8 * force[2]
+        assert (rows @ force <= 0.0).all() == inside
+        across = math.hypot(force[0], force[1])
+        assert cone_excess(force, UP, 0.8) == pytest.approx(max(across - 0.8 * force[2], -force[2]))
+    assert math.isnan(cone_excess([0, 0, math.nan], UP, 0.8))
+
 
 speeds, masses = st.floats(0.01, 10.0), st.floats(0.05, 100.0)
 stiffnesses, brakes = st.floats(100.0, 1e6), st.floats(0.0, 300.0)
@@ -47,30 +86,22 @@ def integrated(v, m, k, a=0.0, latency=0.0, start=0.0):
     raise AssertionError("no peak")
 
 
-@settings(max_examples=30)
-@given(speeds, masses, stiffnesses)
-def test_the_peak_is_the_oscillators(v, m, k):
-    time, depth = integrated(v, m, k)
-    assert braked_deflection(v, m, k, 0.0) == pytest.approx(depth, rel=1e-8)
-    assert peak_force(v, m, k) == pytest.approx(k * depth, rel=1e-8)
-    assert time_to_peak(m, k) == pytest.approx(time, rel=1e-8)
+@given(speeds, masses, stiffnesses, brakes, st.floats(0.0, 1.6), st.floats(0.0, 3.0))
+def test_peaks_are_those_of_the_integrated_oscillator(v, m, k, a, share, depth):
+    quarter, free = integrated(v, m, k)
+    assert time_to_peak(m, k) == pytest.approx(quarter, rel=1e-8)
+    assert braked_deflection(v, m, k, 0.0) == pytest.approx(free, rel=1e-8)
+    assert peak_force(v, m, k) == pytest.approx(k * free, rel=1e-8)
     assert peak_force(speed_limit(v, m, k), m, k) == pytest.approx(v)
-
-
-@given(speeds, masses, stiffnesses, brakes, st.floats(0.0, 1.6))
-def test_a_brake_that_comes_late_is_the_integrated_one(v, m, k, a, share):
-    latency = share * time_to_peak(m, k)
+    assert peak_force(-v, m, k) == braked_deflection(-v, m, k, a, 0.0) == 0.0
     assume(abs(share - 1.0) > 1e-6)
-    _, depth = integrated(v, m, k, a, latency)
-    assert braked_deflection(v, m, k, a, latency) == pytest.approx(depth, rel=1e-7)
-
-
-@settings(max_examples=30)
-@given(speeds, masses, stiffnesses, st.floats(0.0, 300.0), st.floats(0.0, 3.0))
-def test_the_peak_under_a_push_is_the_integrated_one_from_any_deflection(v, m, k, push, depth):
+    # A brake that comes late.
+    _, deep = integrated(v, m, k, a, share * quarter)
+    assert braked_deflection(v, m, k, a, share * quarter) == pytest.approx(deep, rel=1e-7)
+    # A push that goes on, from any deflection.
     start = depth * v * np.sqrt(m / k)
-    _, deep = integrated(v, m, k, -push / m, start=start)
-    assert peak_force(v, m, k, push, start) == pytest.approx(k * deep, rel=1e-6)
+    _, deep = integrated(v, m, k, -a / m, start=start)
+    assert peak_force(v, m, k, a, start) == pytest.approx(k * deep, rel=1e-6)
 
 
 @given(speeds, masses, stiffnesses, st.floats(0.1, 300.0))

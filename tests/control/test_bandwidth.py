@@ -1,12 +1,13 @@
-"""Hold lag and phase budget against python-control's margins, exact sampled loops and their stability limits."""
+"""Bandwidth: hold lag and margins by python-control and known stability limits, modes by SciPy's eigenvalues."""
 
 import control as ct
 import numpy as np
 import pytest
+import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.bandwidth import ControlLoop
+from safe_wrappers.control.bandwidth import ControlLoop, modes
 from safe_wrappers.errors import ConfigurationError
 
 
@@ -20,11 +21,8 @@ def test_a_hold_lags_by_half_its_interval(crossover, share_of_the_sampling_rate)
     hold = share_of_the_sampling_rate * 2 * np.pi / crossover
     hold_response = (1 - np.exp(-1j * crossover * hold)) / (1j * crossover * hold)
     assert phase_lag(crossover, hold) == pytest.approx(-np.angle(hold_response), rel=1e-9)
-
-
-def test_the_printed_number():
-    crossover, rate = 7.0, 50.0
-    assert np.degrees(phase_lag(crossover, 1 / rate)) == pytest.approx(28.65 * crossover / rate, rel=1e-4)
+    # The printed number.
+    assert np.degrees(phase_lag(crossover, hold)) == pytest.approx(28.65 * crossover * hold, rel=1e-4)
 
 
 S = ct.tf("s")
@@ -73,3 +71,28 @@ def test_the_loop_turns_unstable_where_nothing_is_left_in_the_baseband_only(late
         with pytest.raises(ConfigurationError, match="Nyquist"):
             phase_lag(predicted, hold)
     assert 0 < predicted / exact - 1 < off
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_modes_are_scipys_and_light_damping_moves_its_eigenvalues_as_they_say(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 5))
+    roots = rng.normal(size=(3, n, n))
+    inertia = roots[0] @ roots[0].T + 0.3 * np.eye(n)
+    stiffness = roots[1] @ np.diag(np.r_[0.0, rng.uniform(50, 900, n - 1)]) @ roots[1].T  # one rigid motion
+    damping = 1e-4 * roots[2] @ roots[2].T
+    found = modes(inertia, stiffness, damping)
+    squares = np.sort(scipy.linalg.eigh(stiffness, inertia, eigvals_only=True))
+    np.testing.assert_allclose(found.resonances**2, squares, rtol=1e-6, atol=1e-6 * squares[-1])
+    assert found.resonances[0] == found.damping_ratios[0] == 0.0
+    np.testing.assert_allclose(found.shapes.T @ inertia @ found.shapes, np.eye(n), atol=1e-7)
+    system = np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(inertia, np.hstack([stiffness, damping]))]]
+    )
+    values = np.linalg.eigvals(system)
+    ringing = values[values.imag > 1e-3]
+    ringing = ringing[np.argsort(np.abs(ringing))]
+    np.testing.assert_allclose(found.resonances[1:], np.abs(ringing), rtol=1e-4)
+    np.testing.assert_allclose(
+        found.damping_ratios[1:], -ringing.real / np.abs(ringing), rtol=1e-2, atol=1e-9
+    )
