@@ -231,6 +231,6 @@ def test_from_inside_a_disc_the_filter_and_the_backup_alone_lead_out():
                 control, changed = decision.control, changed + decision.changed
             env.env.step(control)
             env.filter.executed(control)
-        assert values[0] < -0.15 and values[-1] > 0.0
-        assert np.diff(values)[np.array(values[:-1]) < clearance.margin].min() > -1e-6
-        assert changed or policy is None
+        assert values[0] < -0.15 and values[-1] > 0.04
+        assert np.diff(values)[np.array(values[:-1]) < clearance.margin].min() > 1e-4
+        assert changed >= 5 or policy is None

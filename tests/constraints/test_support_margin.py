@@ -36,15 +36,15 @@ def table(feet=CORNERS, step=0.0, gravity="0 0 -9.81"):
     )
 
 
-@pytest.mark.parametrize(("inset", "margin"), [(0.03, 0.0), (0.1, 0.0), (0.03, 0.05)])
-def test_it_admits_pushes_up_to_where_the_table_tips_about_the_inset_edge(inset, margin):
+@pytest.mark.parametrize("inset", [0.03, 0.1])
+def test_it_admits_pushes_up_to_where_the_table_tips_about_the_inset_edge(inset):
     # A push F at the height h moves the zero moment point by F h / W; farther than the edge it cannot go.
-    tips = WEIGHT * (HALF - inset - margin) / HEIGHT / 50.0
+    tips = WEIGHT * (HALF - inset) / HEIGHT / 50.0
     for way in (-1.0, 1.0):
-        limit = settled(table(), sw.constraints.SupportMargin(inset, margin), np.array([0.97 * way * tips]))
+        limit = settled(table(), sw.constraints.SupportMargin(inset), np.array([0.97 * way * tips]))
         assert limit.admits(np.array([0.97 * way * tips]))
         assert not limit.admits(np.array([1.04 * way * tips]))
-        assert limit.slack(np.array([9.0 * way * tips])) >= -(inset + margin + 1e-9)
+        assert limit.slack(np.array([9.0 * way * tips])) >= -(inset + 1e-9)
 
 
 def test_the_distance_is_that_of_the_moments():
@@ -138,8 +138,8 @@ def test_a_table_that_is_pushed_over_stays_up_and_keeps_its_inset():
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"inset": 0.0}, {"inset": -0.01}, {"inset": np.nan}, {"inset": "1 cm"}, {"inset": 0.1, "margin": -1.0}],
+    [{"inset": 0.0}, {"inset": -0.01}, {"inset": np.nan}, {"inset": "1 cm"}],
 )
 def test_bad_arguments_are_refused(arguments):
-    with pytest.raises(ConfigurationError, match=r"inset|margin"):
+    with pytest.raises(ConfigurationError, match="inset"):
         sw.constraints.SupportMargin(**arguments)
