@@ -61,3 +61,13 @@ def bias_of(arm, q, q_dot):
     sin = arm.coupling * np.sin(q[..., 1])
     v0, v1 = q_dot[..., 0], q_dot[..., 1]
     return np.stack([-sin * v1 * (2.0 * v0 + v1), sin * v0 * v0], axis=-1)
+
+
+def vibration_energy(arm, qpos, qvel, torque):
+    """Of the boundary layer, J, at coordinates motor 0, spring 0, motor 1, spring 1, shape (4,); from matrices."""
+    q, q_dot = qpos[::2] + qpos[1::2], qvel[::2] + qvel[1::2]
+    m = inertia_of(arm, q)
+    z0 = manifold(torque - arm.motor_damping * qvel[::2], arm.rotor_inertia, m, bias_of(arm, q, q_dot))
+    away, rate = -qpos[1::2] - z0 / arm.stiffness, -qvel[1::2]
+    mobility = np.diag(1.0 / arm.rotor_inertia) + np.linalg.inv(m)
+    return 0.5 * (arm.stiffness @ away**2 + rate @ np.linalg.solve(mobility, rate))

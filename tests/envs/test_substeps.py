@@ -8,9 +8,9 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from flexible_joint import bias_of, inertia_of, manifold
+from flexible_joint import vibration_energy
 
-from safe_wrappers.envs.flex_joint_reach import MOTORS, SPRINGS, TORQUE_RATING
+from safe_wrappers.envs.flex_joint_reach import SPRINGS, TORQUE_RATING
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
 
 State = tuple[np.ndarray, np.ndarray]  # qpos, qvel
@@ -95,16 +95,6 @@ def of_crossing(env):
         return [bool(one.any()) for one in now], {"collisions": begun}
 
     return judge
-
-
-def vibration_energy(arm, qpos, qvel, torque):
-    """Of the boundary layer, from matrices."""
-    q, q_dot = qpos[MOTORS] + qpos[SPRINGS], qvel[MOTORS] + qvel[SPRINGS]
-    m = inertia_of(arm, q)
-    z0 = manifold(torque - arm.motor_damping * qvel[MOTORS], arm.rotor_inertia, m, bias_of(arm, q, q_dot))
-    away, rate = -qpos[SPRINGS] - z0 / arm.stiffness, -qvel[SPRINGS]
-    mobility = np.diag(1.0 / arm.rotor_inertia) + np.linalg.inv(m)
-    return 0.5 * (arm.stiffness @ away**2 + rate @ np.linalg.solve(mobility, rate))
 
 
 def of_arm(env):
