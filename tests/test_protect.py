@@ -219,11 +219,7 @@ def test_dm_control_tasks_are_protected_through_shimmy(task):
     assert changed
 
 
-BOX2D = {
-    "LunarLander-v3": {"continuous": True},
-    "LunarLanderContinuous-v3": {},
-    "BipedalWalker-v3": {},
-}
+BOX2D = {"LunarLander-v3": {"continuous": True}, "LunarLanderContinuous-v3": {}, "BipedalWalker-v3": {}}
 
 
 @pytest.mark.parametrize("env_id", BOX2D)
