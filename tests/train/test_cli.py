@@ -87,7 +87,7 @@ def test_compare_from_nothing_to_the_report_in_processes_of_their_own(tmp_path, 
         "Training, all episodes",
         "Evaluation, filter off",
         "Evaluation, filter on",
-        "With the filter",
+        "Return per evaluation episode",
         f"Report: {folder / 'report.html'}",
     ):
         assert text in said, text
