@@ -1,4 +1,4 @@
-"""CoastingClearance: what it admits, suggests, refuses and says."""
+"""CoastingClearance: what it admits, suggests as a `Detour`, refuses and says."""
 
 import warnings
 

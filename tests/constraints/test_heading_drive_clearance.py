@@ -1,4 +1,4 @@
-"""HeadingDriveClearance: the corners of the uncertainty, the side of a detour, and what holds at the boundary."""
+"""HeadingDriveClearance: the corners of the uncertainty, the side of a `Detour`, and what holds at the boundary."""
 
 import math
 
@@ -85,6 +85,8 @@ def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
     assert memory["detour"] == (-1.0, 50)
     limit.observe(memory)  # not needed in this step
     assert limit.executed(drive)["detour"] == (-1.0, 49)
+    limit.observe({"detour": (-1.0, 20)})
+    assert limit.spec.surroundings(2)[0] == -0.4  # of its time
 
 
 @pytest.mark.parametrize("action", [(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.3, -1.0)])
