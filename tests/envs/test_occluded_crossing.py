@@ -242,15 +242,3 @@ def test_means_and_covariances_follow_the_moment_equations(step_s, steps, mean):
             # Standard error of a normal sample's covariance entry: sqrt((P_ii P_jj + P_ij^2) / (n - 1)).
             error = np.sqrt((np.outer(variances, variances) + covariance**2) / (CARS - 1))
             assert np.abs((np.cov(state) - covariance) / error).max() < 4.5
-
-
-def test_drawing_several_steps_at_once_is_drawing_them_one_by_one():
-    means = np.array([1.0, -1.0, 1.0])
-    position, velocity = np.array([-3.0, 5.0, 0.0]), np.array([0.7, -1.2, 30.0])
-    together = Traffic(means, 0.01, 4).drive(np.random.default_rng(3), position, velocity)
-    assert together.shape == (4, 2, 3)
-    rng, single = np.random.default_rng(3), Traffic(means, 0.01, 1)
-    for state in together:
-        position, velocity = single.drive(rng, position, velocity)[0]
-        np.testing.assert_allclose(state, [position, velocity], rtol=1e-13)
-    assert rng.bit_generator.state["state"] != np.random.default_rng(3).bit_generator.state["state"]
