@@ -11,38 +11,18 @@ from safe_wrappers.filter.bound import Bound
 
 
 class Spring(gym.Env):
-    """x' = -x^2 + (4 + x) u on a line, integrated finely; scalar, so everything can be checked by hand."""
+    """x' = -x^2 + (4 + x) u on a line: scalar, so everything can be checked by hand."""
 
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-
-    def __init__(self, dt=0.1):
-        self.dt = dt
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.array([0.2])
-        self.path = [0.2]
-        return self.state.copy(), {}
-
-    def step(self, action):
-        fine = self.dt / 50
-        for _ in range(50):
-            self.state = self.state + fine * (-(self.state**2) + (4.0 + self.state) * float(action[0]))
-            self.path.append(float(self.state[0]))
-        return self.state.copy(), 0.0, False, False, {}
+    dt, state = 0.1, np.array([0.2])
 
 
-def spring_plant(dt=0.1):
-    return sw.AnalyticPlant(
-        f=lambda x: -(x**2), g=lambda x: np.array([[4.0 + x[0]]]), state=lambda env: env.state, control_dt=dt
-    )
-
-
-def observed(state, plant=None):
+def observed(state):
     env = Spring()
-    env.reset(seed=0)
-    plant = plant or spring_plant()
+    plant = sw.AnalyticPlant(
+        f=lambda x: -(x**2), g=lambda x: np.array([[4.0 + x[0]]]), state=lambda env: env.state, control_dt=0.1
+    )
     plant.bind(env)
     env.state = np.asarray(state, float)
     plant.observe()
@@ -67,14 +47,21 @@ def test_row_is_the_barrier_condition(x):
     np.testing.assert_allclose(barrier.value(), [h([x])])
 
 
-# Relative degree ----------------------------------------------------------------------------------------------
+class Cart(gym.Env):
+    """Pushed along a line, by Euler's steps."""
 
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    dt = 0.1
 
-class Cart(Spring):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.state = np.zeros(2)
-        return self.state[:1].copy(), {}
+        return self.state, {}
+
+    def step(self, action):
+        self.state = self.state + self.dt * np.array([self.state[1], float(action[0])])
+        return self.state, 0.0, False, False, {}
 
 
 def cart_filter(barrier):
@@ -86,17 +73,6 @@ def cart_filter(barrier):
     )
     return sw.CBFActionFilter(Cart(), [barrier], plant=plant)
 
-
-def test_a_position_under_a_force_is_refused_with_the_remedy():
-    with pytest.raises(
-        ConfigurationError, match=r"its relative degree is 2.*put the braking distance into h.*Clearance"
-    ):
-        filtered = cart_filter(sw.constraints.Barrier(lambda x: 1.0 - x[0]))
-        filtered.reset(seed=0)
-        filtered.step(np.array([0.5]))
-
-
-# The unit of h ------------------------------------------------------------------------------------------------
 
 UNITS = [1e-9, 1e3]
 
@@ -125,26 +101,10 @@ def test_the_unit_of_h_does_not_matter(unit):
 def test_an_h_that_no_control_acts_on_is_refused_in_every_unit(unit):
     for barrier, message in (
         (lambda x: unit, "no control acts on it"),
-        (lambda x: unit * (1.0 - x[0]), "relative degree is 2"),
+        (lambda x: unit * (1.0 - x[0]), "relative degree is 2.*put the braking distance into h.*Clearance"),
     ):
         with pytest.raises(ConfigurationError, match=message):
             cart_filter(sw.constraints.Barrier(barrier)).reset(seed=0)
-
-
-# Refusals -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"h": 4.0}, "h must be a function of the state, got 4.0"),
-        ({"alpha": -1.0}, "alpha must be a finite number > 0 in 1/s, got -1.0"),
-        ({"alpha": lambda value: value}, "alpha must be a number in 1/s"),
-    ],
-)
-def test_constructor_refuses_nonsense(arguments, message):
-    with pytest.raises(ConfigurationError, match=message):
-        sw.constraints.Barrier(**{"h": h, **arguments})
 
 
 def test_a_decay_that_outruns_the_hold_is_refused():

@@ -1,16 +1,14 @@
-"""SingularityMargin: w against MuJoCo's Jacobians, loops that seek singularity."""
+"""SingularityMargin: w against MuJoCo's Jacobians, and a threshold that is found by sampling."""
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import asked, bound
-from judged_loops import DRIVERS, Judge, Scene, drive
+from asking import asked
+from scenes import Scene
 
 import safe_wrappers as sw
 from safe_wrappers.control.barriers import validated_threshold
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.bound import Bound
 
 CHAIN = """<mujoco><compiler angle="radian"/><option timestep="0.002"><flag contact="disable"/></option><worldbody>
 <body name="base" pos=".1 0 1" euler="20 10 30"><joint name="rail" type="slide" axis="1 .2 0" range="-.5 .5"
@@ -123,117 +121,12 @@ def test_a_validated_threshold_is_that_of_the_sampled_configurations():
     assert given.spec.validated is None and given.value() == limit.value()
 
 
-# Closed loops -------------------------------------------------------------------------------------------------
-
-
-def reacher_room(threshold):
-    return lambda model, data: 0.011 * abs(np.sin(data.qpos[1])) / threshold - 1.0
-
-
-def pusher_room(threshold):
-    joints = ["r_shoulder_pan_joint", "r_shoulder_lift_joint", "r_upper_arm_roll_joint", "r_elbow_flex_joint"]
-    return lambda model, data: true_w(model, data, "body", "tips_arm", joints) / threshold - 1.0
-
-
-CASES = {
-    "Reacher": ("Reacher-v5", 0.0033, {"body": "fingertip", "directions": "xy", "horizon": 5}, reacher_room),
-    "Pusher": ("Pusher-v5", 0.05, {"body": "tips_arm", "horizon": 8}, pusher_room),
-}
-
-
-def filtered(case, plant=None, **more):
-    env_id, threshold, arguments, _ = CASES[case]
-    # Braking from full speed takes Reacher's arm far longer than any sensible look-ahead.
-    speeds = [sw.constraints.JointSpeedLimit(10.0, margin=0.01)] if case == "Reacher" else []
-    limit = sw.constraints.SingularityMargin(threshold, **arguments, **more)
-    return sw.CBFActionFilter(gym.make(env_id, disable_env_checker=True), [*speeds, limit], plant)
-
-
-def check_closed_loop(case, driver, steps, seeds, plant=None, **more):
-    _, threshold, _, room = CASES[case]
-    with pytest.warns(sw.UnsafeStateWarning):  # these arms start stretched
-        seen = drive(filtered(case, plant, **more), room(threshold), driver, steps, seeds)
-    assert seen["intervened"] > 0 and seen["flagged"] <= 0.1 * seen["steps"]
-    assert (
-        seen["outside"] <= 0.7 * seen["steps"]
-    )  # the start, which a driver that seeks it does not end itself
-    return seen
-
-
-@pytest.mark.parametrize("driver", DRIVERS)
-@pytest.mark.parametrize("case", CASES)
-def test_no_step_that_is_not_flagged_goes_below_the_threshold(case, driver):
-    check_closed_loop(case, driver, 45, [1])
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_from_the_stretched_start_it_comes_back_and_says_so(case):
-    _, threshold, _, room = CASES[case]
-    env = filtered(case)
-    judge = Judge(env, room(threshold))
-    with pytest.warns(sw.UnsafeStateWarning):
-        env.reset(seed=0)
-        rooms, unsafe = [judge.at(judge.raw.data)], []
-        assert rooms[0] < -0.5
-        for _ in range(30):
-            _, end, _, info = judge.step(env, np.zeros(env.action_space.shape, np.float32))
-            rooms.append(end)
-            unsafe.append(info["cbf/unsafe"])
-    inside = int(np.argmax(np.array(rooms) >= -1e-6))
-    assert 0 < inside <= 25 and min(rooms[inside:]) >= -1e-6
-    assert all(unsafe[: inside - 1]) and not any(unsafe[inside + 1 :])
-
-
-def test_far_above_the_threshold_the_actions_pass_bit_for_bit():
-    start = np.array([0.0, 1.5, 0.1, -0.1]), np.zeros(4)
-    bare = gym.make("Reacher-v5").unwrapped
-    env = sw.CBFActionFilter(
-        gym.make("Reacher-v5").unwrapped,
-        [sw.constraints.SingularityMargin(1e-4, body="fingertip", directions="xy")],
-    )
-    rng = np.random.default_rng(0)
-    bare.reset(seed=3)
-    env.reset(seed=3)
-    bare.set_state(*start)
-    env.unwrapped.set_state(*start)
-    for _ in range(20):
-        action = rng.uniform(-0.2, 0.2, 2).astype(np.float32)
-        a, b = bare.step(action), env.step(action)
-        assert a[0].tobytes() == b[0].tobytes() and not b[4]["cbf/intervened"]
-
-
-# Plain data, and what is refused ------------------------------------------------------------------------------
-
-
-TIP = {"body": "fingertip", "directions": "xy"}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        (TIP, ConfigurationError, "give a threshold on the manipulability, or a task_speed and a rate_limit"),
-        ({"threshold": 1e-3}, ConfigurationError, "name the one site, body or geom .*site=None"),
-        ({**TIP, "threshold": 1e-3, "directions": "xw"}, ConfigurationError, 'directions is some of "xyz"'),
-        ({**TIP, "threshold": 1e-3, "joints": ["elbow"]}, UnknownNameError, "no joint 'elbow'"),
-        (
-            {**TIP, "threshold": 0.02},
-            ConfigurationError,
-            "no configuration has .*above 0.02 .*is 0.011, half",
-        ),
-    ],
-)
-def test_nonsense_is_refused(arguments, error, message):
-    with pytest.raises(error, match=message):
-        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.SingularityMargin(**arguments)])
-
-
 def test_a_pose_with_a_position_that_is_no_number_has_no_manipulability():
-    plant = bound(gym.make("Reacher-v5"))
-    limit = Bound(sw.constraints.SingularityMargin(1e-4, body="fingertip", directions="xy"), plant)
-    qpos = np.tile([0.3, 0.8, 0.1, 0.1], (3, 1))
-    qpos[1, 2], qpos[2, 0] = (
-        np.nan,
-        np.inf,
-    )  # the target's position, which does not carry the arm, and the arm's own
-    found = limit.spec._measure(qpos)
-    assert found[0] == pytest.approx(0.1 * 0.11 * np.sin(0.8)) and np.isnan(found[1:]).all()
+    env = gym.make("Reacher-v5")
+    limit = asked(env, sw.constraints.SingularityMargin(1e-4, body="fingertip", directions="xy"))
+    path = limit.plant.rollout(np.zeros(2), 2)
+    path.qpos[:3] = [0.3, 0.8, 0.1, 0.1]
+    # The target's position, which does not carry the arm, and the arm's own.
+    path.qpos[1, 2], path.qpos[2, 0] = np.nan, np.inf
+    found = limit.h_along(path)[:3, 0]
+    assert found[0] == pytest.approx(0.1 * 0.11 * np.sin(0.8) / 1e-4 - 1.0) and np.isnan(found[1:]).all()

@@ -1,4 +1,4 @@
-"""Contacts: friction cones, impacts as integrated and as dropped in MuJoCo, and their residuals."""
+"""Contacts: pyramids inside their cones, impacts as integrated and as dropped in MuJoCo, and their residuals."""
 
 import math
 
@@ -13,6 +13,7 @@ from safe_wrappers.control.contact import (
     braked_deflection,
     complementarity_residuals,
     cone_excess,
+    friction_pyramid,
     peak_force,
     speed_limit,
     tangents,
@@ -20,19 +21,34 @@ from safe_wrappers.control.contact import (
 )
 
 UP = np.array([0.0, 0.0, 1.0])
-directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
-@given(directions)
-def test_tangents_are_a_right_handed_frame(normal):
+def reach(rows, normal, tangent):
+    """How far along a tangent the rows allow a force with one newton along the normal."""
+    slope, at = rows @ tangent, -(rows @ normal)
+    return float(np.min(at[slope > 1e-12] / slope[slope > 1e-12]))
+
+
+@given(DIRECTIONS, st.floats(0.01, 3.0), st.integers(3, 40), st.floats(0.0, math.tau))
+def test_a_pyramid_is_inside_its_cone_for_any_number_of_edges(normal, friction, edges, angle):
     n = np.array(normal) / np.linalg.norm(normal)
-    axes = np.vstack([tangents(n), n])
+    axes, rows, half = np.vstack([tangents(n), n]), friction_pyramid(n, friction, edges), math.pi / edges
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert np.linalg.det(axes) == pytest.approx(1.0)  # right-handed
+    farthest, edge, middle = (
+        reach(rows, n, math.cos(turn) * axes[0] + math.sin(turn) * axes[1]) for turn in (angle, 0.0, half)
+    )
+    assert friction * math.cos(half) * (1 - 1e-9) <= farthest <= friction * (1 + 1e-9)
+    # Its edges are on the cone, the middles of its sides where the figure says.
+    assert edge == pytest.approx(friction) and middle == pytest.approx(friction * math.cos(half))
 
 
-def test_the_cone_is_its_formula():
+def test_four_edges_on_a_floor_are_mujocos_pyramid_and_the_cone_is_its_formula():
+    rows = friction_pyramid(UP, 0.8, 4)
     for force in np.random.default_rng(0).normal(0.5, 1.0, size=(500, 3)):
+        inside = abs(force[0]) + abs(force[1]) <= 0.8 * force[2]
+        assert (rows @ force <= 0.0).all() == inside
         across = math.hypot(force[0], force[1])
         assert cone_excess(force, UP, 0.8) == pytest.approx(max(across - 0.8 * force[2], -force[2]))
     assert math.isnan(cone_excess([0, 0, math.nan], UP, 0.8))
