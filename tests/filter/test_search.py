@@ -349,6 +349,14 @@ class Case(NamedTuple):
     fallback: Any = "brake"
 
 
+class InMargin(Predicting):
+    """A first control of more, or else of less, keeps the limit itself."""
+
+    def __init__(self, more):
+        super().__init__(lambda u: u[0] - 2.0, at_most(0.0))
+        self.keeps_limit = lambda control: (control[0] > 0.5) == more
+
+
 BALANCE = Predicting(lambda u: sum(u) - 0.5, [((-1.0, -1.0), -0.5)])
 NO_NUMBERS = lambda u: [((np.nan, 0.0), 0.3), *at_most(0.3)]  # noqa: E731
 CONTRADICTION, NAN_ROW = at_least(0.5) + at_most(0.0), Rows(((np.nan, 0.0), 0.0))
@@ -400,6 +408,8 @@ CASES = {
     "the fallback may violate least itself": Case(
         [Predicting(lambda u: -1.0 - abs(u[0]), at_most(0.0))], STOP, (0.0, 0.5), True
     ),
+    "inside the margin what violates it least may keep the limit": Case([InMargin(True)], LEAST, (1.0, 0.5)),
+    "or the fallback does": Case([InMargin(False)], STOP, (0.0, 0.5)),
     # The proposal, tried first, violates the prediction least, and the rows.
     "the least violation keeps the rows": Case(
         [Predicting(lambda u: u[0] - 2.0), LEFT], STOP, (0.0, 0.5), True
