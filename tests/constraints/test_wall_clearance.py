@@ -28,7 +28,8 @@ ROOM_WITH_BLOCKS = """<mujoco><option timestep="0.01" gravity="0 0 0"/>
 <default><joint damping="1"/><geom margin="0.002" density="1000" condim="1"/></default>
 <worldbody>{blocks}<body name="ball">
 <joint name="y" type="slide" axis="0 1 0"/><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1"/></body>
-</worldbody><actuator><motor joint="x" ctrlrange="-1 1" gear="100"/><motor joint="y" ctrlrange="-0.8 1" gear="90"/></actuator>
+</worldbody>
+<actuator><motor joint="x" ctrlrange="-1 1" gear="100"/><motor joint="y" ctrlrange="-0.8 1" gear="90"/></actuator>
 </mujoco>"""
 
 
