@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.processes import RunStoppedError
@@ -92,6 +93,37 @@ class FakeFilter(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
 def shield(env, margin=0.0):
     return FakeFilter(env, margin)
+
+
+def slow_joints(env, mass=1.0, delay_s=0.0):
+    """A filter whose model and delay are not the env's."""
+    plant = sw.MujocoPlant(delay_s=delay_s)
+    plant.perturb(mass=mass)
+    return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0)], plant=plant, margin=0.5)
+
+
+def slow_pendulum(env, delay_s=0.0):
+    """A filter with a plant of the user's."""
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.array([x[1], 15 * np.sin(x[0])]),
+        g=lambda x: np.array([[0.0], [3.0]]),
+        state=lambda env: env.state,
+        control_dt=0.05,
+        delay_s=delay_s,
+    )
+    constraint = sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
+    return sw.CBFActionFilter(env, [constraint], plant=plant)
+
+
+class RowsOnly(sw.Constraint):
+    """A constraint without an h."""
+
+    def rows(self):
+        return None
+
+
+def without_h(env):
+    return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0), RowsOnly()])
 
 
 gym.register("FakeGoal-v0", "fake_task:FakeGoal")

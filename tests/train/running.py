@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.files import read_rows
@@ -79,3 +80,12 @@ def finish(folder):
 def episodes(folder):
     """The rows of a run's training."""
     return read_rows(folder / "episodes.csv")
+
+
+def scalars(folder):
+    """Tag -> (step, value) pairs, of what a run sent to TensorBoard."""
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    return {
+        tag: [(each.step, each.value) for each in events.Scalars(tag)] for tag in events.Tags()["scalars"]
+    }
