@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 from judged_loops import (
@@ -19,6 +18,7 @@ from judged_loops import (
     flagged,
     full,
     inside_the_hull,
+    manipulability,
     noisy,
     pulse,
     seeking,
@@ -84,12 +84,7 @@ ARM_JOINTS = "r_shoulder_pan_joint", "r_shoulder_lift_joint", "r_upper_arm_roll_
 
 
 def pusher_manipulability(model, data):
-    """By the singular values of MuJoCo's own Jacobian."""
-    mujoco.mj_comPos(model, data)
-    linear = np.zeros((3, model.nv))
-    mujoco.mj_jacBody(model, data, linear, None, model.body("tips_arm").id)
-    columns = linear[:, model.jnt_dofadr[[model.joint(j).id for j in ARM_JOINTS]]]
-    return np.prod(np.linalg.svd(columns, compute_uv=False)) / 0.05 - 1.0
+    return manipulability(model, data, "body", "tips_arm", ARM_JOINTS) / 0.05 - 1.0
 
 
 def impact(mass, stiffness, horizon, steps, **fine):
