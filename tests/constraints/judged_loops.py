@@ -8,20 +8,11 @@ from scipy.spatial import ConvexHull
 from safe_wrappers.plants.mujoco.contacts import Replay
 
 
-def sliders(count=1, actuator="motor", range_="-1 1", **options):
-    """Masses of 1 kg on slides of their own, along x, without gravity: `v' = u` each."""
-    limit = 'ctrllimited="false"' if range_ is None else f'ctrlrange="{range_}"'
-    bodies = "".join(
-        f'<body name="b{i}" pos="0 {i} 0"><joint name="x{i}" type="slide" axis="1 0 0"/>'
-        '<geom size=".1" mass="1"/></body>'
-        for i in range(count)
-    )
-    motors = "".join(f'<{actuator} joint="x{i}" {limit}/>' for i in range(count))
-    return Scene(
-        f"""<mujoco><option timestep="0.01" gravity="0 0 0"><flag contact="disable"/></option>
-        <worldbody>{bodies}</worldbody><actuator>{motors}</actuator></mujoco>""",
-        **options,
-    )
+def slider(strength=1.0, gear=1.0):
+    """A mass of 1 kg on a slide along x, without gravity: `v' = gear u`, from -strength to strength."""
+    return Scene(f"""<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
+        <body name="b0"><joint name="x0" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body></worldbody>
+        <actuator><motor joint="x0" ctrlrange="{-strength} {strength}" gear="{gear}"/></actuator></mujoco>""")
 
 
 HALF, HEIGHT, MASS = 0.2, 0.5, 5.0

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from judged_loops import sliders
+from judged_loops import slider
 
 import safe_wrappers as sw
 from safe_wrappers import constraints as of
@@ -186,7 +186,7 @@ def test_a_clearance_on_an_analytic_plant_needs_to_know_where_the_point_is():
         f=lambda x: np.zeros(2), g=lambda x: np.ones((2, 1)), state=lambda env: np.zeros(2), control_dt=0.05
     )
     with pytest.raises(ConfigurationError, match="say where the point is in the state"):
-        sw.CBFActionFilter(sliders(), [of.Clearance([DISC], 1.0)], plant=plant)
+        sw.CBFActionFilter(slider(), [of.Clearance([DISC], 1.0)], plant=plant)
 
 
 def test_a_slip_is_not_limited_under_a_delay():

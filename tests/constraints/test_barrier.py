@@ -1,30 +1,24 @@
-"""Barrier: the user's own h, decay, relative degree and the reserve between samples."""
+"""Barrier: the user's own h, its decay, its relative degree and its unit."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from asking import Asked
+from judged_loops import slider
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.bound import Bound
 
 
-class Spring(gym.Env):
-    """x' = -x^2 + (4 + x) u on a line: scalar, so everything can be checked by hand."""
-
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    dt, state = 0.1, np.array([0.2])
-
-
-def observed(state):
-    env = Spring()
+def observed(x):
+    """A plant of x' = -x^2 + (4 + x) u in the state x: scalar, so everything can be checked by hand."""
     plant = sw.AnalyticPlant(
-        f=lambda x: -(x**2), g=lambda x: np.array([[4.0 + x[0]]]), state=lambda env: env.state, control_dt=0.1
+        f=lambda x: -(x**2),
+        g=lambda x: np.array([[4.0 + x[0]]]),
+        state=lambda env: np.array([x]),
+        control_dt=0.05,
     )
-    plant.bind(env)
-    env.state = np.asarray(state, float)
+    plant.bind(slider())
     plant.observe()
     return plant
 
@@ -35,7 +29,7 @@ def h(x):
 
 @pytest.mark.parametrize("x", [-0.8, -0.1, 0.3, 0.9])
 def test_row_is_the_barrier_condition(x):
-    plant = observed([x])
+    plant = observed(x)
     barrier = Asked(sw.constraints.Barrier(h, alpha=3.0, margin=0.05), plant)
     rows = barrier.rows()
     rng = np.random.default_rng(0)
@@ -47,31 +41,14 @@ def test_row_is_the_barrier_condition(x):
     np.testing.assert_allclose(barrier.value(), [h([x])])
 
 
-class Cart(gym.Env):
-    """Pushed along a line, by Euler's steps."""
-
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    dt = 0.1
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.zeros(2)
-        return self.state, {}
-
-    def step(self, action):
-        self.state = self.state + self.dt * np.array([self.state[1], float(action[0])])
-        return self.state, 0.0, False, False, {}
-
-
-def cart_filter(barrier):
+def slider_filter(barrier):
     plant = sw.AnalyticPlant(
         f=lambda x: np.array([x[1], 0.0]),
         g=lambda x: np.array([[0.0], [1.0]]),
-        state=lambda env: env.state,
-        control_dt=0.1,
+        state=lambda env: np.concatenate([env.data.qpos, env.data.qvel]),
+        control_dt=0.05,
     )
-    return sw.CBFActionFilter(Cart(), [barrier], plant=plant)
+    return sw.CBFActionFilter(slider(), [barrier], plant=plant)
 
 
 UNITS = [1e-9, 1e3]
@@ -80,11 +57,11 @@ UNITS = [1e-9, 1e3]
 def driven(unit):
     """What is executed, and h in its unit, under a policy that heads for a speed beyond the limit."""
     of_h = lambda x: unit * (0.25 - x[1] ** 2)  # noqa: E731
-    filtered = cart_filter(sw.constraints.Barrier(of_h, alpha=2.0))
+    filtered = slider_filter(sw.constraints.Barrier(of_h, alpha=2.0))
     filtered.reset(seed=0)
     seen = []
     for _ in range(20):
-        info = filtered.step(np.array([0.9], dtype=np.float32))[4]
+        info = filtered.step(np.array([0.9]))[4]
         assert not info["cbf/fallback"]
         seen.append((info["executed_action"][0], info["cbf/margin"] / unit, info["cbf/intervened"]))
     return np.array(seen, dtype=float)
@@ -104,12 +81,12 @@ def test_an_h_that_no_control_acts_on_is_refused_in_every_unit(unit):
         (lambda x: unit * (1.0 - x[0]), "relative degree is 2.*put the braking distance into h.*Clearance"),
     ):
         with pytest.raises(ConfigurationError, match=message):
-            cart_filter(sw.constraints.Barrier(barrier)).reset(seed=0)
+            slider_filter(sw.constraints.Barrier(barrier)).reset(seed=0)
 
 
 def test_a_decay_that_outruns_the_hold_is_refused():
-    Bound(sw.constraints.Barrier(h, alpha=10.0), observed([0.0]))
+    Bound(sw.constraints.Barrier(h, alpha=20.0), observed(0.0))
     with pytest.raises(
-        ConfigurationError, match=r"alpha = 10.1/s lets h cross zero within one hold of 0.1 s; .* 10/s"
+        ConfigurationError, match=r"alpha = 20.1/s lets h cross zero within one hold of 0.05 s; .* 20/s"
     ):
-        Bound(sw.constraints.Barrier(h, alpha=10.1), observed([0.0]))
+        Bound(sw.constraints.Barrier(h, alpha=20.1), observed(0.0))

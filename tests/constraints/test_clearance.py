@@ -168,7 +168,7 @@ def test_approach_is_what_the_barrier_counts_the_stopping_distance_from(frame):
     assert clearance.value() == pytest.approx(room - stops, abs=1e-12)
 
 
-# Moving obstacles and tracks ----------------------------------------------------------------------------------
+# Moving obstacles ---------------------------------------------------------------------------------------------
 
 
 class Chaser(gym.Env):
@@ -218,34 +218,6 @@ def test_a_published_moving_disc_is_evaded(policy):
     assert 0.0 <= closest < 0.05
     blind = chase(sw.constraints.Discs("discs", 0.5), policy)
     assert blind < 0.0  # taken for standing still it runs the cart over: the test has teeth
-
-
-def test_in_a_clearance_it_keeps_a_machine_out_and_what_is_missing_is_named():
-    def clearance(**options):
-        return sw.constraints.Clearance(
-            [sw.constraints.TrackedDiscs(0.4, **options)],
-            bodies=["robot"],
-            braking=3.0,
-            radius=0.2,
-            margin=0.02,
-        )
-
-    bare = sw.CBFActionFilter(gym.make("OccludedCrossing-v0"), [clearance()])
-    with pytest.raises(UnknownNameError, match="no attribute 'tracking'"):
-        bare.reset(seed=0)
-    env = sw.CBFActionFilter(gym.make("OccludedCrossing-v0"), [clearance(attribute="car_tracks")])
-    # Cars that stand in a row across the way: it stops before them.
-    row = {"agent": [0.0, -2.9, 0.0], "cars": [[-0.9, 0], [0.0, 0], [0.9, 0], [-0.9, 0], [0, 0], [0.9, 0]]}
-    pillars = [[-3, -1.9], [3, -1.9], [-3, 1.9], [3, 1.9]]
-    env.reset(seed=0, options={"layout": {**row, "pillars": pillars}})
-    raw, changed = env.unwrapped, 0
-    for _ in range(100):
-        state = raw.data.qpos.copy(), raw.data.qvel.copy()
-        state[0][3:], state[1][3:] = [-0.9, 0, 0.9] * 2, 0.0  # they would drive on
-        raw.set_state(*state)
-        info = env.step(np.array([0.0, 1.0, 0.0]))[4]
-        changed += info["cbf/intervened"]
-    assert changed > 20 and raw.agent_position[1] < -0.8 - 0.55
 
 
 # TrackPermission ----------------------------------------------------------------------------------------------

@@ -88,10 +88,15 @@ def test_no_control_is_admitted_where_nothing_leaves_more_and_the_state_is_unsaf
 
 
 def test_far_from_everything_nothing_is_forecast():
-    _, constraint, _ = bound([[3.0, 0.0]], max_decrease=0.05, max_decrease_per_speed=0.13)
+    env, constraint, plant = bound([[3.0, 0.0]], max_decrease=0.05, max_decrease_per_speed=0.13)
     constraint.coasting.run = None  # any forecast would fail
     assert constraint.admits(FULL)
     assert constraint.value() == pytest.approx(2.8)
+    for _ in range(10):
+        env.unwrapped.step(np.array([1.0, -1.0]))  # turning moves no origin
+    plant.observe()
+    room = np.linalg.norm([3.0, 0.0] - env.unwrapped.agent_position) - 0.2
+    assert constraint.value() == pytest.approx(room - 0.13 * np.hypot(*env.unwrapped.data.qvel[:2]), abs=1e-6)
 
 
 def test_a_reach_that_is_broken_is_dropped_with_a_warning():

@@ -1,14 +1,19 @@
-"""ContactFeasibility and SupportMargin: where a pushed ball slides, where a pushed table tips, and what they report.
+"""ContactFeasibility and SupportMargin where balls slide and tables tip; Stance by a program put together by hand.
 
 Closed loops are in test_forecast_loops.py.
 """
 
+from dataclasses import replace
+
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from asking import settled
-from judged_loops import HALF, HEIGHT, MASS, ForceJudge, at_random, cone_room, inside_the_hull, table
+from judged_loops import HALF, HEIGHT, MASS, ForceJudge, at_random, cone_room, flagged, inside_the_hull, table
+from qpsolvers import solve_qp
 from scenes import Scene
+from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
 from safe_wrappers.errors import UnsupportedEnvError
@@ -128,3 +133,172 @@ def test_what_it_reports_is_what_the_env_s_own_contacts_were(key):
         assert info[key] == (pytest.approx(least, abs=1e-7) if np.isfinite(least) else 0.0)
         finite += bool(np.isfinite(least))
     assert finite > 20
+
+
+# Stance: a table with driven legs, against the whole program from MuJoCo's numbers, and robots ----------------
+
+LEGS = [(x, y) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
+FRICTION = 0.8
+
+
+def legged_table(gravity="0 0 -9.81", friction=FRICTION, cone="pyramidal", more="", range_=""):
+    """Four legs that swing along x, each with a motor of 30 N m and a spring that holds it upright."""
+    legs = "".join(
+        f'<body pos="{x} {y} 0"><joint name="j{i}" axis="0 1 0" stiffness="300" damping="6" {range_}/>'
+        f'<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4" contype="0" conaffinity="0"/>'
+        f'<geom pos="0 0 -.3" size=".03" mass=".2"/></body>'
+        for i, (x, y) in enumerate(LEGS)
+    )
+    motors = "".join(f'<motor joint="j{i}" gear="30" ctrllimited="true" ctrlrange="-1 1"/>' for i in range(4))
+    return Scene(
+        f"""<mujoco><compiler angle="radian"/><option timestep="0.002" gravity="{gravity}" cone="{cone}"/>
+        <default><geom friction="{friction} 0 0"/></default>
+        <worldbody><geom name="floor" type="plane" size="9 9 1"/>
+        <body name="trunk" pos="0 0 .33"><freejoint/>
+        <geom type="box" size=".35 .25 .05" mass="6"/>{legs}{more}</body></worldbody>
+        <actuator>{motors}</actuator></mujoco>"""
+    )
+
+
+STILL = np.zeros(4)
+
+
+def whole_program(env, nominal, share, edges, settle_s, outer=False):
+    """The closest controls, by an interior-point solver on controls and forces, nothing eliminated; None: none."""
+    m, d = env.model, mujoco.MjData(env.model)
+    d.qpos[:], d.qvel[:], d.ctrl[:] = env.data.qpos, env.data.qvel, nominal
+    mujoco.mj_forward(m, d)
+    inertia = np.zeros((m.nv, m.nv))
+    mujoco.mj_fullM(m, d, inertia)
+    bias = d.qfrc_bias - d.qfrc_passive
+    moments = np.zeros((m.nu, m.nv))
+    mujoco.mju_sparse2dense(moments, d.actuator_moment, d.moment_rownnz, d.moment_rowadr, d.moment_colind)
+    drive = (moments * m.actuator_gainprm[:, :1]).T
+    jacobians, sides, drifts = [], [], []
+    for contact in d.contact:
+        jac, dot = np.zeros((2, 3, m.nv))
+        frame, body = contact.frame.reshape(3, 3), m.geom_bodyid[contact.geom[1]]
+        assert contact.geom[0] == 0 and frame[0] @ [0, 0, 1] == pytest.approx(1.0)
+        mujoco.mj_jac(m, d, jac, None, contact.pos, body)
+        mujoco.mj_jacDot(m, d, dot, None, contact.pos, body)
+        jacobians.append(jac)
+        drifts.append(dot @ d.qvel)
+        around = 2.0 * np.pi * (np.arange(edges) + 0.5) / edges
+        slope = share * FRICTION * (1.0 if outer else np.cos(np.pi / edges))
+        # Sides between edges that lie on the cone, the first along the frame's first tangent; or around the cone.
+        sides.append(
+            np.outer(np.cos(around), frame[1]) + np.outer(np.sin(around), frame[2]) - slope * frame[0]
+        )
+    held = np.concatenate(jacobians)
+    aim = -held @ d.qvel / settle_s - np.concatenate(drifts)
+    aim = (
+        held @ np.linalg.lstsq(held, aim, rcond=1e-5)[0]
+    )  # feet that belong together cannot all come to rest alone
+    k, nu = len(held), m.nu
+    response = np.linalg.solve(inertia, np.column_stack([drive, held.T, -bias]))
+    left, size, right = np.linalg.svd(held @ response[:, :-1], full_matrices=False)
+    rank = int((size > 1e-9 * size[0]).sum())
+    equal = (right[:rank] * size[:rank, None], left[:, :rank].T @ (aim - held @ response[:, -1]))
+    rows = np.zeros((len(sides) * edges, nu + k))
+    for i, side in enumerate(sides):
+        rows[i * edges : (i + 1) * edges, nu + 3 * i : nu + 3 * i + 3] = side
+    cost = csc_matrix(np.diag(np.concatenate([np.ones(nu), np.full(k, 1e-8)])))
+    low, high = np.concatenate([m.actuator_ctrlrange, np.tile([[-np.inf, np.inf]], (k, 1))]).T
+    linear = np.concatenate([-np.asarray(nominal), np.zeros(k)])
+    equal, aims = csc_matrix(equal[0]), equal[1]
+    zeros, rows = np.zeros(len(rows)), csc_matrix(rows)
+    found = solve_qp(cost, linear, rows, zeros, equal, aims, low, high, solver="clarabel", tol_gap_abs=1e-12)
+    return None if found is None else found[:nu]
+
+
+PUSHES = [(1.0, 1.0, -1.0, -1.0), (0.9, -0.7, 0.8, 0.2), (1.0, 1.0, 1.0, 1.0), (-1.0, 0.4, 0.1, 0.9)]
+
+
+@pytest.mark.parametrize("share", [0.7, 0.3])
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_its_answer_is_that_of_the_whole_program(share, cone):
+    changed = 0
+    env = legged_table()
+    stance = settled(env, sw.constraints.Stance(share, cone), STILL, 100)
+    for push in map(np.array, PUSHES):
+        stance.plant.observe()
+        admitted = stance.admits(push)
+        (answer,) = stance.candidates(push)
+        if cone == "pyramid":
+            expected = whole_program(env, push, share, 8, 0.05)
+            np.testing.assert_allclose(answer, expected, atol=2e-5)
+            assert admitted == bool(np.abs(expected - push).max() < 2e-5)
+        else:  # between a pyramid inside and one around it
+            inner, outer = (whole_program(env, push, share, 64, 0.05, outer=o) for o in (False, True))
+            far = [np.linalg.norm(u - push) for u in (outer, answer, inner)]
+            assert far[0] - 1e-5 <= far[1] <= far[2] + 1e-5
+            np.testing.assert_allclose(answer, inner, atol=5e-3)
+        if not admitted:
+            changed += 1
+            assert stance.admits(answer)
+    assert changed >= 2
+
+
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone):
+    env = legged_table(gravity="0 4 -9", friction=0.05)
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7, cone)])
+    filtered.reset()
+    standing, seen = 0, mujoco.MjData(env.model)
+    for _ in range(25):
+        mujoco.mj_copyData(seen, env.model, env.data)
+        mujoco.mj_forward(env.model, seen)
+        info = filtered.step(STILL)[4]
+        assert np.isfinite(info["executed_action"]).all() and np.isfinite(info["whole_body/cone_margin"])
+        if seen.ncon == 4:
+            standing += 1
+            assert info["cbf/infeasible"] and info["cbf/fallback"]
+            assert info["whole_body/cone_margin"] < 0.0
+    assert standing > 5
+
+
+@pytest.mark.parametrize("env_id", ["Humanoid-v5", "Ant-v5", "HalfCheetah-v5"])
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):
+    env = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.Stance(0.7, cone)])
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    stance, counts = env.filter.bound[0].spec, {"flagged": 0, "changed": 0, "same": 0}
+    for _ in range(40):
+        action = rng.uniform(env.action_space.low, env.action_space.high).astype(np.float32)
+        info = env.step(action)[4]
+        counts["flagged"] += flagged(info)
+        counts["changed"] += info["cbf/intervened"]
+        if not flagged(info):
+            # The same program with the executed action as the nominal one: nothing is left to change.
+            problem = stance.problem(info["executed_action"])
+            asked = np.clip(info["executed_action"], problem.lower, problem.upper)
+            answer = stance.solve(replace(problem, nominal=asked))
+            assert answer.cone_error < 1e-4 and answer.contact_error < 1e-3
+            # Rounded to float32 it may have to move again, and then the price of forces moves it too.
+            assert np.abs(answer.control - asked).max() < 2e-3
+            counts["same"] += 1
+    assert counts["same"] > 10 and (counts["changed"] > 0 or env_id == "Humanoid-v5")
+
+
+class Witness(gym.Wrapper):
+    def step(self, action):
+        self.action = action
+        return super().step(action)
+
+
+def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
+    # 0.4 as float32 is more than the model's 0.4.
+    witness = Witness(gym.make("Humanoid-v5"))
+    env = sw.CBFActionFilter(witness, [sw.constraints.Stance(1.0)])
+    assert float(env.action_space.high[0]) > env.plant.upper[0]
+    env.reset(seed=0)
+    silent = 0
+    for k in range(8):
+        action = env.action_space.high if k % 2 else env.action_space.low
+        info = env.step(action)[4]
+        if not info["cbf/intervened"]:
+            silent += 1
+            assert not info["cbf/refused"].any()
+            assert witness.action.tobytes() == action.tobytes() and witness.action.dtype == np.float32
+    assert silent > 3

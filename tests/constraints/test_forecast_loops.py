@@ -22,7 +22,7 @@ from judged_loops import (
     noisy,
     pulse,
     seeking,
-    sliders,
+    slider,
     table,
 )
 
@@ -136,7 +136,7 @@ LOOPS = {
         steps=15, most_flagged=0.4, deepest=1e-3,
     ),
     "speed of a slider": Loop(
-        lambda: sliders(range_="-10 10"), [of.SpeedLimit(0.8, "b0", "x", "substep")], below_speed([0], 0.8),
+        lambda: slider(10.0), [of.SpeedLimit(0.8, "b0", "x", "substep")], below_speed([0], 0.8),
         used=0.02,
     ),
     "a box on Reacher": Loop(

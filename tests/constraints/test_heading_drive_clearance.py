@@ -89,15 +89,6 @@ def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
     assert limit.spec.surroundings(2)[0] == -0.4  # of its time
 
 
-@pytest.mark.parametrize("action", [(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.3, -1.0)])
-def test_a_robot_inside_a_hazard_is_brought_out_whatever_the_policy_wants(action):
-    env, _ = filtered()
-    start(env, [[0.05, 0.02]])
-    costs = [env.step(np.array(action, np.float32))[4]["cost_substep"] for _ in range(400)]
-    assert costs[0] == 1.0
-    assert not any(costs[300:])
-
-
 # At the boundary of its safe set -----------------------------------------------------------------------------
 
 

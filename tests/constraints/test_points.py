@@ -7,7 +7,7 @@ import pytest
 from asking import asked
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from judged_loops import sliders
+from judged_loops import slider
 from scenes import Scene
 
 import safe_wrappers as sw
@@ -122,7 +122,7 @@ def test_a_control_is_admitted_by_the_speed_it_leads_to(v, u, direction, average
 
 def downhill(**options):
     """Whether brakes and full throttle are admitted at 0.6 m/s where a control step adds 0.2 m/s at the least."""
-    env = sliders(range_="-1 1")
+    env = slider()
     env.model.opt.gravity[0] = 5.0
     env.data.qvel[0] = 0.6
     mujoco.mj_forward(env.model, env.data)

@@ -9,7 +9,7 @@ import pytest
 from asking import Asked, bound
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from judged_loops import sliders
+from judged_loops import slider
 
 import safe_wrappers as sw
 from safe_wrappers.filter.bound import Bound
@@ -55,7 +55,7 @@ def looking(scene, limit, qpos, qvel):
 )
 def test_a_control_is_admitted_by_where_it_leads(x, v, u, horizon, margin):
     limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=horizon, margin=margin)
-    limit = looking(sliders(range_="-30 30"), limit, [x], [v])
+    limit = looking(slider(30.0), limit, [x], [v])
     beyond = np.abs(slider_path(x, v, u, horizon, 30.0)) - (1.0 - margin)
     start = abs(x) - (1.0 - margin)
     if start <= 0.0:
@@ -85,7 +85,7 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
     seen, spent = {}, {}
     for max_decrease in (None, 0.5):  # the fastest is 2 m/s, four control steps are 0.2 s
         limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=4, max_decrease=max_decrease)
-        filtered = sw.CBFActionFilter(sliders(range_="-10 10"), [limit])
+        filtered = sw.CBFActionFilter(slider(10.0), [limit])
         filtered.reset(seed=0)
         calls[0] = 0
         with warnings.catch_warnings(action="error"):
@@ -95,7 +95,7 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
     np.testing.assert_array_equal(seen[None], seen[0.5])
     assert spent[0.5] < spent[None] - 50
     limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=4, max_decrease=0.01)
-    filtered = sw.CBFActionFilter(sliders(range_="-10 10"), [limit])
+    filtered = sw.CBFActionFilter(slider(10.0), [limit])
     filtered.reset(seed=0)
     with pytest.warns(UserWarning, match="farther than the declared max_decrease of 0.01"):
         for _ in range(12):
@@ -108,7 +108,7 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
 def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monkeypatch):
     # MuJoCo resets it, and from the reset on all looks well.
     monkeypatch.chdir(tmp_path)  # it writes a log
-    scene = sliders(actuator='motor gear="1000"', range_=None)
+    scene = slider(1e9, gear=1000.0)
     limit = looking(scene, sw.constraints.JointPositionLimit(-1e6, 1e6), [0.0], [0.0])
     assert limit.admits(np.array([1.0]))
     assert not limit.admits(np.array([1e9]))
@@ -125,7 +125,7 @@ LIMITS = {
 
 @pytest.mark.parametrize("kind", LIMITS)
 def test_a_reading_that_is_no_number_runs_the_fallback(kind):
-    scene = sliders()
+    scene = slider()
     filtered = sw.CBFActionFilter(scene, [LIMITS[kind]])
     filtered.reset(seed=0)
     filtered.step(np.array([0.5]))

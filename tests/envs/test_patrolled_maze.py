@@ -120,13 +120,16 @@ def test_contact_that_lasts_costs_every_step_and_is_one_collision():
     assert (costs[inside] == 1.0).all() and abs(int(costs.sum()) - sum(inside)) <= 1
 
 
-def test_no_patrol_starts_at_the_ball():
-    env, gaps = shared(), []
+def test_no_patrol_starts_at_the_ball_and_a_tracker_knows_their_mean_square_speed():
+    env, gaps, squares = shared(), [], []
     for seed in range(80):
         _, info = env.reset(seed=seed)
         assert info["cost"] == 0.0 and info["collisions"] == 0
         gaps.append(np.linalg.norm(env.patrol_positions - env.agent_position, axis=1).min())
+        squares += np.square(env.patrol_velocities).sum(axis=1).tolist()
     assert CONTACT + 0.3 <= min(gaps) < CONTACT + 0.4
+    known = patrolled_maze.PATROL_ACCELERATION_NOISE * patrolled_maze.PATROL_REVERSION_S / 2.0
+    assert abs(np.mean(squares) - known) < 4.5 * np.std(squares) / np.sqrt(len(squares)) < 0.1
 
 
 @pytest.mark.parametrize(

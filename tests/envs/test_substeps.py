@@ -123,8 +123,8 @@ def held(low, high, steps):
 
 FAST = [[-4.0, 25.0], [-9.0, 15.0], [-2.5, 2.0], [6.0, -30.0], [8.0, -10.0], [60.0, 0.0]]
 DRIVES = {
-    **{f"SafePointGoal{level}-v0": Drive(to_things, of_goals, 600, 150) for level in (1, 2)},
-    **{f"SafeCarGoal{level}-v0": Drive(to_things, of_goals, 675, 225) for level in (1, 2)},
+    **{f"SafePointGoal{level}-v0": Drive(to_things, of_goals, 150 + 150 * level, 150) for level in (1, 2)},
+    **{f"SafeCarGoal{level}-v0": Drive(to_things, of_goals, 225 * level, 225) for level in (1, 2)},
     "SafeRover-v0": Drive(
         held([-1, -1, -1, -1, -0.3], [1, 1, 1, 1, 0.3], 15), of_rover, 180, 60,
         {"speed": 3.0, "agent": [-2, 0, 0], "hazards": [[-1, 0.28]]},
@@ -145,7 +145,7 @@ DRIVES = {
 def test_costs_count_every_substep(env_id, monkeypatch):
     drive, env = DRIVES[env_id], gym.make(env_id).unwrapped
     name = "mj_step1" if "Rover" in env_id else "mj_step"
-    original, starts, seen = getattr(mujoco, name), [], set()
+    original, starts, seen, met = getattr(mujoco, name), [], set(), set()
 
     def watched(model, data, *more):
         starts.append((data.qpos.copy(), data.qvel.copy()))
@@ -169,7 +169,11 @@ def test_costs_count_every_substep(env_id, monkeypatch):
             assert info[key] == pytest.approx(float(value), rel=1e-9, abs=1e-12), key
         assert info.get("spin_out") == (float(info["slip_max"] > 0.5) if "slip_max" in info else None)
         seen.add((any(violated), violated[-1]))
+        met |= {key for key in expected if info[key]}
     assert seen == {(False, False), (True, True)} | ({(True, False)} if env.frame_skip > 1 else set())
+    assert met == expected.keys() - (
+        {"cost_vases"} if "Goal1" in env_id else set()
+    )  # where they cost nothing
 
 
 NOWHERE = [[60.0, 0.0]] * 4

@@ -1,7 +1,8 @@
-"""What a run leaves for others: the same actions, no foreign code, another env or filter refused."""
+"""What a run leaves for others: driven as it was trained, no foreign code, another env or filter refused."""
 
 import json
 import shutil
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -15,10 +16,12 @@ import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, RunStateError
 from safe_wrappers.train import policies
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.config import parse_experiment, stored_arm
-from safe_wrappers.train.files import write_rows
+from safe_wrappers.train.config import EvaluationConfig, parse_experiment
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
+from safe_wrappers.train.files import read_rows, write_rows
 from safe_wrappers.train.policies import load_policy, write_card
 from safe_wrappers.train.run.data_pickles import read_pickle
+from safe_wrappers.train.run.stack import make_vec_env
 from safe_wrappers.train.run.training import train_run
 
 SHIPPED = Path(__file__).parents[2] / "configs" / "policies"
@@ -88,6 +91,60 @@ def test_it_sees_scaled_observations_and_has_its_filter(reacher):
     assert np.array_equal(trained(observation), proposed) and np.any(proposed)
 
 
+SEEN = {
+    "env": {"id": "SafePointGoal1-v0", "observation": "constraints", "kwargs": {"max_episode_steps": 50}},
+    "hyperparameters": {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
+    "total_steps": 16,
+    "action_repeat": 4,
+}
+
+
+def test_it_acts_in_evaluation_as_it_was_trained(tmp_path):
+    """Beside SB3's own `predict` in a loop over ActionRepeat."""
+    run = trained({**PPO, **SEEN, "normalize": None, "n_envs": 1}, tmp_path)
+    policy = load_policy(run)
+    arm = policy.arm
+    envs = make_vec_env(arm)
+    envs.reset()
+    dones = [envs.step(np.zeros((1, 2), dtype=np.float32))[2][0] for _ in range(13)]
+    assert dones[-1] and not any(dones[:-1])  # its steps are the policy's
+    evaluate_run(arm, 0, run, EvaluationConfig(episodes=2, seed=7), arm.filter, SILENT)
+    env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=50)))
+    env = sw.ActionRepeat(sw.RecordInterventions(env), 4)
+    for seed, row in zip((7, 8), read_rows(evaluation_folder(run) / "filter_on.csv"), strict=True):
+        observation, _ = env.reset(seed=seed)
+        truncated = False
+        while not truncated:
+            action = policy.model.predict(observation, deterministic=True)[0]
+            observation, _, _, truncated, info = env.step(action)
+        assert row["return"] == pytest.approx(info["interventions"]["return"], abs=1e-12)
+        assert row["length"] == 50
+    held = evaluated_steps(run, "filter_on").proposed[:48].reshape(12, 4, 2)
+    assert (held == held[:, :1]).all()
+    policy.deterministic = False
+    policy.reset()
+    first = policy(observation)
+    policy.reset()
+    assert not np.array_equal(policy(observation), first)
+
+
+def test_fetch_reach_is_trained_and_evaluated_by_its_plain_id(tmp_path):
+    pytest.importorskip("gymnasium_robotics")
+    short = {"hyperparameters": {"n_steps": 50, "batch_size": 50, "n_epochs": 1}, "total_steps": 100}
+    run = trained({**PPO, **short, "env": "FetchReach-v4", "n_envs": 2}, tmp_path)
+    policy = load_policy(run)
+    assert type(policy.model.policy).__name__ == "MultiInputActorCriticPolicy"  # its observations are dicts
+    evaluate_run(policy.arm, 0, run, EvaluationConfig(episodes=1), policy.arm.filter, SILENT)
+    (row,) = read_rows(evaluation_folder(run) / "filter_on.csv")
+    assert row["length"] == 50
+    code = (  # a new process registers the id when it is asked for
+        "import gymnasium as gym; from safe_wrappers.train.config import check_env_id;"
+        "assert 'FetchReach-v4' not in gym.registry; check_env_id('FetchReach-v4');"
+        "assert 'FetchReach-v4' in gym.registry"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
 @pytest.mark.parametrize("name", ["filtered", "unfiltered"])
 def test_the_policies_that_ship_act_safely_in_their_filter(name):
     trained = load_policy(SHIPPED / name)
@@ -141,23 +198,6 @@ def test_a_recipe_that_has_changed_since_is_refused_unless_told(policy, monkeypa
     with pytest.raises(ConfigurationError, match=r"(?s)through another filter.*limit=9\.0"):
         load_policy(policy)
     load_policy(policy, other_filter=True)
-
-
-ARMS = {
-    "protect": {"filter": {"protect": {"margin": 0.1}, "lease": {"budget": {"closing_speed": 3.0}}}},
-    "factory": {"filter": {"factory": "fake_task:shield", "kwargs": {"margin": None}}},
-    "priced": {"hyperparameters": {"clip_range": "linear_0.2"}, "learner": {"cost_limit": 25}},
-    "held": {"normalize": {"observation": True}, "action_repeat": 4, "n_envs": 3},
-    "seen": {"env": {"id": "SafePointGoal1-v0", "observation": "constraints"}},
-    "judged": {"env": {"id": "Reacher-v5", "judge": "constraints"}},
-}
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_an_arm_is_read_back_from_what_its_folder_says(name):
-    given = {**REACHER, **PPO, "env": "SafePointGoal1-v0", "arms": ARMS, "evaluation": {"filter": "protect"}}
-    arm = next(arm for arm in parse_experiment(given).arms if arm.name == name)
-    assert stored_arm(name, json.loads(json.dumps(arm.fingerprint()))) == arm
 
 
 def test_the_card_has_what_was_measured_and_says_what_was_not_judged(reacher, tmp_path):
