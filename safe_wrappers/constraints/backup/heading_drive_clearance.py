@@ -93,7 +93,7 @@ class HeadingDriveClearance(Detour, Model):
         return Trajectory(control, self._now.motion[None])
 
     def h_along(self, path: Trajectory) -> Array:
-        """The least clearance until rest, and the one at its end, m, shape (2, k): of each model and each disc near."""
+        """The least clearance until rest, and that at its end, m, shape (2, k): of each model, and each disc near."""
         now = self._now
         if path.control is None:
             return now.clearances
