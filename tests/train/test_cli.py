@@ -28,7 +28,6 @@ from safe_wrappers.wrappers.recipes import EVERY, recipe_of
 
 FAKE = Path(__file__).parent / "fake.yaml"
 FILTERED = "arms={filtered: {filter: {factory: 'fake_task:shield'}}}"
-COMMAND = [sys.executable, "-m", "safe_wrappers.train.cli"]
 
 
 def heed_interrupts():
@@ -41,13 +40,13 @@ def start():
     """Starts the command; what a failing test leaves running is killed."""
     started = []
 
-    def run(command, *overrides, before=()):
+    def run(command, *overrides):
         process = subprocess.Popen(
-            [*before, *COMMAND, command, str(FAKE), *overrides],
+            [sys.executable, "-m", "safe_wrappers.train.cli", command, str(FAKE), *overrides],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            preexec_fn=None if before else heed_interrupts,
+            preexec_fn=heed_interrupts,
         )
         started.append(process)
         return process

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up import episode, steps, write_evaluation, write_training
 from rich.console import Console
-from running import evaluated, scalars, trained
+from running import episode, evaluated, scalars, steps, trained, write_evaluation, write_training
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -256,7 +255,10 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
     assert "Steps in violation, total │ not judged │ not judged" in table and not summary.judged
     said = "Violations are not judged: the task reports no cost."
     assert said in table and said in page and said in " ".join(verdict(experiment, summary))
-    assert "of 40 steps in violation" not in page
+    shown = page.partition("How to read this")[0]
+    assert "of 40 steps in violation" not in shown and "cost per episode" not in shown
+    # The page's note; cost and violations of two arms in three conditions.
+    assert page.partition("In numbers")[2].partition("The same episode")[0].count("not judged") == 1 + 2 * 6
 
 
 def test_a_cost_function_judges_training_and_evaluation_as_the_task_would(fake_experiment):
@@ -286,10 +288,8 @@ def test_the_episode_with_the_median_return_is_shown(fake_experiment, returns, t
     experiment = fake_experiment()
     write_evaluation(experiment, 1, 0, "filter_on", rows)
     shown = shown_episode(experiment)
-    assert (shown.seed, shown.episode_seed) == (
-        0,
-        typical,
-    ) and "“filtered” with the filter on" in shown.reason
+    assert (shown.seed, shown.episode_seed) == (0, typical)
+    assert "“filtered” with the filter on" in shown.reason
     bare = fake_experiment("name=bare", "arms={one: {filter: none}, two: {filter: none}}")
     write_evaluation(bare, 0, 0, "filter_off", rows)
     assert shown_episode(bare).episode_seed == typical
