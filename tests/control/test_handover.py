@@ -75,6 +75,8 @@ def test_nothing_to_blend_where_nothing_was_sent():
     new = np.array([[3.0], [3.2], [3.1]])
     plan, steps = join(np.zeros((0, 1)), np.zeros((0, 1)), new, 0.1, fewest=2)
     assert steps == 0 and plan.tobytes() == new.tobytes()
+    # A step that is too large is blended, also where the next one is worse.
+    assert join(np.array([[-0.25]]), np.zeros((0, 1)), np.array([[0.25], [5.0]]), 0.1)[1] == 1
 
 
 def test_a_left_over_is_never_padded():
