@@ -112,5 +112,5 @@ def filtered_goals(wall=WALL):
     return filtered(wall, GoalLine)
 
 
-def filtered_dict():
-    return AsDict(filtered())
+def filtered_dict(wall=WALL):
+    return AsDict(filtered(wall))

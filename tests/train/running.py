@@ -80,8 +80,11 @@ def finish(folder):
 
 
 def episodes(folder):
-    """The rows of a run's training."""
-    return read_rows(folder / "episodes.csv")
+    """The rows of a run's training, which are in the order of its steps whatever has happened to it."""
+    rows = read_rows(folder / "episodes.csv")
+    steps = [row["timesteps"] for row in rows]
+    assert steps == sorted(steps)
+    return rows
 
 
 def scalars(folder):

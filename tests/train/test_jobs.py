@@ -168,8 +168,6 @@ def test_a_node_is_lost_and_its_run_goes_on_from_its_checkpoint_elsewhere(cluste
         assert finish(folder)["timesteps"] == 8192
         rows = episodes(folder)
         assert kept[folder] and rows[: len(kept[folder])] == kept[folder]  # nothing done is done again
-        steps = [row["timesteps"] for row in rows]
-        assert steps == sorted(steps)
         assert sum(row["length"] for row in rows) <= 8192
 
 

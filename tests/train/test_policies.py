@@ -181,23 +181,21 @@ def test_another_env_is_refused_unless_told(policy):
 
 
 @pytest.mark.parametrize("run_or_folder", ["", "policy"])
-def test_another_filter_is_refused_unless_told(reacher, run_or_folder):
-    limit = sw.constraints.JointSpeedLimit(limit=4.0)
+def test_another_filter_is_refused_unless_told(reacher, run_or_folder, monkeypatch):
+    folder, limit = reacher / run_or_folder, sw.constraints.JointSpeedLimit(limit=4.0)
     for env, here in (
         (gym.make("Reacher-v5"), "here: no filter"),
         (sw.CBFActionFilter(gym.make("Reacher-v5"), [limit]), r"here: JointSpeedLimit\(limit=4\.0"),
     ):
         with pytest.raises(ConfigurationError, match=rf"(?s)trained: JointSpeedLimit\(limit=5\.0.*{here}"):
-            load_policy(reacher / run_or_folder, env)
-        load_policy(reacher / run_or_folder, env, other_filter=True)
-    load_policy(reacher / run_or_folder, sw.RecordInterventions(sw.protect(gym.make("Reacher-v5"))))
-
-
-def test_a_recipe_that_has_changed_since_is_refused_unless_told(policy, monkeypatch):
+            load_policy(folder, env)
+        load_policy(folder, env, other_filter=True)
+    load_policy(folder, sw.RecordInterventions(sw.protect(gym.make("Reacher-v5"))))
+    # So is, for a policy's folder, a recipe that has changed since.
     monkeypatch.setattr(policies, "constraints_of_arm", lambda arm: ["JointSpeedLimit(limit=9.0)"])
     with pytest.raises(ConfigurationError, match=r"(?s)through another filter.*limit=9\.0"):
-        load_policy(policy)
-    load_policy(policy, other_filter=True)
+        load_policy(reacher / "policy")
+    load_policy(reacher / "policy", other_filter=True)
 
 
 def test_the_card_has_what_was_measured_and_says_what_was_not_judged(reacher, tmp_path):
@@ -207,11 +205,8 @@ def test_the_card_has_what_was_measured_and_says_what_was_not_judged(reacher, tm
     (run / "episodes.csv").unlink()
     write_card(arm, 0, run)
     assert "Nothing was measured yet." in card.read_text()
-    columns = ("return", "length", "intervention_rate", "infeasible")
-    rows = [
-        {"return": value, "length": 50, "intervention_rate": 0.5, "infeasible": 1} for value in (-4.0, -8.0)
-    ]
-    write_rows(run / "evaluation" / "filter_on.csv", columns, rows)
+    row = {"return": -4.0, "length": 50, "intervention_rate": 0.5, "infeasible": 1}
+    write_rows(run / "evaluation" / "filter_on.csv", row, [row, {**row, "return": -8.0}])
     write_card(arm, 0, run)
     text = card.read_text()
     for line in (
@@ -240,10 +235,10 @@ def hub(tmp_path, monkeypatch):
 
     package = types.SimpleNamespace(push_to_hub=push_to_hub, load_from_hub=load_from_hub)
     monkeypatch.setitem(sys.modules, "huggingface_sb3", package)
-    return there
 
 
-def test_a_policy_goes_to_the_hub_and_comes_back(reacher, hub, capsys):
+@pytest.mark.usefixtures("hub")
+def test_a_policy_goes_to_the_hub_and_comes_back(reacher, capsys):
     write_card(load_policy(reacher).arm, 0, reacher)
     assert main(["push", str(reacher), "me/reacher"]) == 0
     names = "config.json, model.zip, vecnormalize.pkl, README.md"
