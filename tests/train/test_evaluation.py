@@ -243,6 +243,7 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
     text = (experiment.folder / "summary.json").read_text()
     assert "cost" not in text and "NaN" not in text and json.loads(text)
     assert "Steps in violation, total │ not judged │ not judged" in table and not summary.judged
+    assert "┃ unfiltered ┃ filtered ┃" in table
     said = "Violations are not judged: the task reports no cost."
     assert said in table and said in page and said in " ".join(verdict(experiment, summary))
     shown = page.partition("How to read this")[0]
