@@ -124,6 +124,21 @@ class ForceJudge:
         return min(rooms), 0.0, terminated or truncated, info
 
 
+# Rooms that need more than a line ----------------------------------------------------------------------------
+
+
+def manipulability(model, data, kind, name, joints, directions="xyz"):
+    """sqrt(det(J J')) by the singular values of MuJoCo's own Jacobian; positions are up to date."""
+    mujoco.mj_comPos(model, data)
+    linear = np.zeros((3, model.nv))
+    index = getattr(model, kind)(name).id
+    call = {"body": mujoco.mj_jacBody, "site": mujoco.mj_jacSite, "geom": mujoco.mj_jacGeom}[kind]
+    call(model, data, linear, None, index)
+    rows = [linear["xyz".index(d)] for d in directions]
+    columns = model.jnt_dofadr[[model.joint(j).id for j in joints]]
+    return float(np.prod(np.linalg.svd(np.array(rows)[:, columns], compute_uv=False)))
+
+
 # Contact forces, from the numbers of MuJoCo's solver ----------------------------------------------------------
 
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 from judged_loops import (
@@ -19,6 +18,7 @@ from judged_loops import (
     flagged,
     full,
     inside_the_hull,
+    manipulability,
     noisy,
     pulse,
     seeking,
@@ -84,12 +84,7 @@ ARM_JOINTS = "r_shoulder_pan_joint", "r_shoulder_lift_joint", "r_upper_arm_roll_
 
 
 def pusher_manipulability(model, data):
-    """By the singular values of MuJoCo's own Jacobian."""
-    mujoco.mj_comPos(model, data)
-    linear = np.zeros((3, model.nv))
-    mujoco.mj_jacBody(model, data, linear, None, model.body("tips_arm").id)
-    columns = linear[:, model.jnt_dofadr[[model.joint(j).id for j in ARM_JOINTS]]]
-    return np.prod(np.linalg.svd(columns, compute_uv=False)) / 0.05 - 1.0
+    return manipulability(model, data, "body", "tips_arm", ARM_JOINTS) / 0.05 - 1.0
 
 
 def impact(mass, stiffness, horizon, steps, **fine):
@@ -115,43 +110,71 @@ LOOPS = {
     ),
     # Its pole falls; the cart's limit holds on. Past what its motor can do it says so.
     "joint speed of InvertedPendulum": Loop(
-        task("InvertedPendulum-v5"), [of.JointSpeedLimit(0.5)], below_speed([0], 0.5), (*ANY, full), 150, 0.1, 0.5,
+        task("InvertedPendulum-v5"),
+        [of.JointSpeedLimit(0.5)],
+        below_speed([0], 0.5),
+        (*ANY, full),
+        150,
+        0.1,
+        0.5,
         used=0.025,
     ),
     "joint speed with a margin": Loop(
-        task("Reacher-v5"), [of.JointSpeedLimit(4.0, margin=0.5)], below_speed([0, 1], 3.5), (bang_bang,), 200,
+        task("Reacher-v5"),
+        [of.JointSpeedLimit(4.0, margin=0.5)],
+        below_speed([0, 1], 3.5),
+        (bang_bang,),
+        200,
         used=0.2,
     ),
     # Infeasible steps, too fast to stop within the horizon, may take it out, by a hair.
     "joint position of Reacher": Loop(
-        task("Reacher-v5"), [of.JointPositionLimit(-1.5, 1.5, ["joint0", "joint1"], horizon=10)],
-        in_range([0, 1], -1.5, 1.5), most_flagged=0.4, deepest=1e-3,
+        task("Reacher-v5"),
+        [of.JointPositionLimit(-1.5, 1.5, ["joint0", "joint1"], horizon=10)],
+        in_range([0, 1], -1.5, 1.5),
+        most_flagged=0.4,
+        deepest=1e-3,
     ),
     "joint position of InvertedPendulum": Loop(
-        task("InvertedPendulum-v5"), [of.JointPositionLimit(-0.2, 0.2, ["slider"], horizon=8)],
-        in_range([0], -0.2, 0.2), used=0.1,
+        task("InvertedPendulum-v5"),
+        [of.JointPositionLimit(-0.2, 0.2, ["slider"], horizon=8)],
+        in_range([0], -0.2, 0.2),
+        used=0.1,
     ),
     "joint position of Pusher": Loop(
-        task("Pusher-v5"), [of.JointPositionLimit(horizon=6)], in_range(np.arange(7), PUSHER_LOW, PUSHER_HIGH),
-        steps=15, most_flagged=0.4, deepest=1e-3,
+        task("Pusher-v5"),
+        [of.JointPositionLimit(horizon=6)],
+        in_range(np.arange(7), PUSHER_LOW, PUSHER_HIGH),
+        steps=15,
+        most_flagged=0.4,
+        deepest=1e-3,
     ),
     "speed of a slider": Loop(
-        lambda: slider(10.0), [of.SpeedLimit(0.8, "b0", "x", "substep")], below_speed([0], 0.8),
+        lambda: slider(10.0),
+        [of.SpeedLimit(0.8, "b0", "x", "substep")],
+        below_speed([0], 0.8),
         used=0.02,
     ),
     "a box on Reacher": Loop(
         task("Reacher-v5"),
         [of.Workspace([*FINGER_LOW, None], [*FINGER_HIGH, None], bodies=["fingertip"], horizon=10)],
-        in_box("fingertip", FINGER_LOW, FINGER_HIGH), most_flagged=0.1, deepest=5e-3,
+        in_box("fingertip", FINGER_LOW, FINGER_HIGH),
+        most_flagged=0.1,
+        deepest=5e-3,
     ),
     "a disc on Reacher": Loop(
         task("Reacher-v5"),
         [of.Workspace(keep_out=[of.Disc([0.0, 0.15], 0.06)], geoms=["fingertip"], radius=0.01, horizon=10)],
-        out_of_the_disc, most_flagged=0.1, deepest=5e-3,
+        out_of_the_disc,
+        most_flagged=0.1,
+        deepest=5e-3,
     ),
     "a box on Pusher": Loop(
-        task("Pusher-v5"), [of.Workspace(TABLE_LOW, TABLE_HIGH, bodies=["tips_arm"], horizon=8)],
-        in_box("tips_arm", TABLE_LOW, TABLE_HIGH), most_flagged=0.1, deepest=5e-3,
+        task("Pusher-v5"),
+        [of.Workspace(TABLE_LOW, TABLE_HIGH, bodies=["tips_arm"], horizon=8)],
+        in_box("tips_arm", TABLE_LOW, TABLE_HIGH),
+        most_flagged=0.1,
+        deepest=5e-3,
     ),
     # These arms start stretched, and braking from full speed takes Reacher's far longer than any sensible look-ahead.
     "singularity of Reacher": Loop(
@@ -160,11 +183,18 @@ LOOPS = {
             of.JointSpeedLimit(10.0, margin=0.01),
             of.SingularityMargin(0.0033, body="fingertip", directions="xy", horizon=5),
         ],
-        reacher_manipulability, steps=45, most_flagged=0.1, deepest=1.0,
+        reacher_manipulability,
+        steps=45,
+        most_flagged=0.1,
+        deepest=1.0,
     ),
     "singularity of Pusher": Loop(
-        task("Pusher-v5"), [of.SingularityMargin(0.05, body="tips_arm", horizon=8)], pusher_manipulability,
-        steps=45, most_flagged=0.1, deepest=1.0,
+        task("Pusher-v5"),
+        [of.SingularityMargin(0.05, body="tips_arm", horizon=8)],
+        pusher_manipulability,
+        steps=45,
+        most_flagged=0.1,
+        deepest=1.0,
     ),
     "feet of Ant": feet("Ant-v5", bang_bang, noisy, steps=12),
     "feet of Humanoid": feet("Humanoid-v5", at_random, steps=30),
@@ -172,13 +202,19 @@ LOOPS = {
     "feet of Hopper": feet("Hopper-v5", at_random, steps=60),
     "feet of Walker2d": feet("Walker2d-v5", bang_bang, steps=60),
     "a table that is pushed over": Loop(
-        lambda: table(), [of.SupportMargin(0.05)], inside_the_hull(0.05), (at_random, bang_bang, full), 60,
-        0.6, np.inf, judge=ForceJudge,
+        lambda: table(),
+        [of.SupportMargin(0.05)],
+        inside_the_hull(0.05),
+        (at_random, bang_bang, full),
+        60,
+        0.6,
+        np.inf,
+        judge=ForceJudge,
     ),
     "a light cart": impact(0.5, 6e4, 8, 30, timestep=2.5e-4, frame_skip=40, gap=0.05),
     "a cart": impact(5.0, 8e3, 12, 70),
     "a heavy cart": impact(40.0, 6e4, 40, 70),
-}  # fmt: skip
+}
 """Limits in the room's own unit, all of them on the model itself."""
 
 

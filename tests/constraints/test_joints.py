@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from asking import asked
+from judged_loops import manipulability
 from scenes import Scene
 
 import safe_wrappers as sw
@@ -181,18 +182,6 @@ CHAIN = """<mujoco><compiler angle="radian"/><option timestep="0.002"><flag cont
 DRIVEN = ["rail", "a", "b", "c"]
 
 
-def true_w(model, data, kind, name, joints, directions="xyz"):
-    """sqrt(det) by the singular values of MuJoCo's own Jacobian; positions are up to date."""
-    mujoco.mj_comPos(model, data)
-    linear = np.zeros((3, model.nv))
-    index = getattr(model, kind)(name).id
-    call = {"body": mujoco.mj_jacBody, "site": mujoco.mj_jacSite, "geom": mujoco.mj_jacGeom}[kind]
-    call(model, data, linear, None, index)
-    rows = [linear["xyz".index(d)] for d in directions]
-    columns = model.jnt_dofadr[[model.joint(j).id for j in joints]]
-    return float(np.prod(np.linalg.svd(np.array(rows)[:, columns], compute_uv=False)))
-
-
 TASKS = {
     "a site, all directions": ({"site": "tip"}, {}),
     "a geom, two directions": ({"geom": "shin", "directions": "zx"}, {"directions": "zx"}),
@@ -216,7 +205,8 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
         still.qpos[:] = qpos
         mujoco.mj_kinematics(env.model, still)
         return (
-            true_w(env.model, still, kind, arguments[kind], **{"joints": DRIVEN, **truth}) / threshold - 1.0
+            manipulability(env.model, still, kind, arguments[kind], **{"joints": DRIVEN, **truth}) / threshold
+            - 1.0
         )
 
     for _ in range(8):

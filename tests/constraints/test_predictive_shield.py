@@ -1,8 +1,6 @@
 """PredictiveShield against the stopping distance of a cart in closed form, and its promises in closed loop."""
 
-import sys
 import warnings
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -11,13 +9,11 @@ from asking import Asked
 from hypothesis import given
 from hypothesis import strategies as st
 from judged_loops import Judge, drive, flagged, signs
+from simulated_worlds import DT, TOP, WALL, Cart, Grid, WaitingCart
 
 import safe_wrappers as sw
 from safe_wrappers.constraints import PredictiveShield
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-
-sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
-from simulated_worlds import DT, TOP, WALL, Cart, Grid, WaitingCart
 
 
 def brake(observation):

@@ -4,11 +4,9 @@ From a drawn state that is safe the backup is admitted; whatever is proposed, th
 breaks nothing at any physics substep, and the next state is safe again.
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -18,15 +16,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from oracles import held, to_rest
 from scenes import Scene
+from simulated_worlds import DT, TOP, WALL, Cart
 
 import safe_wrappers as sw
 from benchmarks.cases import CASES
 from benchmarks.judges import Judge, Replay, Reported
 from safe_wrappers.control.backup.damped_axis import damped_axis
 from safe_wrappers.plants.plant import Model, Trajectory
-
-sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
-from simulated_worlds import DT, TOP, WALL, Cart
 
 ROUNDING = 1e-6  # of float32 actions: `cbf/unsafe` allows as much
 
