@@ -96,6 +96,7 @@ def test_training_alone_with_one_seed_and_without_a_filter(fake_experiment):
     assert "There is no filter to compare with yet." in said and "[n/a]" in said and "over them" not in said
     assert "Violations are not judged: the task reports no cost." in said and "0 of" not in said
     assert "No recorded steps with a filter on." in said and "No videos." in said
+    assert "Training, all episodes" in said and "Evaluation, filter" not in said
 
 
 def test_constraints_places_and_what_was_left_out(fake_experiment):

@@ -110,6 +110,7 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     (final,) = (folder / "checkpoints").iterdir()
     assert final.name == "step_000000000320"
     assert not (final / "replay_buffer.pkl").exists()  # of no use to a finished run, and large
+    assert resumed(experiment.arms[1], folder).replay_buffer.buffer_size == 100  # as much as it asks for
 
     # A kill between this checkpoint and the note that the run is finished:
     scaling = folder / "policy" / "vecnormalize.pkl"
