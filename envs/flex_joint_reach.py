@@ -71,10 +71,10 @@ class FlexibleArm:
     def vibration_energy(self, qpos: Array, qvel: Array, torque: Array) -> Array:
         """Boundary-layer energy, shape (...,), J, of states of shape (..., 4) with the motors' torque held.
 
-        What would ring on if the torque stayed as it is: `flexible_joint.boundary_layer_energy`, which the
-        tests compare it with, written out for two joints because every physics substep asks. With the rigid arm's
-        acceleration a, from (M + J) a = u - h with u = torque - B motor speed and h the links' bias, the springs'
-        quasi-steady torque is z0 = u - J a.
+        What would ring on if the torque stayed as it is, written out for two joints because every physics substep
+        asks; the tests compare it with the same from matrices. With the rigid arm's acceleration a, from
+        (M + J) a = u - h with u = torque - B motor speed and h the links' bias, the springs' quasi-steady torque is
+        z0 = u - J a.
         """
         j0, j1 = self.rotor_inertia.tolist()
         k0, k1 = self.stiffness.tolist()

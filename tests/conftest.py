@@ -33,7 +33,7 @@ BEGIN = (
     "test_algorithms",
     "test_run",
     "test_pages",
-    "test_rendering",
+    "test_videos",
 )
 """Files in the order in which parallel workers begin them; the others follow."""
 

@@ -1,13 +1,11 @@
-"""What an arm over springs carries, and what a change of torque leaves ringing in it (Spong's two masses per joint).
+"""What an arm over springs carries, and how it rings (Spong's two masses per joint).
 
 K, J and M: `stiffness` and `rotor_inertia`, diagonals, shape (n,), N m/rad and kg m^2; `link_inertia`, shape
 (..., n, n), kg m^2. With pose, speeds and bias frozen the deflection swings about the manifold z0 at the resonances,
-roots of K W with W = J^-1 + M^-1; the energies are those of this swinging, for one change from one held torque to
-another.
+roots of K W with W = J^-1 + M^-1.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from safe_wrappers.errors import Array
 
@@ -29,23 +27,9 @@ def manifold(torque: Array, rotor_inertia: Array, link_inertia: Array, taken: Ar
 
 def resonances(stiffness: Array, rotor_inertia: Array, link_inertia: Array) -> Array:
     """Eigenvalues of the square root of K W, ascending, shape (..., n), rad/s."""
-    return _modes(stiffness, rotor_inertia, link_inertia)[0]
-
-
-def step_energies(torque_step: ArrayLike, *machine: Array) -> Array:
-    """Energy that a step of the torque, shape (n,), N m, leaves in each resonance, shape (..., n), J."""
-    _, per_torque = _modes(*machine)
-    return np.asarray(0.5 * np.einsum("...ij,j->...i", per_torque, np.asarray(torque_step)) ** 2)
-
-
-def _modes(stiffness: Array, rotor_inertia: Array, link_inertia: Array) -> tuple[Array, Array]:
-    """The resonances, and the change of each mode's K^1/2-scaled deflection per torque, shape (..., n, n)."""
     root = np.sqrt(stiffness)
     mobility = np.diag(1.0 / rotor_inertia) + np.linalg.inv(link_inertia)
-    squares, shapes = np.linalg.eigh(root[:, None] * mobility * root)
-    both = link_inertia + np.diag(rotor_inertia)
-    carried = np.linalg.solve(both, link_inertia).swapaxes(-1, -2)  # W^-1 J^-1 = M (M + J)^-1
-    return np.sqrt(squares), np.asarray(shapes.swapaxes(-1, -2) @ (carried / root[:, None]))
+    return np.sqrt(np.linalg.eigvalsh(root[:, None] * mobility * root))
 
 
 def inertia_of(arm, q):
@@ -61,3 +45,13 @@ def bias_of(arm, q, q_dot):
     sin = arm.coupling * np.sin(q[..., 1])
     v0, v1 = q_dot[..., 0], q_dot[..., 1]
     return np.stack([-sin * v1 * (2.0 * v0 + v1), sin * v0 * v0], axis=-1)
+
+
+def vibration_energy(arm, qpos, qvel, torque):
+    """Of the boundary layer, J, at coordinates motor 0, spring 0, motor 1, spring 1, shape (4,); from matrices."""
+    q, q_dot = qpos[::2] + qpos[1::2], qvel[::2] + qvel[1::2]
+    m = inertia_of(arm, q)
+    z0 = manifold(torque - arm.motor_damping * qvel[::2], arm.rotor_inertia, m, bias_of(arm, q, q_dot))
+    away, rate = -qpos[1::2] - z0 / arm.stiffness, -qvel[1::2]
+    mobility = np.diag(1.0 / arm.rotor_inertia) + np.linalg.inv(m)
+    return 0.5 * (arm.stiffness @ away**2 + rate @ np.linalg.solve(mobility, rate))

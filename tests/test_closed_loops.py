@@ -19,6 +19,7 @@ from benchmarks.protected import Case
 pytestmark = [
     pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning"),
     pytest.mark.filterwarnings("ignore:.*is out of date"),
+    pytest.mark.filterwarnings("error:.*farther than the declared max_decrease"),  # of a recipe
 ]
 STEPS = {
     "SafePointGoal": 800,

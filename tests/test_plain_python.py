@@ -13,7 +13,7 @@ from safe_wrappers.control.compiled import IS_COMPILED
 
 FOLDERS = [str(Path(__file__).parent / name) for name in ("control", "constraints", "plants")]
 CALLS = {
-    "test_stopping": ("random_looks", [200]),
+    "test_shapes": ("random_looks", [200]),
     "test_heading_drive": ("random_scenes", [10]),
     "test_point_among_walls": ("random_scenes", [40]),
 }

@@ -46,6 +46,12 @@ def clearance() -> sw.constraints.HeadingDriveClearance:
     )
 
 
+def rail() -> sw.constraints.Clearance:
+    """On the rail."""
+    ends = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
+    return sw.constraints.Clearance(ends, bodies=["cart"], braking=8.0)
+
+
 def _joint_speed(env: Any) -> float:
     return float(abs(env.data.qvel[0]))
 
@@ -64,33 +70,15 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
     "AdaptionPenalty": {"a constant": (TASK, lambda: {"penalty": 0.5})},
     "BalanceMonitor": {
         "everything": ("HalfCheetah-v5", dict),
-        "a trunk and its legs": (
-            "Ant-v5",
-            lambda: {"bodies": ["torso"]},
-        ),
+        "a trunk and its legs": ("Ant-v5", lambda: {"bodies": ["torso"]}),
     },
     "CBFActionFilter": {
         "a HeadingDriveClearance": (TASK, lambda: {"constraints": [clearance()]}),
         "a JointSpeedLimit with options": (
             "Reacher-v5",
-            lambda: {
-                "constraints": [sw.constraints.JointSpeedLimit(4.0)],
-                "fallback": "hold",
-                "margin": 0.1,
-            },
+            lambda: {"constraints": [sw.constraints.JointSpeedLimit(4.0)], "fallback": "hold", "margin": 0.1},
         ),
-        "a Clearance": (
-            "InvertedPendulum-v5",
-            lambda: {
-                "constraints": [
-                    sw.constraints.Clearance(
-                        [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])],
-                        bodies=["cart"],
-                        braking=8.0,
-                    )
-                ]
-            },
-        ),
+        "a Clearance": ("InvertedPendulum-v5", lambda: {"constraints": [rail()]}),
     },
     "ChunkHandover": {
         "a delay drawn for every chunk": (
@@ -118,14 +106,9 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
     },
     "ContactMonitor": {
         "everything": (TASK, dict),
-        "feet on the floor": (
-            "HalfCheetah-v5",
-            lambda: {"bodies": ["bfoot", "ffoot"], "against": ["world"]},
-        ),
+        "feet on the floor": ("HalfCheetah-v5", lambda: {"bodies": ["bfoot", "ffoot"], "against": ["world"]}),
     },
-    "CostFunction": {
-        "a function by its name": ("Reacher-v5", lambda: {"fn": f"{__name__}:_joint_speed"}),
-    },
+    "CostFunction": {"a function by its name": ("Reacher-v5", lambda: {"fn": f"{__name__}:_joint_speed"})},
     "FilterObservation": {
         "constraints without a filter": (
             "Reacher-v5",
@@ -136,25 +119,11 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
     "LeaseExpiry": {
         "a Clearance": (
             "InvertedPendulum-v5",
-            lambda: {
-                "budget": sw.StoppingBudget(
-                    sw.constraints.Clearance(
-                        [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])],
-                        bodies=["cart"],
-                        braking=8.0,
-                    ),
-                    acceleration=20.0,
-                    top_speed=5.0,
-                    delays_s=0.01,
-                ),
-            },
+            lambda: {"budget": sw.StoppingBudget(rail(), acceleration=20.0, top_speed=5.0, delays_s=0.01)},
         ),
         "a value with a closing speed": (
             TASK,
-            lambda: {
-                "budget": {"clearance": clearance(), "closing_speed": 4.0},
-                "blend_time": 0.0,
-            },
+            lambda: {"budget": {"clearance": clearance(), "closing_speed": 4.0}, "blend_time": 0.0},
         ),
     },
     "OcclusionPenalty": {
@@ -191,18 +160,12 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         ),
     },
     "RecordInterventions": {"no arguments": (TASK, dict)},
-    "SafetyOverlay": {
-        "of a filter": (TASK, dict),
-    },
+    "SafetyOverlay": {"of a filter": (TASK, dict)},
     "SlipLimiter": {
         "all wheels": ("SafeRover-v0", lambda: {"wheels": list(WHEELS)}),
         "the rear ones, with options": (
             "SafeRover-v0",
-            lambda: {
-                "wheels": ["rear_left", "rear_right"],
-                "max_slip": 0.1,
-                "friction": 0.05,
-            },
+            lambda: {"wheels": ["rear_left", "rear_right"], "max_slip": 0.1, "friction": 0.05},
         ),
     },
     "StuckEscape": {"sooner": (TASK, lambda: {"after_s": 0.5, "progress": 0.1, "escape_s": 0.2})},
@@ -233,12 +196,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
     "WholeBodyFilter": {
         "forecasts": (
             "Hopper-v5",
-            lambda: {
-                "friction_share": 0.6,
-                "joint_tolerance": 0.2,
-                "zmp_inset": 0.01,
-                "tolerance": 0.02,
-            },
+            lambda: {"friction_share": 0.6, "joint_tolerance": 0.2, "zmp_inset": 0.01, "tolerance": 0.02},
         ),
         "contacts alone": ("HalfCheetah-v5", lambda: {"friction_share": 0.5, "joint_tolerance": None}),
     },
@@ -246,8 +204,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
 INSIDE: dict[str, Callable[[Env], Env]] = dict.fromkeys(
-    ("AdaptionPenalty", "SafetyOverlay", "StuckEscape"),
-    lambda env: sw.CBFActionFilter(env, [clearance()]),
+    ("AdaptionPenalty", "SafetyOverlay", "StuckEscape"), lambda env: sw.CBFActionFilter(env, [clearance()])
 )
 """Wrapper name -> the wrapper that it needs inside."""
 

@@ -56,7 +56,7 @@ def draw() -> Figure:
     """Left: distance that must be left, over approach speed. Right: paths."""
     figure, (inset, chart) = panels(2, height=3.0, width_ratios=[3, 4])
     speed = np.linspace(0.0, 2.0, 401)
-    held = held_stop(speed, BRAKE, HOLD)
+    held = np.array([held_stop(v, BRAKE, HOLD) for v in speed])
     inset.plot(speed, speed**2 / (2 * BRAKE), color=INK, ls="--", lw=1.2, label="v² / 2a")
     inset.plot(speed, held, color=ON, label="held for 0.25 s")
     inset.plot(speed, held + speed * DELAY, color=OTHER, label="and 0.2 s of delay")

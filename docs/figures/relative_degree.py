@@ -25,7 +25,7 @@ def draw() -> Figure:
     """Left: paths in the plane of position and speed. Right: what was executed."""
     figure, (plane, commands) = panels(2, height=3.1, width_ratios=[3, 2])
     speed = np.linspace(0.0, 2.2, 200)
-    inset = WALL - held_stop(speed, 1.0, 0.1)
+    inset = WALL - np.array([held_stop(v, 1.0, 0.1) for v in speed])
     plane.fill_betweenx(speed, -0.2, inset, color=SAFE, alpha=0.15, lw=0)
     plane.plot(inset, speed, color=SAFE, lw=1.2)
     plane.text(-0.16, 1.0, "from here it\ncan still stop", color=SAFE)

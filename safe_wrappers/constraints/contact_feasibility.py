@@ -18,7 +18,6 @@ from safe_wrappers.errors import (
     Array,
     ConfigurationError,
     UnsupportedEnvError,
-    check_fields,
     non_negative,
     positive,
 )
@@ -65,18 +64,16 @@ class ContactFeasibility(_ContactConstraint):
         friction_share: Of the model's friction coefficient, in (0, 1]. MuJoCo's default cones are pyramids: above
             0.71 a foot may slide within its share.
         tolerance: By how much a force may miss its cone, as a share of the robot's weight: light touches scrape.
-        margin: Kept free inside the cone, as a share of the weight. More than the tolerance refuses light touches.
 
     Source: appendix "Physical contact feasibility constraints".
     """
 
     friction_share: float = 0.7
     tolerance: float = 0.01
-    margin: float = 0.0
 
     def __post_init__(self) -> None:
         self.friction_share = checked_friction_share(self.friction_share)
-        check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
+        self.tolerance = non_negative("tolerance", self.tolerance, "shares of the weight")
 
     info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_CONE_MARGIN,)
 
@@ -87,8 +84,8 @@ class ContactFeasibility(_ContactConstraint):
     def h_along(self, path: Contacts | None) -> Array:
         """By how much each body's contact forces stay inside the cone, tolerance added, shares of the weight.
 
-        At most as much as is asked for: differences between a touch and none would say nothing of the touch. NaN
-        where the simulation has diverged.
+        At most the tolerance: differences between a touch and none would say nothing of the touch. NaN where the
+        simulation has diverged.
         """
         if path is None:
             return np.zeros((1, 0))
@@ -99,7 +96,7 @@ class ContactFeasibility(_ContactConstraint):
         np.minimum.at(worst, path.body, inside / weight_n(self.plant.model))
         worst, least = worst[self._chosen], float(worst[self._chosen].min())
         self.report[keys.WHOLE_BODY_CONE_MARGIN] = least if np.isfinite(least) else 0.0
-        return (np.minimum(worst, self.margin) + self.tolerance)[None]
+        return (np.minimum(worst, 0.0) + self.tolerance)[None]
 
 
 def checked_friction_share(share: float) -> float:
@@ -133,22 +130,19 @@ class SupportMargin(_ContactConstraint):
     Args:
         inset: m, positive: pushing forces alone keep the point inside the hull. An inset of millimetres can be
             crossed between two evaluations.
-        margin: Kept free inside the inset, m.
 
     Source: appendix "Physical contact feasibility constraints", third condition and footnote 8.
     """
 
     inset: float
-    margin: float = 0.0
 
     def __post_init__(self) -> None:
         self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
-        self.margin = non_negative("margin", self.margin, "m")
 
     info_keys: ClassVar[tuple[str, ...]] = (keys.WHOLE_BODY_ZMP_MARGIN,)
 
     def h_along(self, path: Contacts | None) -> Array:
-        """Distance to the edge minus the inset where it is least, m; the margin where there is no polygon."""
+        """Distance to the edge minus the inset where it is least, m; 0 where there is no polygon."""
         if path is None:
             return np.zeros((1, 0))
         if not path.finite:
@@ -156,7 +150,7 @@ class SupportMargin(_ContactConstraint):
             return np.array([[np.nan]])
         distances = support_distances(path.step, path.point, path.normal, path.force)
         self.report[keys.WHOLE_BODY_ZMP_MARGIN] = least = float(min(distances, default=0.0))
-        return np.array([[least - self.inset if len(distances) else self.margin]])
+        return np.array([[least - self.inset if len(distances) else 0.0]])
 
 
 @dataclass

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,8 +27,6 @@ _LEAST_SHARE = 0.3  # of the slip that must be along the heading: the force acro
 _UNBOUNDED = 1e9  # stands for the control of an actuator without limits
 _LEAST_LOAD = 0.05  # share of the largest load seen below which a wheel counts as in the air
 _MOST_FRICTION = 3.0  # force over load beyond which something else than the ground held the wheel
-# Integrators that step a servo's feedback as they step damping.
-_IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
 
 
 @dataclass
@@ -63,7 +60,7 @@ class Traction(Constraint):
     commands change, the slip overshoots for one to three steps; that is not flagged, and `slip/ratio` shows it.
 
     Args:
-        wheels: Names of the wheels' hinges; each must be driven by actuators on that joint and nothing else.
+        wheels: Names of the wheels' hinges; each must be driven by motors on that joint and nothing else.
         max_slip: Largest slip ratio, normalised, in (0, 1).
         friction: Lower bound on the peak friction coefficient under every wheel, > 0, whose force is counted on at
             once; too high a bound lets wheels spin. None: no bound.
@@ -103,9 +100,7 @@ class Traction(Constraint):
             )
         self._wheels = DrivenWheels(self.plant, self.wheels)
         self.constants = self._wheels.wheel
-        options, feedback = self.plant.model.opt, self._wheels.feedback
-        hold = float(options.timestep), self.plant.substeps
-        self._response = self.constants.response(*hold, feedback, int(options.integrator) in _IMPLICIT)
+        self._response = self.constants.response(float(self.plant.model.opt.timestep), self.plant.substeps)
         slip, friction = np.zeros(len(self.wheels)), self._start().estimate.mean
         self.report |= {keys.SLIP_RATIO: slip, keys.SLIP_MU_ESTIMATE: friction}
 
@@ -195,10 +190,10 @@ class Traction(Constraint):
         """Two per wheel, for driving and braking torque, where the drive could exceed them."""
         if self.seen.rate is None:  # says nothing, and a row that is not a number fails
             return HalfSpaces(np.full((1, self.plant.lower.size), np.nan), np.full(1, np.nan))
-        bias, effect = self._wheels.drive()
+        effect = self._wheels.effect
         carried = 0.0 if self.friction is None else self.friction * self.seen.load
-        most = self._torques(self._window[1], np.maximum(self.seen.present, carried)) - bias
-        least = self._torques(self._window[0], np.minimum(self.seen.present, -carried)) - bias
+        most = self._torques(self._window[1], np.maximum(self.seen.present, carried))
+        least = self._torques(self._window[0], np.minimum(self.seen.present, -carried))
         low, high = self.plant.acting_range
         low, high = np.maximum(low, -_UNBOUNDED), np.minimum(high, _UNBOUNDED)
         ends = [end(effect * low, effect * high).sum(axis=1) for end in (np.minimum, np.maximum)]
@@ -223,14 +218,13 @@ class Traction(Constraint):
     def _braking(self) -> Array:
         if self.seen.rate is None:
             return np.zeros_like(self.plant.lower)
-        bias, effect = self._wheels.drive()
         speed = self.seen.ground + self.seen.ahead
         low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
         wanted = np.where(speed > 0.0, low, high)
         # No farther than to a standstill: past it the wheel would drive the other way.
         wanted = np.where(speed > 0.0, np.maximum(wanted, 0.0), np.minimum(wanted, 0.0))
-        torque = self._torques(wanted, self.seen.present) - bias
-        return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
+        torque = self._torques(wanted, self.seen.present)
+        return np.asarray(np.linalg.lstsq(self._wheels.effect, torque, rcond=None)[0])
 
 
 def _kept_free(error: Array, room: Array) -> Array:

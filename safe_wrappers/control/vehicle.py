@@ -66,28 +66,20 @@ class Response(NamedTuple):
 class Wheel:
     """Constants of one or more wheels, arrays of one shape.
 
-    Over a control interval `I w' = tau - k w - b w - r F`, with torque and force constant over the interval and k the
-    feedback of a speed servo, stepped with implicit damping as MuJoCo's Euler integrators do: `w+ = decay w + gain
-    (tau - r F)`, exactly. Solved for F it is a traction-force observer; other torques on the axle (dry friction, a
-    spring) appear in F.
+    Over a control interval `I w' = tau - b w - r F`, with torque and force constant over the interval, stepped with
+    implicit damping as MuJoCo's Euler integrators do: `w+ = decay w + gain (tau - r F)`, exactly. Solved for F it is
+    a traction-force observer; other torques on the axle (dry friction, a spring) appear in F.
     """
 
     radius: Array  #: r, m, > 0
     inertia: Array  #: I about the axle, rotor included, kg m^2, > 0
     damping: Array  #: b of the axle, N m s/rad, >= 0
 
-    def response(
-        self, timestep: float, substeps: int, feedback: Array | float = 0.0, implicit: bool = False
-    ) -> Response:
-        """To torque and force held for `substeps` physics steps of `timestep` s.
-
-        The feedback is the k of speed servos, N m s/rad, which the engine may integrate implicitly, like damping;
-        `torque` is then their torque at standstill.
-        """
-        k = np.asarray(feedback, dtype=np.float64)
-        effective = self.inertia + timestep * (self.damping + (k if implicit else 0.0))
-        share = (self.inertia - (0.0 if implicit else timestep * k)) / effective
-        # (1 - decay) / (b + k), also where both are 0.
+    def response(self, timestep: float, substeps: int) -> Response:
+        """To torque and force held for `substeps` physics steps of `timestep` s."""
+        effective = self.inertia + timestep * self.damping
+        share = self.inertia / effective
+        # (1 - decay) / b, also where b is 0.
         gain = timestep / effective * sum(share**step for step in range(substeps))
         return Response(share**substeps, np.asarray(gain))
 

@@ -1,34 +1,71 @@
-"""Closed loops judged at every physics substep by an integration of their own, and the drivers that attack them."""
+"""Closed loops judged at every physics substep on data of their own, and the drivers that attack them."""
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 from scenes import Scene
+from scipy.spatial import ConvexHull
 
-import safe_wrappers as sw
+from safe_wrappers.plants.mujoco.contacts import Replay
 
 
-def sliders(count=1, actuator="motor", range_="-1 1", **options):
-    """Masses of 1 kg on slides of their own, along x, without gravity: `v' = u` each."""
-    limit = 'ctrllimited="false"' if range_ is None else f'ctrlrange="{range_}"'
-    bodies = "".join(
-        f'<body name="b{i}" pos="0 {i} 0"><joint name="x{i}" type="slide" axis="1 0 0"/>'
-        '<geom size=".1" mass="1"/></body>'
-        for i in range(count)
+def slider(strength=1.0, gear=1.0):
+    """A mass of 1 kg on a slide along x, without gravity: `v' = gear u`, from -strength to strength."""
+    return Scene(f"""<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
+        <body name="b0"><joint name="x0" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body></worldbody>
+        <actuator><motor joint="x0" ctrlrange="{-strength} {strength}" gear="{gear}"/></actuator></mujoco>""")
+
+
+HALF, HEIGHT, MASS = 0.2, 0.5, 5.0
+TABLE = """<mujoco><option timestep="0.002" gravity="{gravity}"/>
+<default><geom friction="2 0 0" solref="-40000 -200"/></default>
+<worldbody><geom name="floor" type="plane" size="9 9 1"/>{step}
+<body name="table" pos="0 0 {height}">
+  <joint name="x" type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0 1 0"/>
+  <inertial pos="0 0 0" mass="{mass}" diaginertia=".3 .3 .3"/>{feet}</body></worldbody>
+<actuator><motor joint="x" ctrllimited="true" ctrlrange="-1 1" gear="50"/></actuator></mujoco>"""
+CORNERS = [(x, y) for x in (-HALF, HALF) for y in (-0.6, 0.6)]
+
+
+def table(feet=CORNERS, step=0.0, gravity="0 0 -9.81"):
+    """A table pushed at the height of its centre of mass; a control of 1 is 50 N."""
+    legs = "".join(
+        f'<geom name="f{i}" pos="{x} {y} {-HEIGHT + 0.02 + (step if x > 0 else 0.0)}" size=".02"/>'
+        for i, (x, y) in enumerate(feet)
     )
-    motors = "".join(f'<{actuator} joint="x{i}" {limit}/>' for i in range(count))
+    ground = f'<geom type="box" pos="1.1 0 {step - 0.5}" size="1 2 .5"/>' if step else ""
     return Scene(
-        f"""<mujoco><option timestep="0.01" gravity="0 0 0"><flag contact="disable"/></option>
-        <worldbody>{bodies}</worldbody><actuator>{motors}</actuator></mujoco>""",
-        **options,
+        TABLE.format(height=HEIGHT, mass=MASS, feet=legs, step=ground, gravity=gravity), frame_skip=5
     )
+
+
+def cart_before_a_wall(
+    mass=5.0, stiffness=2e4, timestep=1e-3, gap=0.3, frame_skip=10, force=200.0, extra="", wall=""
+):
+    """A ball that is pushed along x towards a wall that MuJoCo makes a spring without damping."""
+    env = Scene(
+        f"""<mujoco><option timestep="{timestep}" gravity="0 0 0"/><worldbody>
+        <body name="wall" pos="{gap + 0.1} 0 0" {wall}><geom name="wall" type="box" size=".05 .5 .5" pos=".05 0 0"
+          condim="1" priority="1"/></body>
+        <body name="cart"><joint name="x" axis="1 0 0" type="slide"/>
+        <geom name="bumper" size=".1" mass="{mass}" condim="1"/></body>{extra}</worldbody>
+        <actuator><motor joint="x" ctrlrange="-1 1" gear="{force}"/></actuator></mujoco>""",
+        frame_skip=frame_skip,
+    )
+    env.model.geom("wall").solref[:] = -stiffness * env.model.body("cart").invweight0[0], 0.0
+    env.model.geom("wall").solimp[:] = 1e-3, 1e-3, 1e-3, 0.5, 2.0
+    return env
+
+
+def flagged(info):
+    """Whether the step says of itself that it promises nothing."""
+    return info["cbf/infeasible"] or info["cbf/fallback"]
 
 
 class Judge:
     """Integrates every executed action once more, from a copy of the env's data.
 
     Args:
-        env: The filtered one.
+        env: The filtered one, or a bare one.
         room: Model and data with fresh kinematics to what is left of the limit, any shape; wanted >= 0.
     """
 
@@ -51,10 +88,10 @@ class Judge:
         return self.at(self.data)
 
     def step(self, env, action):
-        """The least room at any substep of the step, that at its end, and the info."""
+        """The least room at any substep of the step, that at its end, whether the episode ends, and the info."""
         mujoco.mj_copyData(self.data, self.raw.model, self.raw.data)
         *_, terminated, truncated, info = env.step(action)
-        self.data.ctrl[:] = info["executed_action"]
+        self.data.ctrl[:] = info.get("executed_action", action)
         rooms = []
         for _ in range(self.raw.frame_skip):
             mujoco.mj_step(self.raw.model, self.data)
@@ -64,75 +101,184 @@ class Judge:
         return min(rooms), rooms[-1], terminated or truncated, info
 
 
-def flagged(info):
-    """Whether the step says of itself that it promises nothing."""
-    return info["cbf/infeasible"] or info["cbf/fallback"]
+class ForceJudge:
+    """Likewise of forces, at every evaluation of the physics; of a state nothing is known before its step.
+
+    Args:
+        env: The filtered one, or a bare one.
+        room: Model and data with the forces of the solver to what is left of the limit; wanted >= 0.
+    """
+
+    def __init__(self, env, room):
+        self.raw, self.room = env.unwrapped, room
+        self._replay = Replay(self.raw)
+
+    def at(self, data):
+        return 0.0
+
+    def step(self, env, action):
+        self._replay.before()
+        *_, terminated, truncated, info = env.step(action)
+        rooms = []
+        assert self._replay.after(lambda data, _: rooms.append(self.room(self.raw.model, data)))
+        return min(rooms), 0.0, terminated or truncated, info
 
 
-def signs(env, k, rate):
+# Rooms that need more than a line ----------------------------------------------------------------------------
+
+
+def manipulability(model, data, kind, name, joints, directions="xyz"):
+    """sqrt(det(J J')) by the singular values of MuJoCo's own Jacobian; positions are up to date."""
+    mujoco.mj_comPos(model, data)
+    linear = np.zeros((3, model.nv))
+    index = getattr(model, kind)(name).id
+    call = {"body": mujoco.mj_jacBody, "site": mujoco.mj_jacSite, "geom": mujoco.mj_jacGeom}[kind]
+    call(model, data, linear, None, index)
+    rows = [linear["xyz".index(d)] for d in directions]
+    columns = model.jnt_dofadr[[model.joint(j).id for j in joints]]
+    return float(np.prod(np.linalg.svd(np.array(rows)[:, columns], compute_uv=False)))
+
+
+# Contact forces, from the numbers of MuJoCo's solver ----------------------------------------------------------
+
+
+def moves(model, body):
+    """Whether a body has a joint between itself and the world."""
+    while body:
+        if model.body_dofnum[body]:
+            return True
+        body = model.body_parentid[body]
+    return False
+
+
+def solver_force(model, data, contact):
+    """Along the normal and the two tangents: what a contact's rows of the solver add up to, N."""
+    first, dim = contact.efc_address, contact.dim
+    if dim == 1:
+        return np.array([data.efc_force[first], 0.0, 0.0])
+    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        return np.array(data.efc_force[first : first + 3])
+    # A row pushes along an edge of the pyramid: the normal, plus or minus a tangent times its friction.
+    edges = data.efc_force[first : first + 2 * (dim - 1)].reshape(-1, 2)
+    sideways = (edges[:2, 0] - edges[:2, 1]) * contact.friction[:2]
+    return np.array([edges.sum(), *sideways])
+
+
+def touches(model, data):
+    """Point, normal, force on the robot and friction of each contact with what does not move."""
+    for contact in data.contact:
+        if contact.efc_address < 0 or -1 in contact.geom:
+            continue
+        one, two = (int(model.geom_bodyid[g]) for g in contact.geom)
+        if moves(model, one) == moves(model, two):
+            continue
+        frame = contact.frame.reshape(3, 3)
+        side = 1.0 if moves(model, two) else -1.0
+        force = side * frame.T @ solver_force(model, data, contact)
+        friction = min(contact.friction[:2]) if contact.dim > 1 else 0.0
+        yield contact.pos.copy(), side * frame[0], force, friction
+
+
+def cone_room(share, tolerance=0.0):
+    """By how much all contact forces stay in narrower cones, the tolerance added, shares of the weight."""
+
+    def room(model, data):
+        mass = sum(model.body_mass[b] for b in range(model.nbody) if moves(model, b))
+        weight, left = mass * np.linalg.norm(model.opt.gravity), [np.inf]
+        for _, normal, force, friction in touches(model, data):
+            pressure = force @ normal
+            sideways = np.linalg.norm(force - pressure * normal)
+            left.append(min(share * friction * pressure - sideways, pressure) / weight)
+        return min(left) + tolerance
+
+    return room
+
+
+def inside_the_hull(inset):
+    """Distance of the centre of pressure from the edge of the contacts' hull, by scipy; infinite without one."""
+
+    def room(model, data):
+        found = list(touches(model, data))
+        if not found:
+            return np.inf
+        points, forces = (np.array([one[i] for one in found]) for i in (0, 2))
+        flat, pressure = points[:, :2], forces[:, 2]
+        if (
+            len(flat) < 3
+            or np.linalg.matrix_rank(flat - flat.mean(axis=0), 1e-6) < 2
+            or pressure.sum() <= 0.0
+        ):
+            return np.inf
+        # Points above the mean height have moments of their own tangential forces.
+        up = points[:, 2] - points[:, 2].mean()
+        centre = (flat * pressure[:, None] - up[:, None] * forces[:, :2]).sum(axis=0) / pressure.sum()
+        return -float((ConvexHull(flat).equations @ [*centre, 1.0]).max()) - inset
+
+    return room
+
+
+def below_force(limit):
+    """What is left of a force, N, of all contacts together."""
+    return lambda model, data: limit - float(data.efc_force[data.contact.efc_address[: data.ncon]].sum())
+
+
+# Drivers: the judge, the action space, the number of the step, a generator ------------------------------------
+
+
+def signs(space, k, rate):
     """Full controls that stay for `rate` steps."""
-    bits = np.random.default_rng(k // rate).random(env.action_space.shape) < 0.5
-    return env.action_space.high * np.where(bits, -1.0, 1.0)
+    bits = np.random.default_rng(k // rate).random(space.shape) < 0.5
+    return np.where(bits, space.low, space.high)
 
 
-def at_random(judge, env, k, rng):
-    return rng.uniform(env.action_space.low, env.action_space.high)
+def at_random(judge, space, k, rng):
+    return rng.uniform(space.low, space.high)
 
 
-def bang_bang(judge, env, k, rng):
-    return signs(env, k, 9)
+def bang_bang(judge, space, k, rng):
+    return signs(space, k, 9)
 
 
-def pulse(judge, env, k, rng):
-    return signs(env, k, 20) * (k % 20 < 4)
+def pulse(judge, space, k, rng):
+    return signs(space, k, 20) * (k % 20 < 4)
 
 
-def seeking(judge, env, k, rng):
+def full(judge, space, k, rng):
+    return space.high
+
+
+def noisy(judge, space, k, rng):
+    """A weak policy: on legs it stands, falls and scrapes."""
+    return 0.15 * space.high * rng.normal(size=space.shape).clip(-3, 3)
+
+
+def seeking(judge, space, k, rng):
     """Of some full controls the one that leaves the least room two steps on."""
-    tried = [env.action_space.high * rng.choice([-1.0, 1.0], env.action_space.shape) for _ in range(5)]
+    tried = [np.where(rng.random(space.shape) < 0.5, space.low, space.high) for _ in range(5)]
     return min(tried, key=lambda u: judge.ahead(u, 2))
 
 
-DRIVERS = {d.__name__: d for d in (at_random, bang_bang, pulse, seeking)}
-
-
-def drive(env, room, driver, steps, seeds=(0,)):
-    """Drive episodes; every step that starts safe and is not flagged has to keep the limit at every substep.
+def drive(env, judge, driver, steps, seed=0):
+    """Every step that starts safe and is not flagged has to keep the limit at every substep.
 
     Returns:
-        Counts: steps, intervened, flagged, outside (steps with less than no room), and the least room.
+        Counts: intervened, flagged, outside (steps with less than no room), and the least room.
     """
-    judge = Judge(env, room)
-    seen = {"steps": 0, "intervened": 0, "flagged": 0, "outside": 0, "least": np.inf}
-    for seed in seeds:
-        rng = np.random.default_rng(seed)
-        env.reset(seed=seed)
-        before = judge.at(judge.raw.data)
-        for k in range(steps):
-            action = DRIVERS[driver](judge, env, k, rng).astype(env.action_space.dtype)
-            least, end, done, info = judge.step(env, action)
-            # 1e-6: the executed action is rounded to the space's float32
-            assert least >= -1e-6 or before < 0.0 or flagged(info), (seed, k, least, info)
-            seen["steps"] += 1
-            seen["intervened"] += info["cbf/intervened"]
-            seen["flagged"] += flagged(info)
-            seen["outside"] += least < -1e-6
-            seen["least"] = min(seen["least"], least)
-            before = end
-            if done:
-                env.reset()
-                before = judge.at(judge.raw.data)
+    seen = {"intervened": 0, "flagged": 0, "outside": 0, "least": np.inf}
+    rng = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    before = judge.at(judge.raw.data)
+    for k in range(steps):
+        action = driver(judge, env.action_space, k, rng).astype(env.action_space.dtype)
+        least, end, done, info = judge.step(env, action)
+        # 1e-6: the executed action is rounded to the space's float32
+        assert least >= -1e-6 or before < 0.0 or flagged(info), (k, least, info)
+        seen["intervened"] += info["cbf/intervened"]
+        seen["flagged"] += flagged(info)
+        seen["outside"] += least < -1e-6
+        seen["least"] = min(seen["least"], least)
+        before = end
+        if done:
+            env.reset()
+            before = judge.at(judge.raw.data)
     return seen
-
-
-def check_inactive(env_id, limit, largest, steps):
-    """Actions of up to `largest` pass bit for bit: the env does what it does without the filter."""
-    bare, filtered = gym.make(env_id), sw.CBFActionFilter(gym.make(env_id), [limit])
-    rng = np.random.default_rng(0)
-    a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
-    for _ in range(steps):
-        assert a.tobytes() == b.tobytes()
-        action = rng.uniform(-largest, largest, bare.action_space.shape).astype(np.float32)
-        a, reward, *_ = bare.step(action)
-        b, same, _, _, info = filtered.step(action)
-        assert reward == same and not info["cbf/intervened"] and not info["cbf/refused"].any()

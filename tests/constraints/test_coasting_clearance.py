@@ -1,4 +1,4 @@
-"""CoastingClearance: what it admits, suggests, refuses and says."""
+"""CoastingClearance: what it admits, suggests as a `Detour`, refuses and says."""
 
 import warnings
 
@@ -6,11 +6,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked, asked
+from asking import Asked
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
-from safe_wrappers.filter.bound import Bound
+from safe_wrappers.errors import UnsafeStateWarning
 
 FULL = np.array([1.0, 1.0])
 BACK = -FULL
@@ -57,15 +56,17 @@ def ahead_of(env, distance):
     return np.array([x + distance, y])
 
 
-@pytest.mark.parametrize("gap", np.linspace(0.02, 0.16, 8))
+@pytest.mark.parametrize("gap", [0.01, *np.linspace(0.02, 0.16, 8), 0.2])
 @pytest.mark.parametrize("speed_up", [0, 6, 30])
 def test_a_control_is_admitted_iff_its_way_to_rest_keeps_the_margin(gap, speed_up):
     """Independent: the env's own data, stepped on without any control."""
     env, constraint, plant = bound([[5.0, 0.0]], speed_up=speed_up)
-    hazard = ahead_of(env, 0.2 + gap)
-    env.unwrapped._hazards[:] = hazard
-    plant.observe()
-    at_rest = least_way(env, NONE, hazard) - 0.2
+    for side in (-1.0, 1.0):  # behind the car: what it rolls away from is as near as now; and before it
+        hazard = ahead_of(env, side * (0.2 + gap))
+        env.unwrapped._hazards[:] = hazard
+        plant.observe()
+        at_rest = least_way(env, NONE, hazard) - 0.2
+        assert constraint.value() == pytest.approx(min(at_rest, gap), abs=1e-3)
     for control in (FULL, BACK, NONE, np.array([1.0, -1.0]), np.array([0.006, 0.0])):
         way = least_way(env, control, hazard) - 0.2
         if abs(way - 0.005) < 1e-3 or at_rest < 0.006:
@@ -87,10 +88,15 @@ def test_no_control_is_admitted_where_nothing_leaves_more_and_the_state_is_unsaf
 
 
 def test_far_from_everything_nothing_is_forecast():
-    _, constraint, _ = bound([[3.0, 0.0]], max_decrease=0.05, max_decrease_per_speed=0.13)
+    env, constraint, plant = bound([[3.0, 0.0]], max_decrease=0.05, max_decrease_per_speed=0.13)
     constraint.coasting.run = None  # any forecast would fail
     assert constraint.admits(FULL)
     assert constraint.value() == pytest.approx(2.8)
+    for _ in range(10):
+        env.unwrapped.step(np.array([1.0, -1.0]))  # turning moves no origin
+    plant.observe()
+    room = np.linalg.norm([3.0, 0.0] - env.unwrapped.agent_position) - 0.2
+    assert constraint.value() == pytest.approx(room - 0.13 * np.hypot(*env.unwrapped.data.qvel[:2]), abs=1e-6)
 
 
 def test_a_reach_that_is_broken_is_dropped_with_a_warning():
@@ -126,29 +132,13 @@ def test_the_outline_counts_where_it_should():
 
 
 def test_from_inside_it_drives_out():
-    options = {"keep_out": [sw.constraints.Discs("hazard_positions", 0.2)], "robot_model_attr": "robot_model"}
-    env = sw.CBFActionFilter(gym.make("SafeCarGoal1-v0"), [sw.constraints.CoastingClearance(**options)])
-    layout = {"agent": [0.0, 0.0, 0.0], "goal": [9.0, 9.0], "hazards": [[0.12, 0.05]], "vases": []}
     with pytest.warns(UnsafeStateWarning):
-        info = env.reset(seed=0, options={"layout": layout})[1]
-    assert info["cbf/unsafe"]
+        env, _, _ = bound([[0.12, 0.05]])
     with warnings.catch_warnings(action="ignore"):
         infos = [env.step(FULL.astype(np.float32))[4] for _ in range(60)]
     assert infos[0]["cbf/unsafe"] and infos[0]["cbf/intervened"]
     first = next(k for k, info in enumerate(infos) if not info["cost_substep"])
     assert first < 40 and not any(info["cost_substep"] for info in infos[first:])
-
-
-@pytest.mark.parametrize("gap", [0.01, 0.05, 0.2])
-@pytest.mark.parametrize("speed_up", [0, 6, 30])
-def test_the_value_is_what_coasting_leaves(gap, speed_up):
-    env, constraint, plant = bound([[5.0, 0.0]], speed_up=speed_up)
-    for side in (1.0, -1.0):  # before the car, and behind it: what it rolls away from is as near as now
-        hazard = ahead_of(env, side * (0.2 + gap))
-        env.unwrapped._hazards[:] = hazard
-        plant.observe()
-        left = min(least_way(env, NONE, hazard) - 0.2, gap)
-        assert constraint.value() == pytest.approx(left, abs=1e-3)
 
 
 def test_from_inside_the_best_way_out_is_admitted_and_the_way_in_is_not():
@@ -180,67 +170,24 @@ def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
     assert limit.executed(FULL)["detour"] == (-1.0, 24)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, "keep_out .* or untouched"),
-        ({"keep_out": [sw.constraints.Plane([0.0], [1.0])]}, "keep_out holds Disc and Discs, got Plane"),
-        (
-            {"untouched": [sw.constraints.Disc([0, 0], 1)], "outline": [[0, 0], [1, 1]]},
-            "outline needs three points that are not on one line",
-        ),
-        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "max_decrease": -1.0}, "max_decrease must be"),
-        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "margin": -0.1}, "margin must be"),
-    ],
-)
-def test_bad_arguments_are_refused_when_it_is_made(options, message):
-    with pytest.raises(ConfigurationError, match=message):
-        sw.constraints.CoastingClearance(**options)
-
-
-def test_a_plant_without_a_model_is_refused():
-    plant = sw.AnalyticPlant(f=lambda x: -x, g=lambda x: np.eye(1), state=lambda env: np.zeros(1))
-    with pytest.raises(UnsupportedEnvError, match="needs a MujocoPlant"):
-        Bound(sw.constraints.CoastingClearance(keep_out=[sw.constraints.Disc([0, 0], 1)]), plant)
-
-
-# CoastingClearance where zero control leaves less than the margin, or does not lead to rest within the horizon
-
-
-RADIUS, MARGIN = 0.2, 0.005
-
-
-def parked(hazard, speed_up=0, **options):
-    """A car at the origin, along x, after `speed_up` steps of full drive; its constraint, and where it is then."""
-    env = gym.make("SafeCarGoal1-v0")
-    layout = {"agent": [0.0, 0.0, 0.0], "goal": [9.0, 9.0], "hazards": [list(hazard)], "vases": []}
-    env.reset(seed=0, options={"layout": layout})
-    for _ in range(20):
-        env.unwrapped.step(NONE)  # it settles on its wheels
-    for _ in range(speed_up):
-        env.unwrapped.step(FULL)
-    spec = sw.constraints.CoastingClearance([sw.constraints.Discs("hazard_positions", RADIUS)], **options)
-    return asked(env, spec), np.array(env.unwrapped.agent_position)
-
-
 def test_what_does_not_rest_within_the_horizon_is_refused_however_far_it_stays_away():
     for horizon, rests in ((2, False), (12, True)):
-        limit, at = parked([5.0, 0.0], speed_up=30, horizon=horizon)
-        for control in (FULL, NONE, -FULL):
+        env, limit, _ = bound([[5.0, 0.0]], speed_up=30, horizon=horizon)
+        far = 5.0 - 0.2 - env.unwrapped.agent_position[0]
+        for control in (FULL, NONE, BACK):
             assert limit.admits(control) == rests
             assert np.isfinite(limit.value()).all() == rests
-            if rests:
-                assert 5.0 - RADIUS - at[0] - 0.3 < limit.slack(control) < 5.0 - RADIUS - at[0]
-            else:
-                assert limit.slack(control) == -np.inf
+            slack = limit.slack(control)
+            assert far - 0.3 < slack < far if rests else slack == -np.inf
 
 
 @pytest.mark.parametrize("gap", [0.001, 0.003, 0.0045])
 def test_parked_inside_the_margin_only_the_way_out_is_open(gap):
-    ahead, _ = parked([RADIUS + gap, 0.0], margin=MARGIN)
-    assert 0.0 < float(ahead.value()[0]) < MARGIN
-    assert ahead.admits(-FULL)
-    assert not ahead.admits(FULL)
-    behind, _ = parked([-RADIUS - gap, 0.0], margin=MARGIN)
-    assert behind.admits(FULL)
-    assert not behind.admits(-FULL)
+    for side, out in ((1.0, BACK), (-1.0, FULL)):
+        env, limit, plant = bound([[5.0, 0.0]])
+        for _ in range(20):
+            env.unwrapped.step(NONE)  # it settles on its wheels
+        env.unwrapped._hazards[:] = ahead_of(env, side * (0.2 + gap))
+        plant.observe()
+        assert 0.0 < float(limit.value()[0]) < 0.005
+        assert limit.admits(out) and not limit.admits(-out)

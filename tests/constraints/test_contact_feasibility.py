@@ -1,19 +1,23 @@
-"""ContactFeasibility: where a pushed ball would slide, and closed loops judged on the env's own contacts."""
+"""ContactFeasibility and SupportMargin where balls slide and tables tip; Stance by a program put together by hand.
+
+Closed loops are in test_forecast_loops.py.
+"""
+
+from dataclasses import replace
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
-from asking import bound, settled
-from contact_judge import DRIVERS, ConeJudge
-from judged_loops import Scene, flagged
+from asking import settled
+from judged_loops import HALF, HEIGHT, MASS, ForceJudge, at_random, cone_room, flagged, inside_the_hull, table
+from qpsolvers import solve_qp
+from scenes import Scene
+from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.bound import Bound
+from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import weight_n
-
-ROUNDING = 1e-6
-"""Executed actions are rounded to float32, and a robot in contact makes more of it."""
 
 BALLS = """<mujoco><option timestep="0.005" cone="{cone}"/>
 <default><geom friction="0.8 0 0" condim="{condim}"/></default>
@@ -33,16 +37,14 @@ def pushed_balls(names=("left",), cone="pyramidal", condim=3, more=""):
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 @pytest.mark.parametrize(
-    ("share", "tolerance", "margin"),
-    [(0.7, 0.0, 0.0), (0.5, 0.0, 0.0), (0.7, 0.1, 0.0), (0.7, 0.0, 0.1), (0.7, 0.02, 0.12), (1.0, 0.0, 0.2)],
+    ("share", "tolerance"),
+    [(0.7, 0.0), (0.5, 0.0), (0.7, 0.1)],
 )
-def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_margin(
-    cone, share, tolerance, margin
-):
+def test_it_admits_pushes_up_to_the_share_and_the_tolerance(cone, share, tolerance):
     # One ball, one contact: its pressure is the weight, and what holds it is what pushes it.
-    largest = share * 0.8 + tolerance - margin  # of the weight
+    largest = share * 0.8 + tolerance  # of the weight
     weight = 2.0 * 9.81
-    spec = sw.constraints.ContactFeasibility(share, tolerance, margin=margin)
+    spec = sw.constraints.ContactFeasibility(share, tolerance)
     for part, admitted in ((0.99, True), (1.01, False), (-0.99, True), (-1.01, False)):
         control = np.array([part * largest * weight / 50.0])
         limit = settled(pushed_balls(cone=cone), spec, control, 40)
@@ -51,113 +53,252 @@ def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_marg
         inside = share * 0.8 - abs(part) * largest
         limit.executed(control)
         assert limit.report["whole_body/cone_margin"] == pytest.approx(inside, abs=2e-3)
-        assert limit.slack(control) == pytest.approx(min(inside, margin) + tolerance - margin, abs=2e-3)
+        assert limit.slack(control) == pytest.approx(min(inside, 0.0) + tolerance, abs=2e-3)
 
 
-def test_in_the_air_nothing_is_missed_whatever_the_margin():
+def test_in_the_air_nothing_is_missed():
     env = pushed_balls(("left", "right"))
     env.start = np.array([0.0, 3.0, 0.0, 3.0]), np.zeros(4)
-    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0, margin=0.3), np.zeros(2), 40)
+    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0), np.zeros(2), 40)
     env.reset()
     limit.plant.observe()
     control = np.array([1.0, -1.0])
     assert limit.admits(control) and limit.slacks(control).tolist() == [0.0, 0.0]
 
 
+def test_where_nothing_has_friction_there_is_no_cone_to_stay_in():
+    with pytest.raises(UnsupportedEnvError, match="no body of this model"):
+        sw.CBFActionFilter(pushed_balls(condim=1), [sw.constraints.ContactFeasibility()])
+
+
+TIPS = MASS * 9.81 / HEIGHT / 50.0
+"""A push F at the height h moves the zero moment point by F h / W: the control that moves it by 1 m."""
+
+
+@pytest.mark.parametrize("inset", [0.03, 0.1])
+def test_it_admits_pushes_up_to_where_the_table_tips_about_the_inset_edge(inset):
+    tips = TIPS * (HALF - inset)
+    for way in (-1.0, 1.0):
+        limit = settled(table(), sw.constraints.SupportMargin(inset), np.array([0.97 * way * tips]))
+        assert limit.admits(np.array([0.97 * way * tips]))
+        assert not limit.admits(np.array([1.04 * way * tips]))
+        assert limit.slack(np.array([9.0 * way * tips])) >= -(inset + 1e-9)
+
+
+def test_the_distance_is_that_of_the_moments():
+    for push in (-0.3, 0.0, 0.25):
+        limit = settled(table(), sw.constraints.SupportMargin(0.01), np.array([push]))
+        expected = HALF - abs(push) / TIPS
+        assert limit.slacks(np.array([push]))[0] == pytest.approx(expected - 0.01, abs=2e-3)
+        limit.executed(np.array([push]))
+        assert limit.report["whole_body/zmp_margin"] == pytest.approx(expected, abs=2e-3)
+
+
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    "env",
     [
-        ({"friction_share": 0.0}, "friction_share"),
-        ({"friction_share": "all"}, "friction_share"),
-        ({"margin": np.nan}, "margin"),
+        table([(-0.2, 0.0), (0.2, 0.0)]),  # a line
+        table([(0.0, 0.0)]),  # a point
+        table(step=0.05),  # two heights
+        table(gravity="0 0 0.1"),  # in the air
     ],
 )
-def test_bad_arguments_are_refused_in_words(arguments, words):
-    with pytest.raises(ConfigurationError, match=words):
-        sw.constraints.ContactFeasibility(**arguments)
+def test_where_there_is_no_polygon_nothing_is_asked(env):
+    limit = settled(env, sw.constraints.SupportMargin(0.1), np.zeros(1), 20)
+    for push in (-1.0, 0.0, 1.0):
+        assert limit.admits(np.array([push]))
+        limit.executed(np.array([push]))
+        assert limit.report == {"whole_body/zmp_margin": 0.0}
 
 
-def test_what_it_cannot_watch_is_refused_when_it_is_bound():
-    def watched(env, **arguments):
-        Bound(sw.constraints.ContactFeasibility(**arguments), bound(env))
+REPORTS = {
+    "whole_body/cone_margin": (
+        lambda: gym.make("HalfCheetah-v5"),
+        sw.constraints.ContactFeasibility(0.7),
+        cone_room(0.7),
+    ),
+    "whole_body/zmp_margin": (table, sw.constraints.SupportMargin(0.01), inside_the_hull(0.0)),
+}
 
-    watched(pushed_balls())
-    with pytest.raises(UnsupportedEnvError, match="no body of this model"):
-        watched(pushed_balls(condim=1))
-    with pytest.raises(UnsupportedEnvError, match="no body of this model"):
-        watched(gym.make("Reacher-v5"))
-    plant = sw.AnalyticPlant(
-        f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, control_dt=0.1
+
+@pytest.mark.parametrize("key", REPORTS)
+def test_what_it_reports_is_what_the_env_s_own_contacts_were(key):
+    make, limit, room = REPORTS[key]
+    env, rng, finite = sw.CBFActionFilter(make(), [limit]), np.random.default_rng(1), 0
+    judge = ForceJudge(env, room)
+    env.reset(seed=1)
+    for k in range(40):
+        action = at_random(judge, env.action_space, k, rng).astype(env.action_space.dtype)
+        least, *_, info = judge.step(env, action)
+        assert info[key] == (pytest.approx(least, abs=1e-7) if np.isfinite(least) else 0.0)
+        finite += bool(np.isfinite(least))
+    assert finite > 20
+
+
+# Stance: a table with driven legs, against the whole program from MuJoCo's numbers, and robots ----------------
+
+LEGS = [(x, y) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
+FRICTION = 0.8
+
+
+def legged_table(gravity="0 0 -9.81", friction=FRICTION, cone="pyramidal", more="", range_=""):
+    """Four legs that swing along x, each with a motor of 30 N m and a spring that holds it upright."""
+    legs = "".join(
+        f'<body pos="{x} {y} 0"><joint name="j{i}" axis="0 1 0" stiffness="300" damping="6" {range_}/>'
+        f'<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4" contype="0" conaffinity="0"/>'
+        f'<geom pos="0 0 -.3" size=".03" mass=".2"/></body>'
+        for i, (x, y) in enumerate(LEGS)
     )
-    with pytest.raises(UnsupportedEnvError, match="AnalyticPlant"):
-        Bound(sw.constraints.ContactFeasibility(), plant)
+    motors = "".join(f'<motor joint="j{i}" gear="30" ctrllimited="true" ctrlrange="-1 1"/>' for i in range(4))
+    return Scene(
+        f"""<mujoco><compiler angle="radian"/><option timestep="0.002" gravity="{gravity}" cone="{cone}"/>
+        <default><geom friction="{friction} 0 0"/></default>
+        <worldbody><geom name="floor" type="plane" size="9 9 1"/>
+        <body name="trunk" pos="0 0 .33"><freejoint/>
+        <geom type="box" size=".35 .25 .05" mass="6"/>{legs}{more}</body></worldbody>
+        <actuator>{motors}</actuator></mujoco>"""
+    )
 
 
-CASES = [
-    ("Ant-v5", "bang_bang", 12),
-    ("Ant-v5", "noisy", 12),
-    ("Humanoid-v5", "at_random", 30),
-    ("HalfCheetah-v5", "at_random", 40),
-    ("HalfCheetah-v5", "bang_bang", 40),
-    ("HalfCheetah-v5", "noisy", 40),
-    ("Hopper-v5", "at_random", 60),
-    ("Walker2d-v5", "bang_bang", 60),
-]
+STILL = np.zeros(4)
 
 
-def filtered(env_id, plant=None, **arguments):
-    return sw.CBFActionFilter(gym.make(env_id), [sw.constraints.ContactFeasibility(**arguments)], plant=plant)
+def whole_program(env, nominal, share, edges, settle_s, outer=False):
+    """The closest controls, by an interior-point solver on controls and forces, nothing eliminated; None: none."""
+    m, d = env.model, mujoco.MjData(env.model)
+    d.qpos[:], d.qvel[:], d.ctrl[:] = env.data.qpos, env.data.qvel, nominal
+    mujoco.mj_forward(m, d)
+    inertia = np.zeros((m.nv, m.nv))
+    mujoco.mj_fullM(m, d, inertia)
+    bias = d.qfrc_bias - d.qfrc_passive
+    moments = np.zeros((m.nu, m.nv))
+    mujoco.mju_sparse2dense(moments, d.actuator_moment, d.moment_rownnz, d.moment_rowadr, d.moment_colind)
+    drive = (moments * m.actuator_gainprm[:, :1]).T
+    jacobians, sides, drifts = [], [], []
+    for contact in d.contact:
+        jac, dot = np.zeros((2, 3, m.nv))
+        frame, body = contact.frame.reshape(3, 3), m.geom_bodyid[contact.geom[1]]
+        assert contact.geom[0] == 0 and frame[0] @ [0, 0, 1] == pytest.approx(1.0)
+        mujoco.mj_jac(m, d, jac, None, contact.pos, body)
+        mujoco.mj_jacDot(m, d, dot, None, contact.pos, body)
+        jacobians.append(jac)
+        drifts.append(dot @ d.qvel)
+        around = 2.0 * np.pi * (np.arange(edges) + 0.5) / edges
+        slope = share * FRICTION * (1.0 if outer else np.cos(np.pi / edges))
+        # Sides between edges that lie on the cone, the first along the frame's first tangent; or around the cone.
+        sides.append(
+            np.outer(np.cos(around), frame[1]) + np.outer(np.sin(around), frame[2]) - slope * frame[0]
+        )
+    held = np.concatenate(jacobians)
+    aim = -held @ d.qvel / settle_s - np.concatenate(drifts)
+    aim = (
+        held @ np.linalg.lstsq(held, aim, rcond=1e-5)[0]
+    )  # feet that belong together cannot all come to rest alone
+    k, nu = len(held), m.nu
+    response = np.linalg.solve(inertia, np.column_stack([drive, held.T, -bias]))
+    left, size, right = np.linalg.svd(held @ response[:, :-1], full_matrices=False)
+    rank = int((size > 1e-9 * size[0]).sum())
+    equal = (right[:rank] * size[:rank, None], left[:, :rank].T @ (aim - held @ response[:, -1]))
+    rows = np.zeros((len(sides) * edges, nu + k))
+    for i, side in enumerate(sides):
+        rows[i * edges : (i + 1) * edges, nu + 3 * i : nu + 3 * i + 3] = side
+    cost = csc_matrix(np.diag(np.concatenate([np.ones(nu), np.full(k, 1e-8)])))
+    low, high = np.concatenate([m.actuator_ctrlrange, np.tile([[-np.inf, np.inf]], (k, 1))]).T
+    linear = np.concatenate([-np.asarray(nominal), np.zeros(k)])
+    equal, aims = csc_matrix(equal[0]), equal[1]
+    zeros, rows = np.zeros(len(rows)), csc_matrix(rows)
+    found = solve_qp(cost, linear, rows, zeros, equal, aims, low, high, solver="clarabel", tol_gap_abs=1e-12)
+    return None if found is None else found[:nu]
 
 
-def loop(env, driver, steps, share=0.7, tolerance=0.01, seed=1):
-    """Counts of a closed loop: steps outside, flagged, unflagged ones outside, changed; and unflagged excesses."""
-    judge, rng = ConeJudge(env, share), np.random.default_rng(seed)
-    seen = {"outside": 0, "flagged": 0, "unflagged": 0, "changed": 0, "worst": -np.inf}
-    env.reset(seed=seed)
-    for k in range(steps):
-        action = DRIVERS[driver](env.action_space, k, rng).astype(np.float32)
-        excess, (*_, terminated, truncated, info) = judge.step(env, action)
-        beyond = excess - tolerance
-        seen["outside"] += beyond > ROUNDING
-        seen["flagged"] += flagged(info)
-        seen["changed"] += info["cbf/intervened"]
+PUSHES = [(1.0, 1.0, -1.0, -1.0), (0.9, -0.7, 0.8, 0.2), (1.0, 1.0, 1.0, 1.0), (-1.0, 0.4, 0.1, 0.9)]
+
+
+@pytest.mark.parametrize("share", [0.7, 0.3])
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_its_answer_is_that_of_the_whole_program(share, cone):
+    changed = 0
+    env = legged_table()
+    stance = settled(env, sw.constraints.Stance(share, cone), STILL, 100)
+    for push in map(np.array, PUSHES):
+        stance.plant.observe()
+        admitted = stance.admits(push)
+        (answer,) = stance.candidates(push)
+        if cone == "pyramid":
+            expected = whole_program(env, push, share, 8, 0.05)
+            np.testing.assert_allclose(answer, expected, atol=2e-5)
+            assert admitted == bool(np.abs(expected - push).max() < 2e-5)
+        else:  # between a pyramid inside and one around it
+            inner, outer = (whole_program(env, push, share, 64, 0.05, outer=o) for o in (False, True))
+            far = [np.linalg.norm(u - push) for u in (outer, answer, inner)]
+            assert far[0] - 1e-5 <= far[1] <= far[2] + 1e-5
+            np.testing.assert_allclose(answer, inner, atol=5e-3)
+        if not admitted:
+            changed += 1
+            assert stance.admits(answer)
+    assert changed >= 2
+
+
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone):
+    env = legged_table(gravity="0 4 -9", friction=0.05)
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7, cone)])
+    filtered.reset()
+    standing, seen = 0, mujoco.MjData(env.model)
+    for _ in range(25):
+        mujoco.mj_copyData(seen, env.model, env.data)
+        mujoco.mj_forward(env.model, seen)
+        info = filtered.step(STILL)[4]
+        assert np.isfinite(info["executed_action"]).all() and np.isfinite(info["whole_body/cone_margin"])
+        if seen.ncon == 4:
+            standing += 1
+            assert info["cbf/infeasible"] and info["cbf/fallback"]
+            assert info["whole_body/cone_margin"] < 0.0
+    assert standing > 5
+
+
+@pytest.mark.parametrize("env_id", ["Humanoid-v5", "Ant-v5", "HalfCheetah-v5"])
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):
+    env = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.Stance(0.7, cone)])
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    stance, counts = env.filter.bound[0].spec, {"flagged": 0, "changed": 0, "same": 0}
+    for _ in range(40):
+        action = rng.uniform(env.action_space.low, env.action_space.high).astype(np.float32)
+        info = env.step(action)[4]
+        counts["flagged"] += flagged(info)
+        counts["changed"] += info["cbf/intervened"]
         if not flagged(info):
-            seen["worst"] = max(seen["worst"], beyond)
-            seen["unflagged"] += beyond > ROUNDING
-        # What it reports is what the env's own contacts were.
-        reported = info["whole_body/cone_margin"]
-        assert reported == (pytest.approx(-excess, abs=1e-7) if np.isfinite(excess) else 0.0)
-        if terminated or truncated:
-            env.reset()
-    return seen
+            # The same program with the executed action as the nominal one: nothing is left to change.
+            problem = stance.problem(info["executed_action"])
+            asked = np.clip(info["executed_action"], problem.lower, problem.upper)
+            answer = stance.solve(replace(problem, nominal=asked))
+            assert answer.cone_error < 1e-4 and answer.contact_error < 1e-3
+            # Rounded to float32 it may have to move again, and then the price of forces moves it too.
+            assert np.abs(answer.control - asked).max() < 2e-3
+            counts["same"] += 1
+    assert counts["same"] > 10 and (counts["changed"] > 0 or env_id == "Humanoid-v5")
 
 
-@pytest.mark.parametrize(("env_id", "driver", "steps"), CASES)
-def test_unflagged_steps_stay_in_the_cone(env_id, driver, steps):
-    seen = loop(filtered(env_id), driver, steps)
-    assert seen["unflagged"] == 0 and seen["worst"] <= ROUNDING, seen
-    assert seen["changed"] > 0 and seen["flagged"] < steps, seen
+class Witness(gym.Wrapper):
+    def step(self, action):
+        self.action = action
+        return super().step(action)
 
 
-def test_without_it_they_leave_the_cone():
-    judge, rng = ConeJudge(gym.make("HalfCheetah-v5"), 0.7), np.random.default_rng(1)
-    bare = judge.raw
-    bare.reset(seed=1)
-    outside = sum(
-        judge.step(bare, DRIVERS["at_random"](bare.action_space, k, rng))[0] > 0.01 for k in range(60)
-    )
-    assert outside > 10
-
-
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Ant-v5", "Humanoid-v5"])
-def test_the_whole_cone_is_never_left_so_it_is_inactive_bit_for_bit(env_id):
-    env, twin = filtered(env_id, friction_share=1.0, tolerance=0.0), gym.make(env_id)
-    env.reset(seed=4), twin.reset(seed=4)
-    rng = np.random.default_rng(4)
-    for k in range(25):
-        action = rng.choice([env.action_space.low, env.action_space.high, np.zeros(env.action_space.shape)])
-        action = (action if k % 2 else env.action_space.sample()).astype(np.float32)
-        observation, reward, *_, info = env.step(action)
-        expected, as_much, *_ = twin.step(action)
-        assert observation.tobytes() == expected.tobytes() and reward == as_much
-        assert not info["cbf/intervened"] and not flagged(info)
+def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
+    # 0.4 as float32 is more than the model's 0.4.
+    witness = Witness(gym.make("Humanoid-v5"))
+    env = sw.CBFActionFilter(witness, [sw.constraints.Stance(1.0)])
+    assert float(env.action_space.high[0]) > env.plant.upper[0]
+    env.reset(seed=0)
+    silent = 0
+    for k in range(8):
+        action = env.action_space.high if k % 2 else env.action_space.low
+        info = env.step(action)[4]
+        if not info["cbf/intervened"]:
+            silent += 1
+            assert not info["cbf/refused"].any()
+            assert witness.action.tobytes() == action.tobytes() and witness.action.dtype == np.float32
+    assert silent > 3

@@ -21,7 +21,7 @@ from safe_wrappers.control.contact import (
 )
 
 UP = np.array([0.0, 0.0, 1.0])
-directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
 def reach(rows, normal, tangent):
@@ -30,7 +30,7 @@ def reach(rows, normal, tangent):
     return float(np.min(at[slope > 1e-12] / slope[slope > 1e-12]))
 
 
-@given(directions, st.floats(0.01, 3.0), st.integers(3, 40), st.floats(0.0, math.tau))
+@given(DIRECTIONS, st.floats(0.01, 3.0), st.integers(3, 40), st.floats(0.0, math.tau))
 def test_a_pyramid_is_inside_its_cone_for_any_number_of_edges(normal, friction, edges, angle):
     n = np.array(normal) / np.linalg.norm(normal)
     axes, rows, half = np.vstack([tangents(n), n]), friction_pyramid(n, friction, edges), math.pi / edges

@@ -1,11 +1,21 @@
-"""Dead reckoning on MuJoCo's own accelerometer and gyroscope, and against closed forms."""
+"""Lever arms, poses and dead reckoning against MuJoCo's own accelerometer, gyroscope and velocimeter."""
 
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from safe_wrappers.control.dead_reckoning import DeadReckoning, rigid_transform
+from safe_wrappers.control.dead_reckoning import (
+    DeadReckoning,
+    centre_acceleration,
+    from_sensor,
+    lever_arm_velocity,
+    rigid_transform,
+    to_sensor,
+)
 
 THROWN = """
 <mujoco>
@@ -17,62 +27,92 @@ THROWN = """
       <site name="imu" pos="0.3 -0.2 0.5" euler="40 -25 110"/>
     </body>
   </worldbody>
-  <sensor><accelerometer site="imu"/><gyro site="imu"/></sensor>
+  <sensor><accelerometer site="imu"/><gyro site="imu"/><velocimeter site="imu"/></sensor>
 </mujoco>
 """
 EVERY = 10  # physics steps of an interval: 0.005 s
+VECTORS = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0))
 
 
-def thrown(lever_arm, seconds=2.0, seed=0):
-    """Errors of the reckoned position (m), velocity and orientation (rad) at the end; readings are MuJoCo's alone."""
+def orientation_of(quaternion):
+    return Rotation.from_quat(quaternion, scalar_first=True)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lever_arms_are_those_of_mujocos_sensors(seed):
     model = mujoco.MjModel.from_xml_string(THROWN)
-    data = mujoco.MjData(model)
-    rng = np.random.default_rng(seed)
-    data.qvel[:] = np.concatenate([rng.normal(size=3), rng.normal(0.0, 2.0, 3)])
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    data.qpos[:], data.qvel[:] = rng.normal(size=7), 3.0 * rng.normal(size=6)
+    data.xfrc_applied[1] = 5.0 * rng.normal(size=6)
     mujoco.mj_forward(model, data)
-    mount = Rotation.from_quat(model.site_quat[0], scalar_first=True).as_matrix()
-    arm = model.site_pos[0] if lever_arm else np.zeros(3)
-    reckoning = DeadReckoning(rigid_transform(mount, arm), model.opt.gravity)
-    start = Rotation.from_quat(data.qpos[3:], scalar_first=True)
-    reckoning.fix(data.qpos[:3], data.qvel[:3], start, data.sensordata[3:])
-    step_s = model.opt.timestep
-    for k in range(round(seconds / step_s / EVERY)):
-        data.xfrc_applied[1] = (
-            rng.normal(size=6) * [3, 3, 3, 0.1, 0.1, 0.1] if k % 40 == 0 else data.xfrc_applied[1]
-        )
-        mujoco.mj_forward(model, data)
-        readings, axes = [data.sensordata.copy()], [data.site_xmat[0].reshape(3, 3).copy()]
-        for _ in range(EVERY):
-            mujoco.mj_step(model, data)
-            mujoco.mj_forward(model, data)
-            readings.append(data.sensordata.copy())
-            axes.append(data.site_xmat[0].reshape(3, 3).copy())
-        readings = np.array(readings)
-        between = 0.5 * (readings[1:] + readings[:-1])
-        turned = Rotation.identity()
-        for rate in between[:, 3:]:  # what the unit integrates, from its gyroscope alone
-            turned = turned * Rotation.from_rotvec(step_s * rate)
-        in_world = np.einsum("kij,kj->ki", np.array(axes), readings[:, :3])
-        mean = (0.5 * (in_world[1:] + in_world[:-1])).mean(axis=0)
-        middle = axes[0] @ Rotation.from_rotvec(0.5 * turned.as_rotvec()).as_matrix()
-        reckoning.advance(mean @ middle, turned.as_rotvec(), readings[-1, 3:], EVERY * step_s)
-    end = Rotation.from_quat(data.qpos[3:], scalar_first=True)
-    assert np.linalg.norm(data.qvel[3:]) > 1.0
-    np.testing.assert_allclose(reckoning.angular_velocity, end.apply(data.qvel[3:]), atol=1e-3)
-    return (
-        np.linalg.norm(reckoning.position - data.qpos[:3]),
-        np.linalg.norm(reckoning.velocity - data.qvel[:3]),
-        (reckoning.orientation.inv() * end).magnitude(),
-    )
+    # A free joint has its linear part in world axes and its angular part in the body's.
+    body = orientation_of(data.qpos[3:])
+    rate, speeding, arm = (body.apply(part) for part in (data.qvel[3:], data.qacc[3:], model.site_pos[0]))
+    force, _, velocity = (body * orientation_of(model.site_quat[0])).apply(data.sensordata.reshape(3, 3))
+    np.testing.assert_allclose(lever_arm_velocity(data.qvel[:3], rate, arm), velocity, atol=1e-12)
+    found = centre_acceleration(force + model.opt.gravity, rate, speeding, arm)
+    np.testing.assert_allclose(found, data.qacc[:3], atol=1e-10)
+    assert np.linalg.norm(velocity - data.qvel[:3]) > 0.1 and np.linalg.norm(force - found) > 0.5
+
+
+@given(arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), VECTORS, VECTORS, VECTORS)
+def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
+    body = rigid_transform(Rotation.from_rotvec(rotvec).as_matrix(), position)
+    mount = rigid_transform(Rotation.from_rotvec(mounted).as_matrix(), 0.1 * mounted)
+    pose = body * mount
+    np.testing.assert_allclose(pose.as_matrix(), body.as_matrix() @ mount.as_matrix(), atol=1e-12)
+    rotation, origin = pose.rotation.as_matrix(), pose.translation
+    seen = to_sensor(points, rotation, origin)
+    np.testing.assert_allclose(seen, pose.inv().apply(points), atol=1e-12)
+    np.testing.assert_allclose(from_sensor(seen, rotation, origin), points, atol=1e-12)
+    np.testing.assert_allclose(to_sensor(points[2], rotation, origin), seen[2], atol=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_mujocos_readings_lead_to_mujocos_motion(seed):
-    position, velocity, angle = thrown(True, seed=seed)
-    assert position < 2e-3 and velocity < 2e-3 and angle < 1e-4
-    position, velocity, angle = thrown(False, seed=seed)
-    assert position > 0.5 and velocity > 0.1, "without the lever arm it is wrong"
-    assert angle < 1e-4, "the orientation has nothing to do with it"
+    """Thrown, and pushed anew every 0.2 s; the readings are MuJoCo's alone."""
+    model = mujoco.MjModel.from_xml_string(THROWN)
+    data, rng, step_s = mujoco.MjData(model), np.random.default_rng(seed), model.opt.timestep
+    data.qvel[:] = rng.normal(size=6) * [1, 1, 1, 2, 2, 2]
+    mujoco.mj_forward(model, data)
+    mount = orientation_of(model.site_quat[0]).as_matrix()
+    with_arm, without = (
+        DeadReckoning(rigid_transform(mount, arm), model.opt.gravity)
+        for arm in (model.site_pos[0], np.zeros(3))
+    )
+    for reckoning in (with_arm, without):
+        reckoning.fix(data.qpos[:3], data.qvel[:3], orientation_of(data.qpos[3:]), data.sensordata[3:6])
+    for k in range(400):
+        if k % 40 == 0:
+            data.xfrc_applied[1] = rng.normal(size=6) * [3, 3, 3, 0.1, 0.1, 0.1]
+        readings, axes = [], []
+        for physics_step in range(EVERY + 1):
+            if physics_step:
+                mujoco.mj_step(model, data)
+            mujoco.mj_forward(model, data)
+            readings.append(data.sensordata[:6].copy())
+            axes.append(data.site_xmat[0].reshape(3, 3).copy())
+        readings, axes = np.array(readings), np.array(axes)
+        turned = Rotation.identity()
+        for rate in (
+            0.5 * (readings[1:] + readings[:-1])[:, 3:]
+        ):  # what the unit integrates, from its gyroscope alone
+            turned = turned * Rotation.from_rotvec(step_s * rate)
+        in_world = np.einsum("kij,kj->ki", axes, readings[:, :3])
+        middle = axes[0] @ Rotation.from_rotvec(0.5 * turned.as_rotvec()).as_matrix()
+        force = (0.5 * (in_world[1:] + in_world[:-1])).mean(axis=0) @ middle
+        for reckoning in (with_arm, without):
+            reckoning.advance(force, turned.as_rotvec(), readings[-1, 3:], EVERY * step_s)
+    end = orientation_of(data.qpos[3:])
+    assert np.linalg.norm(data.qvel[3:]) > 1.0
+    np.testing.assert_allclose(with_arm.angular_velocity, end.apply(data.qvel[3:]), atol=1e-3)
+    assert np.linalg.norm(with_arm.position - data.qpos[:3]) < 2e-3
+    assert np.linalg.norm(with_arm.velocity - data.qvel[:3]) < 2e-3
+    assert (with_arm.orientation.inv() * end).magnitude() < 1e-4
+    # Without the lever arm it is wrong; the orientation has nothing to do with it.
+    assert np.linalg.norm(without.position - data.qpos[:3]) > 0.5
+    assert np.linalg.norm(without.velocity - data.qvel[:3]) > 0.1
+    assert (without.orientation.inv() * end).magnitude() < 1e-4
 
 
 def test_it_takes_the_rate_between_two_readings_for_the_parabola_with_their_mean():

@@ -47,7 +47,7 @@ def test_a_way_is_every_physics_step_until_rest(place, velocity, controls, subst
         # At a whole number of control steps rounding decides whether one more, of next to nothing, ends at rest.
         n = min(len(xs), len(way))
         np.testing.assert_allclose(way[:n, i], xs[:n], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(way[n:, i], xs[-1], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(way[n - 1 :, i], xs[-1], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

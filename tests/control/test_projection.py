@@ -331,3 +331,14 @@ def test_a_control_beyond_the_action_s_dtype_is_cast_to_its_largest_number():
     )
     most = np.finfo(np.float32).max
     assert sent.dtype == np.float32 and sent.tolist() == [most, -most, 0.5]
+
+
+@given(SEEDS, st.integers(1, 4))
+def test_a_cast_control_stays_inside_its_row_and_moves_no_other_component(seed, n):
+    rng = np.random.default_rng(seed)
+    control, normal = rng.uniform(-1.0, 1.0, n), rng.normal(size=(1, n)) * (rng.random(n) < 0.7)
+    offset = normal @ control
+    sent = cast_inside(control, np.float32, normal, offset, -np.ones(n), np.ones(n))
+    assert sent.dtype == np.float32 and (normal @ sent.astype(np.float64) <= offset).all()
+    np.testing.assert_allclose(sent, control, rtol=2e-7)
+    np.testing.assert_array_equal(sent[normal[0] == 0.0], control[normal[0] == 0.0].astype(np.float32))

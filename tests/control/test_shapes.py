@@ -1,12 +1,21 @@
-"""Convex outlines and joined rectangles: SciPy's hull, a finely sampled boundary, and the cells that are covered."""
+"""Outlines by SciPy's hull and a sampled boundary, discs from a moving frame, and the cells rectangles cover."""
+
+import hashlib
 
 import numpy as np
+import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 
-from safe_wrappers.control.numerics.shapes import convex_outline, distance_to_outline, merged
+from safe_wrappers.control.numerics.shapes import (
+    clearances_on_a_course,
+    convex_outline,
+    distance_to_outline,
+    merged,
+    nearest_discs,
+)
 
 GRID = st.integers(-20, 20).map(lambda n: n / 100.0)  # coarse: many points on one edge, many twice
 CLOUDS = arrays(np.float64, st.tuples(st.integers(3, 15), st.just(2)), elements=GRID)
@@ -29,6 +38,47 @@ def test_the_outline_is_the_convex_hull_and_distances_are_those_to_its_boundary(
     beyond = (points @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
     clear = np.abs(beyond) > 1e-9
     assert ((found > 0.0) == (beyond > 0.0))[clear].all()
+
+
+def scene(rng, corners):
+    """An outline, places, directions and discs."""
+    outline = convex_outline(rng.normal(size=(6, 2))) if corners else np.zeros((0, 2))
+    ahead = rng.normal(size=(3, 2))
+    ahead /= np.sqrt((ahead**2).sum(axis=1))[:, None]
+    return outline, rng.normal(size=(3, 2)), ahead, np.abs(rng.normal(size=(4, 3)))
+
+
+def random_looks(count):
+    """Clearances in random scenes, as one digest."""
+    rng, digest = np.random.default_rng(5), hashlib.sha256()
+    for i in range(count):
+        digest.update(clearances_on_a_course(*scene(rng, i % 2)).tobytes())
+    return digest.hexdigest()
+
+
+@given(st.integers(0, 2**31), st.booleans())
+def test_clearances_on_a_course_are_distances_in_the_bodys_frame(seed, corners):
+    outline, places, ahead, discs = scene(np.random.default_rng(seed), corners)
+    found = clearances_on_a_course(outline, places, ahead, discs)
+    for k, i in np.ndindex(found.shape):
+        x, y = np.column_stack([ahead[k], [-ahead[k, 1], ahead[k, 0]]]).T @ (discs[i, :2] - places[k])
+        distance = distance_to_outline(outline, x, y) if corners else np.hypot(x, y)
+        assert found[k, i] == pytest.approx(distance - discs[i, 2], abs=1e-12)
+
+
+@given(st.integers(0, 2**31), st.integers(0, 4), st.integers(0, 4), st.floats(-4.0, 4.0))
+def test_the_nearest_discs_come_first_as_seen_from_a_moving_frame(seed, discs, count, heading):
+    rng = np.random.default_rng(seed)
+    given_, place, velocity = np.abs(rng.normal(size=(discs, 3))), rng.normal(size=2), rng.normal(size=2)
+    found = nearest_discs(given_, *place, heading, *velocity, count).reshape(count, 4)
+    to = given_[:, :2] - place
+    away = np.linalg.norm(to, axis=1)
+    gaps, to = away - given_[:, 2], to / away[:, None]
+    frame = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
+    squash = lambda value: value / (1.0 + np.abs(value))  # noqa: E731
+    seen = np.column_stack([to @ frame.T, squash(gaps), squash(to @ velocity)])[np.argsort(gaps)][:count]
+    np.testing.assert_allclose(found[: len(seen)], seen, atol=1e-12)
+    assert (found[len(seen) :] == [0.0, 0.0, 1.0, 0.0]).all()  # the rest is far away
 
 
 def covers(r, x, y):

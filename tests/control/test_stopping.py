@@ -1,7 +1,5 @@
 """Stopping insets in one dimension: against exact simulation, with an adversary at the throttle."""
 
-import hashlib
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -9,7 +7,6 @@ from hypothesis import strategies as st
 
 from safe_wrappers.control.backup import stopping as of
 from safe_wrappers.control.backup.stopping import held_limit, held_stop
-from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline
 
 STATES = st.floats(0, 3), st.floats(-2, 3), st.floats(0.05, 5.0), st.floats(0.005, 0.5)
 """Clearance, approach speed, braking and hold."""
@@ -97,18 +94,3 @@ def test_a_row_is_left_out_only_where_no_control_exceeds_it(high, drift, effect,
         near, np.zeros(1), np.array([drift]), np.full((1, 1), effect), machine
     )
     assert normals.shape == (rows, 1) and offsets.shape == (rows,)
-
-
-# Compiled and plain Python: the same bits of what `CoastingClearance` computes
-
-
-def random_looks(count):
-    """Random scenes, as one digest."""
-    rng, digest = np.random.default_rng(5), hashlib.sha256()
-    for i in range(count):
-        outline = convex_outline(rng.normal(size=(6, 2))) if i % 2 else np.zeros((0, 2))
-        ahead = rng.normal(size=(3, 2))
-        ahead /= np.sqrt((ahead**2).sum(axis=1))[:, None]
-        places, discs = rng.normal(size=(3, 2)), np.abs(rng.normal(size=(4, 3)))
-        digest.update(clearances_on_a_course(outline, places, ahead, discs).tobytes())
-    return digest.hexdigest()

@@ -1,21 +1,25 @@
-"""Whole-body programs against problems solved by hand, and against the same program with nothing eliminated."""
+"""Whole-body programs: solved by hand, with nothing eliminated, and by solvers that know no cones."""
 
 import dataclasses
 
+import daqp
 import numpy as np
 import pytest
 import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import in_cone
+from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 from safe_wrappers.control import whole_body
 from safe_wrappers.control.contact import friction_pyramid
 from safe_wrappers.control.projection import Status
 from safe_wrappers.control.whole_body import (
+    Program,
     WholeBodyProblem,
     attainable_contact_acceleration,
+    by_clarabel,
     rigid_forces,
     solve_cone,
     solve_pyramid,
@@ -23,27 +27,74 @@ from safe_wrappers.control.whole_body import (
 from safe_wrappers.errors import ConfigurationError
 
 UP = np.array([0.0, 0.0, 1.0])
-SOLVERS = {
-    "daqp": solve_pyramid,
-    "cone": solve_cone,
-}
+by_both = pytest.mark.parametrize("solve", [solve_pyramid, solve_cone])
 
 
-def foot(nominal, friction=0.5, mass=2.0, bound=100.0, **more):
-    """A point mass that is pushed by three motors and stands on a floor, in newtons: f = m g e_z - u."""
-    return WholeBodyProblem(
-        inertia=mass * np.eye(3),
-        bias=np.array([0.0, 0.0, mass * 9.81]),
-        actuation=np.eye(3),
-        jacobians=np.eye(3)[None],
-        drift=np.zeros((1, 3)),
-        normals=UP[None],
-        friction=np.array([friction]),
-        lower=-np.full(3, bound),
-        upper=np.full(3, bound),
-        nominal=np.array(nominal, dtype=float),
-        **more,
-    )
+# Programs ---------------------------------------------------------------------------------------------------------
+
+
+def nearest(point, **parts):
+    """The program of the closest point."""
+    n = len(point)
+    none, zero = np.zeros((0, n)), np.zeros(0)
+    fields = {"equal": none, "values": zero, "rows": none, "limits": zero, "cones": np.zeros((0, 3, n))}
+    return Program(np.ones(n), -np.array(point), **(fields | parts))
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 3))
+def test_the_closest_point_of_a_cone_is_known(point):
+    p = np.array(point)
+    t, x = p[0], p[1:]
+    size = float(np.linalg.norm(x))
+    if size <= t:
+        expected = p
+    elif size <= -t:
+        expected = np.zeros(3)
+    else:
+        expected = 0.5 * (t + size) * np.array([1.0, *(x / size)])
+    found = by_clarabel(nearest(p, cones=np.eye(3)[None]))
+    assert found == pytest.approx(expected, abs=2e-5)
+
+
+@given(st.integers(0, 300))
+def test_another_solver_of_another_kind_has_the_same_answer(seed):
+    rng = np.random.default_rng(seed)
+    n, k = int(rng.integers(2, 7)), int(rng.integers(0, 9))
+    inside, weights = rng.uniform(-0.5, 0.5, n), rng.uniform(0.1, 3.0, n)
+    rows, equal = rng.normal(size=(k, n)), rng.normal(size=(1, n))
+    limits, values = rows @ inside + rng.uniform(0.0, 0.5, k), equal @ inside
+    linear = rng.normal(size=n)
+    program = Program(weights, linear, equal, values, rows, limits, np.zeros((0, 3, n)))
+    above, below = np.concatenate([values, limits]), np.concatenate([values, np.full(k, -1e30)])
+    senses = np.array([5] + [0] * k, dtype=np.int32)  # the first is an equality
+    other, _, flag, _ = daqp.solve(np.diag(weights), linear, np.vstack([equal, rows]), above, below, senses)
+    assert flag > 0
+    np.testing.assert_allclose(by_clarabel(program), other, atol=1e-6)
+
+
+ROWS, LIMITS = np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0])
+
+
+def test_what_has_no_answer_is_said_to_have_none(monkeypatch):
+    assert by_clarabel(nearest([0.0], rows=ROWS, limits=LIMITS)) == "infeasible"
+    assert by_clarabel(nearest([0.0], equal=ROWS, values=LIMITS)) == "infeasible"
+    open_ended = nearest([0.0], rows=ROWS, limits=np.array([-1.0, np.inf]))
+    assert by_clarabel(open_ended) == pytest.approx([-1.0])
+    limited = whole_body.clarabel.DefaultSettings()
+    limited.max_iter = 1
+    monkeypatch.setattr(whole_body.clarabel, "DefaultSettings", lambda: limited)
+    assert by_clarabel(open_ended) == "failed"  # its solver reached its limit
+
+
+@pytest.mark.parametrize("part", ["equal", "values", "rows", "limits", "cones"])
+def test_what_is_no_number_is_failed_and_not_infeasible(part):
+    parts = {"equal": ROWS[:1].copy(), "values": np.ones(1), "rows": ROWS.copy(), "limits": np.ones(2)}
+    parts["cones"] = np.ones((1, 3, 1))
+    parts[part].flat[0] = np.nan
+    assert by_clarabel(nearest([0.0], **parts)) == "failed"
+
+
+# Random robots ----------------------------------------------------------------------------------------------------
 
 
 def robot(seed, nv=8, nu=5, k=3, **more):
@@ -70,46 +121,20 @@ def robot(seed, nv=8, nu=5, k=3, **more):
 def in_full(problem, edges=4):
     """The same program in (u, qacc, f), nothing eliminated, by qpsolvers: control and half the weighted squares."""
     nv, nu, k = len(problem.bias), len(problem.nominal), len(problem.normals)
-    n = nu + nv + 3 * k
-    stacked = problem.jacobians.reshape(3 * k, nv)
-    hessian, linear, constant = np.zeros((n, n)), np.zeros(n), 0.0
-    u, a, f = slice(0, nu), slice(nu, nu + nv), slice(nu + nv, n)
-    hessian[u, u] = np.eye(nu)
-    linear[u] = -problem.nominal
-    constant += problem.nominal @ problem.nominal
-    hessian[f, f] = problem.force_weight * np.eye(3 * k)
-    dynamics = np.hstack([-problem.actuation, problem.inertia, -stacked.T])
-    equal, value = [dynamics], [-problem.bias]
-    stay = problem.stance
-    wanted = (problem.contact_acceleration - problem.drift)[stay].ravel()
-    held = problem.jacobians[stay].reshape(-1, nv)
-    rows = np.zeros((len(wanted), n))
-    rows[:, a] = held
-    equal.append(rows)
-    value.append(wanted)
-    rows, limits = [np.zeros((0, n))], []
-    sides = friction_pyramid(problem.normals, problem.friction, edges)
-    for i in range(k):
-        block = np.zeros((edges, n))
-        block[:, nu + nv + 3 * i : nu + nv + 3 * i + 3] = sides[i]
-        rows.append(block)
-        limits += [0.0] * edges
-    for i in problem.opening:
-        rows_i = np.zeros((1, n))
-        rows_i[0, a] = -problem.normals[i] @ problem.jacobians[i]
-        rows.append(rows_i)
-        limits.append(-float(problem.normals[i] @ (problem.contact_acceleration - problem.drift)[i]))
-        none = np.zeros((3, n))
-        none[:, nu + nv + 3 * i : nu + nv + 3 * i + 3] = np.eye(3)
-        equal.append(none)
-        value.append(np.zeros(3))
-    free = np.full(n - nu, np.inf)
-    x = qpsolvers.solve_qp(
-        hessian, linear, np.vstack(rows), np.array(limits), np.vstack(equal), np.concatenate(value),
-        np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free]), solver="clarabel",
-        tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10,
-    )  # fmt: skip
-    return None if x is None else (x[:nu], 0.5 * (x @ hessian @ x + constant) + linear @ x)
+    n, stacked = nu + nv + 3 * k, problem.jacobians.reshape(3 * k, nv)
+    squares = np.concatenate([np.ones(nu), np.zeros(nv), np.full(3 * k, problem.force_weight)])
+    linear = np.concatenate([-problem.nominal, np.zeros(n - nu)])
+    equal = np.zeros((nv + 3 * k, n))
+    equal[:nv] = np.hstack([-problem.actuation, problem.inertia, -stacked.T])
+    equal[nv:, nu : nu + nv] = stacked
+    value = np.concatenate([-problem.bias, (problem.contact_acceleration - problem.drift).ravel()])
+    sides = block_diag(*friction_pyramid(problem.normals, problem.friction, edges))
+    rows, free = np.hstack([np.zeros((len(sides), nu + nv)), sides]), np.full(n - nu, np.inf)
+    box = np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free])
+    tight = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-10)
+    program = np.diag(squares), linear, rows, np.zeros(len(sides)), equal, value, *box
+    x = qpsolvers.solve_qp(*program, solver="clarabel", **tight)
+    return x[:nu], 0.5 * (squares @ x**2 + problem.nominal @ problem.nominal) + linear @ x
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -118,21 +143,16 @@ def in_full(problem, edges=4):
 def test_elimination_changes_nothing(seed, k):
     # Five contacts of three axes on eight degrees of freedom: seven inner forces.
     problem = robot(seed, k=k)
-    expected = in_full(problem)
-    for name in ("daqp",):
-        found = SOLVERS[name](problem)
-        if expected is None:
-            assert found.status in ("infeasible", "failed")
-            continue
-        assert found.status in ("projected", "inactive")
-        if found.status == "projected":
-            # No worse, and better by no more than what the large program leaves inexact.
-            assert -1e-5 <= cost(problem, found) - expected[1] <= 1e-7 * (1.0 + abs(expected[1]))
-            assert found.control == pytest.approx(expected[0], abs=3e-3)
-        else:
-            assert found.control is problem.nominal
-            assert cost(problem, found) >= expected[1] - 1e-6
-        assert_says_the_truth(problem, found)
+    control, least = in_full(problem)
+    found = solve_pyramid(problem)
+    if found.status == "inactive":
+        assert found.control is problem.nominal and cost(problem, found) >= least - 1e-6
+    else:
+        assert found.status == "projected"
+        # No worse, and better by no more than what the large program leaves inexact.
+        assert -1e-5 <= cost(problem, found) - least <= 1e-7 * (1.0 + abs(least))
+        assert found.control == pytest.approx(control, abs=3e-3)
+    assert_says_the_truth(problem, found)
 
 
 def cost(problem, found):
@@ -154,33 +174,6 @@ def assert_says_the_truth(problem, found):
     assert found.contact_error >= np.abs(missed).max(initial=0.0) - 1e-9 * scale
     if found.status in ("projected", "inactive"):
         assert np.abs(missed).max(initial=0.0) < 1e-5 * scale
-
-
-@pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS)
-def test_a_foot_that_is_pushed_within_its_friction_is_left_alone_bit_for_bit(solve):
-    problem = foot([3.0, 1.0, -2.0])
-    found = solve(problem)
-    assert found.status == "inactive"
-    assert found.control is problem.nominal
-    assert found.forces[0] == pytest.approx([-3.0, -1.0, 2.0 * 9.81 + 2.0])
-    assert found.acceleration == pytest.approx(np.zeros(3), abs=1e-12)
-
-
-def test_a_foot_that_is_pushed_too_hard_gets_the_closest_push_of_its_cone():
-    # Allowed pushes are the cone |u_t| <= mu (m g - u_z) with its apex at m g e_z: its projection is known.
-    mu, weight, nominal = 0.5, 19.62, np.array([12.0, 5.0, 3.0])
-    found = solve_cone(foot(nominal, mu))
-    # Along (radius, height below the apex): the nearest point of the ray (mu, 1).
-    sideways, below = np.linalg.norm(nominal[:2]), weight - nominal[2]
-    t = (mu * sideways + below) / (1.0 + mu * mu)
-    expected = np.array([*(nominal[:2] / sideways * mu * t), weight - t])
-    assert found.status == "projected"
-    assert found.control == pytest.approx(expected, abs=1e-5)
-    assert np.linalg.norm(found.forces[0, :2]) == pytest.approx(mu * found.forces[0, 2], rel=1e-5)
-    # By hand: what is left, nominal minus answer, is a multiple of the cone's outer normal there.
-    outwards = np.array([*(nominal[:2] / sideways), mu])
-    left = nominal - found.control
-    assert left == pytest.approx(outwards * np.linalg.norm(left) / np.linalg.norm(outwards), abs=1e-4)
 
 
 def test_the_cone_by_a_solver_that_knows_no_cones():
@@ -211,22 +204,56 @@ def test_the_cone_by_a_solver_that_knows_no_cones():
     assert found.control == pytest.approx(other.x, abs=1e-3)
 
 
-def table(load_at, legs, friction=0.5):
-    """A 10 kg plate on legs, its centre of mass somewhere, six motors on its centre that are not used."""
-    legs = np.array(legs, dtype=float)
-    arms = legs - np.array([*load_at, 0.5])
-    jacobians = np.zeros((len(legs), 3, 6))
-    for jac, (x, y, z) in zip(jacobians, arms, strict=True):
-        jac[:, :3] = np.eye(3)
-        jac[:, 3:] = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-    k = len(legs)
+@by_both
+def test_numbers_that_overflow_inside_are_failed_with_a_finite_control(solve):
+    found = solve(dataclasses.replace(robot(1), bias=np.full(8, 1.7e308)))
+    assert found.status == "failed" and np.isfinite(found.control).all()
+
+
+# By hand ----------------------------------------------------------------------------------------------------------
+
+
+def foot(nominal, friction=0.5, mass=2.0, bound=100.0, **more):
+    """A point mass that is pushed by three motors and stands on a floor, in newtons: f = m g e_z - u."""
     return WholeBodyProblem(
-        np.diag([10.0, 10, 10, 1, 1, 2]), np.array([0, 0, 98.1, 0, 0, 0]), np.eye(6), jacobians, np.zeros((k, 3)),
-        np.tile(UP, (k, 1)), np.full(k, friction), -np.full(6, 1e-3), np.full(6, 1e-3), np.zeros(6),
-    )  # fmt: skip
+        inertia=mass * np.eye(3),
+        bias=np.array([0.0, 0.0, mass * 9.81]),
+        actuation=np.eye(3),
+        jacobians=np.eye(3)[None],
+        drift=np.zeros((1, 3)),
+        normals=UP[None],
+        friction=np.array([friction]),
+        lower=-np.full(3, bound),
+        upper=np.full(3, bound),
+        nominal=np.array(nominal, dtype=float),
+        **more,
+    )
 
 
-@pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS)
+@by_both
+def test_a_foot_that_is_pushed_within_its_friction_is_left_alone_bit_for_bit(solve):
+    problem = foot([3.0, 1.0, -2.0])
+    found = solve(problem)
+    assert found.status == "inactive"
+    assert found.control is problem.nominal
+    assert found.forces[0] == pytest.approx([-3.0, -1.0, 2.0 * 9.81 + 2.0])
+    assert found.acceleration == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_a_foot_that_is_pushed_too_hard_gets_the_closest_push_of_its_cone():
+    # Allowed pushes are the cone |u_t| <= mu (m g - u_z) with its apex at m g e_z: its projection is known.
+    mu, weight, nominal = 0.5, 19.62, np.array([12.0, 5.0, 3.0])
+    found = solve_cone(foot(nominal, mu))
+    # Along (radius, height below the apex): the nearest point of the ray (mu, 1).
+    sideways, below = np.linalg.norm(nominal[:2]), weight - nominal[2]
+    t = (mu * sideways + below) / (1.0 + mu * mu)
+    expected = np.array([*(nominal[:2] / sideways * mu * t), weight - t])
+    assert found.status == "projected"
+    assert found.control == pytest.approx(expected, abs=1e-5)
+    assert np.linalg.norm(found.forces[0, :2]) == pytest.approx(mu * found.forces[0, 2], rel=1e-5)
+
+
+@by_both
 def test_what_no_control_does_is_infeasible(solve):
     # The floor is to rise at 3 m/s^2: with motors of 5 N the mass can follow, but sink at 20 it cannot.
     problem = foot([0.0, 0.0, 0.0], bound=5.0, contact_acceleration=np.array([[0.0, 0.0, 3.0]]))
@@ -240,11 +267,17 @@ def test_what_no_control_does_is_infeasible(solve):
 
 
 def test_wanted_accelerations_that_contradict_each_other_are_infeasible_until_made_attainable():
-    # Two points of one plate drawn apart.
-    problem = table((0.3, 0.2), [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    apart = dataclasses.replace(
-        problem, contact_acceleration=np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 0, 0]])
-    )
+    # Two points of a plate that stands on three, drawn apart.
+    jacobians = np.zeros((3, 3, 6))
+    for jacobian, (x, y, z) in zip(
+        jacobians, [[-0.3, -0.2, -0.5], [0.7, -0.2, -0.5], [-0.3, 0.8, -0.5]], strict=True
+    ):
+        jacobian[:] = np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
+    weak = np.full(6, 1e-3)
+    apart = WholeBodyProblem(
+        np.diag([10.0, 10, 10, 1, 1, 2]), np.array([0, 0, 98.1, 0, 0, 0]), np.eye(6), jacobians, np.zeros((3, 3)),
+        np.tile(UP, (3, 1)), np.full(3, 0.5), -weak, weak, np.zeros(6), np.outer([-1.0, 1.0, 0.0], [1.0, 0.0, 0.0]),
+    )  # fmt: skip
     found = solve_pyramid(apart)
     assert found.status == "infeasible"
     assert found.contact_error > 0.5
@@ -256,32 +289,32 @@ def test_wanted_accelerations_that_contradict_each_other_are_infeasible_until_ma
     assert attainable_contact_acceleration(consistent) == pytest.approx(consistent.contact_acceleration)
 
 
-def test_a_contact_that_opens_gives_no_force_and_moves_away():
+@by_both
+def test_a_contact_that_opens_gives_no_force_and_moves_away(solve):
     opening = {"breaking": np.array([True]), "contact_acceleration": np.array([[0.0, 0.0, 1.0]])}
-    for solve in SOLVERS.values():
-        found = solve(foot([2.0, 0.0, 0.0], **opening))
-        assert found.status == "projected"
-        assert not found.forces.any()
-        # m (g + 1) is the least that lifts; sideways it is free.
-        assert found.control == pytest.approx([2.0, 0.0, 2.0 * 10.81], abs=1e-5)
-        free = foot([2.0, 0.0, 30.0], **opening)
-        assert solve(free).control is free.nominal
-        weak = solve(foot([2.0, 0.0, 0.0], bound=10.0, **opening))
-        assert weak.status == "infeasible"
+    found = solve(foot([2.0, 0.0, 0.0], **opening))
+    assert found.status == "projected"
+    assert not found.forces.any()
+    # m (g + 1) is the least that lifts; sideways it is free.
+    assert found.control == pytest.approx([2.0, 0.0, 2.0 * 10.81], abs=1e-5)
+    free = foot([2.0, 0.0, 30.0], **opening)
+    assert solve(free).control is free.nominal
+    weak = solve(foot([2.0, 0.0, 0.0], bound=10.0, **opening))
+    assert weak.status == "infeasible"
 
 
-def test_a_frictionless_contact_holds_along_its_normal_alone():
-    found = solve_pyramid(foot([4.0, 0.0, -1.0], friction=0.0))
+@by_both
+def test_a_frictionless_contact_holds_along_its_normal_alone(solve):
+    found = solve(foot([4.0, 0.0, -1.0], friction=0.0))
     assert found.status == "inactive"
     assert found.forces[0] == pytest.approx([0.0, 0.0, 20.62])
     assert found.acceleration == pytest.approx([2.0, 0.0, 0.0])
     assert found.contact_error < 1e-12
     pulled = foot([0.0, 0.0, 25.0], friction=0.0)
-    for solve in SOLVERS.values():
-        found = solve(pulled)
-        assert found.status == "projected"
-        assert found.control == pytest.approx([0.0, 0.0, 19.62], abs=1e-5)
-        assert found.forces[0, 2] >= -1e-6
+    found = solve(pulled)
+    assert found.status == "projected"
+    assert found.control == pytest.approx([0.0, 0.0, 19.62], abs=1e-5)
+    assert found.forces[0, 2] >= -1e-6
 
 
 @pytest.mark.parametrize("lie", ["zeros", "huge", "nothing", "claims infeasible"])
@@ -304,22 +337,17 @@ def test_a_backend_is_not_believed(monkeypatch, lie):
     assert np.isfinite(found.forces).all() and np.isfinite(found.acceleration).all()
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["inertia", "jacobians", "friction", "nominal", "contact_acceleration"])
-def test_what_is_not_finite_is_refused_by_name(name, value):
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, np.nan) for name in ("inertia", "jacobians", "friction", "nominal", "contact_acceleration")),
+        ("bias", np.inf),
+        ("friction", -0.1),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_name(name, value):
     problem = foot([0.0] * 3)
-    given = np.array(getattr(problem, name), dtype=float)
-    given.flat[0] = value
+    given_ = np.array(getattr(problem, name), dtype=float)
+    given_.flat[0] = value
     with pytest.raises(ConfigurationError, match=f"^{name} must"):
-        dataclasses.replace(problem, **{name: given})
-
-
-def test_a_friction_below_zero_is_refused():
-    with pytest.raises(ConfigurationError, match="friction must be at least 0"):
-        foot([0.0] * 3, friction=-0.1)
-
-
-@pytest.mark.parametrize("solve", SOLVERS.values())
-def test_numbers_that_overflow_inside_are_failed_with_a_finite_control(solve):
-    found = solve(dataclasses.replace(robot(1), bias=np.full(8, 1.7e308)))
-    assert found.status == "failed" and np.isfinite(found.control).all()
+        dataclasses.replace(problem, **{name: given_})

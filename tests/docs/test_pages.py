@@ -83,19 +83,17 @@ def test_every_constraint_and_wrapper_has_a_heading_of_its_own(folder):
 # The examples for envs without MuJoCo, in closed loop, against hostile drivers --------------------------------------
 
 DRIVERS = {
-    "random": lambda rng, k, angle, speed: rng.uniform(-2.0, 2.0),
-    "bang-bang": lambda rng, k, angle, speed: 2.0 if k // 7 % 2 else -2.0,
-    "faster": lambda rng, k, angle, speed: np.copysign(2.0, speed),
+    "bang-bang": lambda k, speed: 2.0 if k // 7 % 2 else -2.0,
+    "faster": lambda k, speed: np.copysign(2.0, speed),
 }
 
 
 def drive(env, driver, seed):
     """Speeds after every step of one episode, and how many of its steps were flagged."""
     env.reset(seed=seed)
-    rng = np.random.default_rng(seed)
     speeds, flagged, truncated, k = [], 0, False, 0
     while not truncated:
-        action = np.array([DRIVERS[driver](rng, k, *env.unwrapped.state)], np.float32)
+        action = np.array([DRIVERS[driver](k, env.unwrapped.state[1])], np.float32)
         *_, truncated, info = env.step(action)
         speeds.append(abs(env.unwrapped.state[1]))
         flagged += bool(info.get("cbf/infeasible") or info.get("cbf/fallback"))
@@ -112,6 +110,6 @@ def test_the_limit_of_the_first_example_holds(driver, page, until, limit):
     free = gym.make(filtered.unwrapped.spec.id, **filtered.unwrapped.spec.kwargs)
     for seed in range(2):
         speeds, flagged = drive(filtered, driver, seed)
-        assert (speeds.max(), flagged) <= (limit, 0) and len(speeds) == 200
+        assert speeds.max() <= limit and flagged == 0 and len(speeds) == 200
         violated += (drive(free, driver, seed)[0] > limit).sum()
-    assert violated > 20 or driver == "random"
+    assert violated > 20

@@ -1,4 +1,4 @@
-"""What the filter makes of constraints at the edges of their contract."""
+"""A constraint on a plant at the edges of its contract: outside, inside the margin, far away, and without numbers."""
 
 import warnings
 from dataclasses import dataclass
@@ -10,88 +10,152 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.plants.plant import Model, Trajectory
 
-PUSH = np.ones(2, np.float32)
 
+class Rail(gym.Env):
+    """Its place is set by hand; nothing is there where it is None."""
 
-def reacher(*constraints, **options):
-    env = sw.CBFActionFilter(gym.make("Reacher-v5"), constraints, **options)
-    env.reset(seed=0)
-    return env
+    dt, x = 0.1, 0.0
+    action_space = gym.spaces.Box(-2.0, 2.0, (2,), np.float64)
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
 
 
 @dataclass
-class Shaped(sw.Constraint):
-    """As many columns now, and instants and columns along a trajectory, as is said."""
+class Shifted(sw.Constraint, Model):
+    """h is the place; two controls shift it by themselves: one on the way, the other at the end."""
 
-    now: int
-    instants: int
-    columns: int
+    margin: float = 0.0
     horizon: int = 3
     max_decrease: float | None = None
+    backup: tuple[float, float] | None = None
+    most: float | None = None
+    """Of the first control, by a row."""
+    instants: int = 2
+    recovery_s: float = 0.3
 
-    def h_along(self, path):
-        return np.ones((1, self.now) if path.control is None else (self.instants, self.columns))
+    @property
+    def rows_decide(self):
+        return self.most is not None
 
-
-def test_nothing_near_admits_everything_and_no_instant_is_an_error():
-    assert not reacher(Shaped(0, 6, 0)).step(PUSH)[4]["cbf/intervened"]
-    with pytest.raises(ConfigurationError, match="at least one instant"):
-        reacher(Shaped(0, 0, 1))
-
-
-@dataclass
-class Counted(sw.Constraint, Model):
-    """A model of one's own that does not count its control intervals."""
-
-    horizon: int = 5
+    def rows(self):
+        return None if self.most is None else sw.HalfSpaces(np.array([[1.0, 0.0]]), np.array([self.most]))
 
     def rollout(self, control, horizon=1):
-        ahead = np.zeros(1) if control is None else control[0] * np.arange(1.0, 6.0)
-        return Trajectory(control, ahead[:, None])
+        shifts = np.zeros((1, 1)) if control is None else control[: self.instants, None]
+        return Trajectory(control, self.plant.state + shifts)
 
     def h_along(self, path):
-        return 2.0 - np.abs(path.states)
+        return path.states[:, :0] if (path.states > 100.0).any() else path.states
+
+    def proposals(self, control):
+        return [] if control is not None or self.backup is None else [np.array(self.backup)]
 
 
-def test_a_model_need_not_count_its_intervals():
-    info = reacher(Counted()).step(PUSH)[4]
-    assert info["cbf/intervened"] and not info["cbf/infeasible"]
-    assert 0.35 < info["executed_action"][0] <= 0.4 + 1e-6
+def filtered(x, **options):
+    """A filter at a place, and how it gets to another one."""
+    env, plant = Rail(), sw.AnalyticPlant(lambda x: 0.0 * x, lambda x: np.ones((1, 2)), lambda env: [env.x])
+    plant.bind(env)
+    safety = SafetyFilter(plant, [Shifted(**options)], "zero", *np.outer([-2.0, 2.0], np.ones(2)))
+
+    def go(x):
+        env.x = 999.0 if x is None else x
+        safety.observe()
+        safety.executed(np.zeros(2))
+
+    env.x = 999.0 if x is None else x
+    safety.start()
+    return safety, go
+
+
+WORSE, BETTER = {"backup": (-0.3, 0.2)}, {"backup": (0.5, 0.9)}
+LOSES_IT = {"margin": 0.5, "backup": (-0.3, -0.3)}
+
+
+@pytest.mark.parametrize(
+    ("x", "options", "control", "admitted"),
+    [
+        (0.2, {}, (-0.19, -0.19), True),
+        (0.2, {}, (-0.21, 0.5), False),
+        (0.2, {}, (0.5, -0.21), False),
+        (0.2, {"margin": 0.1}, (-0.11, 0.0), False),
+        (0.2, {"most": 0.4}, (0.39, 0.0), True),  # rows decide too
+        (0.2, {"most": 0.4}, (0.41, 0.0), False),
+        (0.2, {"most": 0.4}, (0.0, -0.21), False),
+        (None, {}, (-2.0, -2.0), True),  # nothing is near
+        # From outside: no farther out, and at the end back but for exp(-1).
+        (-1.0, {}, (0.0, 0.64), True),
+        (-1.0, {}, (0.0, 0.62), False),
+        (-1.0, {}, (-0.01, 0.7), False),
+        # As far as the backup does; a better one asks for no more.
+        (-1.0, WORSE, (-0.29, 0.21), True),
+        (-1.0, WORSE, (-0.31, 0.21), False),
+        (-1.0, WORSE, (-0.29, 0.19), False),
+        (-1.0, BETTER, (0.0, 0.64), True),
+        (-1.0, BETTER, (-0.01, 0.64), False),
+        # A limit that is kept now is not lost, whatever the backup does.
+        (0.2, LOSES_IT, (-0.19, -0.19), True),
+        (0.2, LOSES_IT, (-0.21, 0.0), False),
+        (0.2, LOSES_IT, (0.0, -0.21), False),
+        # So far inside that nothing is forecast.
+        (1.0, {"max_decrease": 0.9}, (-2.0, -2.0), True),
+        (1.0, {"max_decrease": 0.9, "margin": 0.2}, (-2.0, -2.0), False),
+        (1.0, {"max_decrease": 1.1}, (-2.0, -2.0), False),
+    ],
+)
+def test_what_is_admitted(x, options, control, admitted):
+    assert filtered(x, **options)[0].admits(np.array(control)) == admitted
+
+
+@pytest.mark.parametrize(
+    ("x", "options", "shift", "keeps"),
+    [
+        (0.2, {}, 0.0, True),
+        (0.2, {}, 0.1, True),
+        (0.2, {}, -0.05, False),
+        (0.6, {}, -0.2, False),
+        (-0.1, {}, 0.2, False),
+        (0.2, {"recovery_s": 0.0}, 0.1, False),
+        (0.2, {"most": 1.0}, 0.1, False),
+    ],
+)
+def test_inside_the_margin_a_refused_control_may_keep_the_limit_and_lose_nothing(x, options, shift, keeps):
+    bound = filtered(x, margin=0.5, **options)[0].bound[0]
+    assert bound.keeps_limit(np.full(2, shift)) == keeps
 
 
 def test_a_state_that_is_not_a_number_admits_nothing():
-    env = reacher(sw.constraints.JointSpeedLimit(limit=4.0))
-    env.observe()
-    assert env.filter.admits(np.zeros(2))
-    env.unwrapped.data.qvel[0] = np.nan
-    env.observe()
-    assert not env.filter.admits(np.zeros(2))
+    safety, go = filtered(0.5)
+    assert safety.admits(np.zeros(2))
+    go(np.nan)
+    assert not safety.admits(np.zeros(2))
 
 
-def test_a_broken_max_decrease_stays_broken():
-    env = reacher(sw.constraints.JointSpeedLimit(limit=4.0, max_decrease=0.01))
-    with pytest.warns(UserWarning, match="farther than the declared max_decrease"):
-        for _ in range(6):
-            env.step(PUSH)
+def test_no_instant_is_an_error():
+    with pytest.raises(ConfigurationError, match="at least one instant"):
+        filtered(0.5, instants=0)
+
+
+def test_a_model_need_not_count_its_intervals():
+    decision = filtered(0.2)[0].filter(np.array([0.5, -0.5]))  # horizon=3 of one interval
+    np.testing.assert_allclose(decision.control, [0.5, -0.2], atol=1e-2)
+    assert decision.changed and not decision.infeasible
+
+
+def test_a_max_decrease_is_checked_within_the_horizon_and_stays_broken():
+    safety, go = filtered(None, max_decrease=0.5)  # nothing near at first breaks nothing
     with warnings.catch_warnings(action="error"):
-        for _ in range(6):
-            env.step(-PUSH)
-    assert env.filter.bound[0].max_decrease is None
-
-
-def test_nothing_near_at_first_breaks_no_max_decrease():
-    env = reacher(Shaped(0, 6, 0, max_decrease=50.0))
-    env.step(PUSH)
-    env.filter.bound[0].spec.now = 1
+        for x in (1.7, 1.6, 1.5, 1.4, 1.3, 1.2, 1.1, 1.0, 1.1):
+            go(x)
+    with pytest.warns(
+        UserWarning, match="fell by 0.6 units of h within 3 .* farther than the declared max_decrease"
+    ):
+        go(0.5)
     with warnings.catch_warnings(action="error"):
-        env.step(PUSH)
-
-
-def fetch(watched):
-    env = sw.protect(gym.make("FetchReach-v4"))
-    return sw.FilterObservation(env) if watched else env
+        go(2.0)
+        go(0.1)
+    assert safety.bound[0].max_decrease is None
 
 
 def test_who_looks_on_changes_nothing_where_slopes_are_kept():
@@ -99,7 +163,8 @@ def test_who_looks_on_changes_nothing_where_slopes_are_kept():
     pushes = np.clip([1.0, 0.3, -1.0, 0.0] + 0.3 * rng.normal(size=(25, 4)), -1.0, 1.0).astype(np.float32)
     executed = []
     for watched in (False, True):
-        env = fetch(watched)
+        env = sw.protect(gym.make("FetchReach-v4"))
+        env = sw.FilterObservation(env) if watched else env
         env.reset(seed=0)
         executed.append([env.step(push)[4]["executed_action"] for push in pushes])
     np.testing.assert_array_equal(*executed)
@@ -107,7 +172,7 @@ def test_who_looks_on_changes_nothing_where_slopes_are_kept():
 
 @pytest.mark.parametrize("fingers", [0.0, 0.5])
 def test_a_step_of_a_blocked_gripper_is_compared_whatever_the_fingers_were_told(fingers):
-    env = fetch(watched=False)
+    env = sw.protect(gym.make("FetchReach-v4"))
     env.reset(seed=0)
     inner = env.unwrapped.step
 

@@ -4,11 +4,9 @@ From a drawn state that is safe the backup is admitted; whatever is proposed, th
 breaks nothing at any physics substep, and the next state is safe again.
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -16,15 +14,15 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from oracles import held, to_rest
 from scenes import Scene
+from simulated_worlds import DT, TOP, WALL, Cart
 
 import safe_wrappers as sw
 from benchmarks.cases import CASES
 from benchmarks.judges import Judge, Replay, Reported
+from safe_wrappers.control.backup.damped_axis import damped_axis
 from safe_wrappers.plants.plant import Model, Trajectory
-
-sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
-from simulated_worlds import DT, TOP, WALL, Cart
 
 ROUNDING = 1e-6  # of float32 actions: `cbf/unsafe` allows as much
 
@@ -44,6 +42,8 @@ SLED = """
 <geom size="0.05" mass="1"/></body></worldbody><actuator><motor joint="rail" ctrlrange="-2 3" ctrllimited="true"/>
 </actuator></mujoco>
 """
+RAIL = damped_axis(1.0 / (1.0 + 0.005 * 0.3), 0.005 / (1.0 + 0.005 * 0.3), 0.005, 4, -2.0, 3.0)
+"""MuJoCo's damping is implicit."""
 
 
 @dataclass
@@ -52,31 +52,20 @@ class EndOfRail(sw.Constraint, Model):
 
     promise = "proved"
 
-    def hold(self, x, v, push, places):
-        for _ in range(4):
-            v = (v + 0.005 * push) / (1.0 + 0.005 * 0.3)  # MuJoCo's damping is implicit
-            x += 0.005 * v
-            places.append(x)
-        return x, v
-
-    def brake(self, v):
-        coasts, kicked = self.hold(0.0, v, 0.0, [])[1], self.hold(0.0, 0.0, 1.0, [])[1]
-        return float(np.clip(-coasts / kicked, -2.0, 3.0))
-
     def rollout(self, control, horizon=1):
         x, v = self.plant.state.tolist()
-        places = [x]
-        if control is not None:
-            x, v = self.hold(x, v, float(control[0]), places)
-        while abs(v) > 1e-12:
-            x, v = self.hold(x, v, self.brake(v), places)
+        places, held_first = [x], control is not None
+        while held_first or abs(v) > 1e-12:
+            more, v = held(RAIL, places[-1], v, float(control[0]) if held_first else to_rest(RAIL, v))
+            places, held_first = places + more, False
         return Trajectory(control, np.array(places)[:, None])
 
     def h_along(self, path):
         return END_M - path.states
 
     def proposals(self, control):
-        return [np.array([self.brake(float(self.plant.state[1]))])] if control is None else []
+        brake = np.clip([to_rest(RAIL, float(self.plant.state[1]))], RAIL.low, RAIL.high)
+        return [brake] if control is None else []
 
 
 def on_the_rail(raw, drawn):

@@ -1,4 +1,4 @@
-"""Envs that keep model and data elsewhere than in `.model` and `.data`: functions say where.
+"""Envs that keep model and data elsewhere than in `.model` and `.data`, and envs that hold the one that steps them.
 
 The oracle is the env's own step.
 """
@@ -135,3 +135,19 @@ def test_a_step_of_a_dm_control_task_is_its_forecast(task, scale):
     plant = dm_plant(env, lambda raw: raw.inner)
     assert (plant.action_map is None) == (scale == 1.0)
     assert missed(env, plant, env.physics.data.ptr) <= 1e-9  # 0.0 with dm_control 1.0.44 and MuJoCo 3.11
+
+
+@pytest.mark.parametrize(
+    ("env_id", "substeps", "control_dt"), [("AntMaze_UMaze-v5", 5, 0.05), ("PointMaze_UMaze-v3", 1, 0.01)]
+)
+def test_the_hold_of_a_maze_is_the_inner_env_s(env_id, substeps, control_dt):
+    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    env = gym.make(env_id)
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    assert plant.substeps == substeps
+    assert plant.control_dt == pytest.approx(control_dt)
+    env.reset(seed=0)
+    before = env.unwrapped.data.time
+    env.step(np.zeros(env.action_space.shape, env.action_space.dtype))
+    assert env.unwrapped.data.time - before == pytest.approx(plant.control_dt)

@@ -193,28 +193,19 @@ class Weaker(gym.Wrapper):
     ("inside", "told"),
     [(Late, "applied"), (Twice, "instead of"), (Pushed, "from its forecast"), (Weaker, "changed during")],
 )
-@pytest.mark.parametrize("vector", [False, True])
-def test_a_step_that_is_not_the_one_that_was_judged_is_flagged(inside, told, vector):
+def test_a_step_that_is_not_the_one_that_was_judged_is_flagged(inside, told):
     """No violation without a flag, and no flag without a reason."""
     limit = sw.constraints.JointSpeedLimit(limit=5.0, joints=["joint0", "joint1"])
     for wrapper in (inside, gym.Wrapper):
-        make = lambda wrapper=wrapper: wrapper(gym.make("Reacher-v5").unwrapped)  # noqa: E731
-        if vector:
-            env = sw.VectorCBFActionFilter(gym.vector.SyncVectorEnv([make]), [limit])
-            raw = env.unwrapped.envs[0].unwrapped
-        else:
-            env, raw = (one := sw.CBFActionFilter(make(), [limit])), one.unwrapped
+        env = sw.CBFActionFilter(wrapper(gym.make("Reacher-v5").unwrapped), [limit])
+        raw = env.unwrapped
         env.reset(seed=0)
         flags, unflagged, rng = 0, 0, np.random.default_rng(0)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             for _ in range(100):
                 action = np.sign(rng.uniform(-1, 1, env.action_space.shape)).astype(np.float32)
-                info = {
-                    key: np.ravel(value)[0]
-                    for key, value in env.step(action)[4].items()
-                    if key.startswith("cbf/")
-                }
+                info = env.step(action)[4]
                 flags += info["cbf/mismatch"]
                 broken = np.abs(raw.data.qvel[:2]).max() > 5.0 + 1e-6
                 unflagged += broken and not (
@@ -252,24 +243,6 @@ def test_a_constraint_that_the_changed_machine_does_not_fit_is_refused_at_every_
     for _ in range(2):
         with pytest.raises(sw.SafeWrappersError, match="the slides need equal damping"):
             env.step(np.zeros(2, np.float32))
-
-
-def test_many_envs_follow_their_models_as_single_ones_do():
-    single = [sw.protect(made("SafePointGoal1-v0")) for _ in range(3)]
-    many = sw.protect(gym.vector.SyncVectorEnv([lambda: made("SafePointGoal1-v0")] * 3))
-    seeds, rng = [5, 6, 7], np.random.default_rng(0)
-    many.reset(seed=seeds), [env.reset(seed=seed) for env, seed in zip(single, seeds, strict=True)]
-    for step in range(60):
-        if step % 20 == 10:
-            for raw in (many.unwrapped.envs[1].unwrapped, single[1].unwrapped):
-                CHANGES["mass"](raw.model)
-        actions = rng.uniform(-1, 1, (3, 2)).astype(np.float32)
-        infos = many.step(actions)[4]
-        for i, env in enumerate(single):
-            info = env.step(actions[i])[4]
-            for key in ("executed_action", "cbf/margin", "cbf/stage", "cbf/mismatch"):
-                np.testing.assert_array_equal(infos[key][i], info[key], err_msg=key)
-    assert many.filters[1].plant.model_version > 1
 
 
 def test_a_simulation_follows_the_model_of_its_env():

@@ -1,4 +1,4 @@
-"""A point on a line, pushed left and right, and a filter that is known in closed form."""
+"""A point on a line, pushed left and right, and a filter that is known in closed form; with and without goals."""
 
 from dataclasses import dataclass
 
@@ -38,6 +38,36 @@ class Line(gym.Env):
         return self.observed(), reward, self.x < -1.0, self.steps >= 9, info
 
 
+class GoalLine(Line):
+    """Pays minus the distance to a goal that is drawn at every reset; each observation has a number of its own."""
+
+    def __init__(self):
+        super().__init__()
+        one = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        three = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        parts = {"observation": three, "achieved_goal": one, "desired_goal": one}
+        self.observation_space = gym.spaces.Dict(parts)
+
+    def reset(self, *, seed=None, options=None):
+        self.goal = np.zeros(1, np.float32)
+        super().reset(seed=seed)
+        self.goal = self.np_random.uniform(-1.0, 0.5, 1).astype(np.float32)
+        return self.observed(), {}
+
+    def observed(self):
+        at = np.append(super().observed(), self.np_random.uniform()).astype(np.float32)
+        return {"observation": at, "achieved_goal": at[:1].copy(), "desired_goal": self.goal.copy()}
+
+    def step(self, action):
+        observation, _, terminated, truncated, info = super().step(action)
+        reward = self.compute_reward(observation["achieved_goal"], self.goal, info)
+        return observation, float(reward), terminated, truncated, info
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        """Minus the distance, (...), in the precision of the goals."""
+        return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+
 @dataclass
 class BehindTheWall(sw.Constraint):
     """x <= wall at the end of the hold, which is u <= (wall - x) / hold."""
@@ -73,10 +103,14 @@ def read(env):
     return np.array([env.x])
 
 
-def filtered(wall=WALL):
+def filtered(wall=WALL, task=Line):
     plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=HOLD)
-    return Monitor(sw.RecordInterventions(sw.CBFActionFilter(Line(), [BehindTheWall(wall)], plant=plant)))
+    return Monitor(sw.RecordInterventions(sw.CBFActionFilter(task(), [BehindTheWall(wall)], plant=plant)))
 
 
-def filtered_dict():
-    return AsDict(filtered())
+def filtered_goals(wall=WALL):
+    return filtered(wall, GoalLine)
+
+
+def filtered_dict(wall=WALL):
+    return AsDict(filtered(wall))

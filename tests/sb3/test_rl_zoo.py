@@ -1,22 +1,19 @@
 """RL Zoo finds `protect` and the other wrappers by their names, as docs/sb3.md shows it."""
 
 import importlib
-import importlib.util
 import re
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
 import yaml
-
-pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 import safe_wrappers as sw
 
 PAGE = (Path(__file__).parents[2] / "docs" / "sb3.md").read_text(encoding="utf-8")
-SHOWN = re.search(r"## RL Zoo.*?```yaml\n(.*?)```", PAGE, re.DOTALL)
+SHOWN = yaml.safe_load(re.search(r"## RL Zoo.*?```yaml\n(.*?)```", PAGE, re.DOTALL)[1])["SafePointGoal1-v0"]
 
 
 def named(name):
@@ -25,29 +22,16 @@ def named(name):
     return getattr(importlib.import_module(module), attribute)
 
 
-def zoo_wrapper(settings):
+def read_by_itself(settings):
     """The Zoo's reading of `env_wrapper`; its own, where it is installed, reads the same."""
-    layers = [
-        next(iter(each.items())) if isinstance(each, dict) else (each, {}) for each in settings["env_wrapper"]
-    ]
 
     def wrap(env):
-        for name, arguments in layers:
+        for each in settings["env_wrapper"]:
+            ((name, arguments),) = each.items() if isinstance(each, dict) else [(each, {})]
             env = named(name)(env, **arguments)
         return env
 
     return wrap
-
-
-@pytest.fixture
-def settings():
-    ((env_id, found),) = yaml.safe_load(SHOWN[1]).items()
-    assert env_id == "SafePointGoal1-v0"
-    return found
-
-
-def read_by_itself(settings):
-    return zoo_wrapper(settings)
 
 
 def read_by_the_zoo(settings):
@@ -55,26 +39,23 @@ def read_by_the_zoo(settings):
 
 
 @pytest.mark.parametrize("read", [read_by_itself, read_by_the_zoo])
-def test_the_page_s_settings_make_a_filtered_and_recorded_env(settings, read):
-    env = read(settings)(gym.make("SafePointGoal1-v0"))
+def test_the_page_s_settings_make_a_filtered_and_recorded_env(read):
+    env = read(SHOWN)(gym.make("SafePointGoal1-v0"))
     assert isinstance(env, sw.RecordInterventions) and isinstance(env.env, sw.CBFActionFilter)
     (own,) = sw.protect(gym.make("SafePointGoal1-v0")).constraints
     assert env.env.constraints[0].margin == pytest.approx(own.margin + 0.05)
 
 
-def test_ppo_learns_with_the_page_s_settings_as_the_zoo_makes_it(settings):
-    callback = named(settings.pop("callback"))()
-    wrapper, policy = zoo_wrapper(settings), settings["policy"]
-    small = {"n_steps": 16, "batch_size": 16, "n_epochs": 1}
-    envs = make_vec_env("SafePointGoal1-v0", n_envs=2, seed=0, wrapper_class=wrapper)
+def test_ppo_learns_with_the_page_s_settings_as_the_zoo_makes_it():
     seen = []
 
-    class Seen(type(callback)):
+    class Seen(named(SHOWN["callback"])):
         def _on_step(self):
             seen.extend(self.locals["infos"])
             return super()._on_step()
 
-    PPO(policy, envs, **small).learn(32, callback=Seen())
+    envs = make_vec_env("SafePointGoal1-v0", n_envs=2, seed=0, wrapper_class=read_by_itself(SHOWN))
+    PPO(SHOWN["policy"], envs, n_steps=16, batch_size=16, n_epochs=1).learn(32, callback=Seen())
     assert len(seen) == 32 and all("cbf/margin" in info for info in seen)
-    names = set(settings) - {"env_wrapper", "n_envs", "n_timesteps", "policy"}
-    assert names <= set(PPO.__init__.__code__.co_varnames)
+    of_the_zoo = {"env_wrapper", "n_envs", "n_timesteps", "policy", "callback"}
+    assert SHOWN.keys() - of_the_zoo <= set(PPO.__init__.__code__.co_varnames)

@@ -1,5 +1,6 @@
 """A tiny goal task and a tiny filter, so that runs of the whole machinery take a second."""
 
+import contextlib
 import os
 import signal
 import time
@@ -8,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.processes import RunStoppedError
@@ -94,6 +96,37 @@ def shield(env, margin=0.0):
     return FakeFilter(env, margin)
 
 
+def slow_joints(env, mass=1.0, delay_s=0.0):
+    """A filter whose model and delay are not the env's."""
+    plant = sw.MujocoPlant(delay_s=delay_s)
+    plant.perturb(mass=mass)
+    return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0)], plant=plant, margin=0.5)
+
+
+def slow_pendulum(env, delay_s=0.0):
+    """A filter with a plant of the user's."""
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.array([x[1], 15 * np.sin(x[0])]),
+        g=lambda x: np.array([[0.0], [3.0]]),
+        state=lambda env: env.state,
+        control_dt=0.05,
+        delay_s=delay_s,
+    )
+    constraint = sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
+    return sw.CBFActionFilter(env, [constraint], plant=plant)
+
+
+class RowsOnly(sw.Constraint):
+    """A constraint without an h."""
+
+    def rows(self):
+        return None
+
+
+def without_h(env):
+    return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0), RowsOnly()])
+
+
 gym.register("FakeGoal-v0", "fake_task:FakeGoal")
 gym.register("SilentGoal-v0", "fake_task:SilentGoal")
 
@@ -136,11 +169,8 @@ def until_stopped(progress):
 
 def never_stopped(progress):
     """A job that is asked to stop and does not; it says so a second later."""
-    progress.say("working")
-    end = time.monotonic() + 60.0
-    while not progress.stopping():
-        assert time.monotonic() < end, "nobody asked it to stop"
-        time.sleep(0.05)
+    with contextlib.suppress(RunStoppedError):
+        until_stopped(progress)
     time.sleep(1.0)  # a signal that follows within half a second is the same one
     progress.say("goes on")
     time.sleep(300.0)

@@ -279,24 +279,6 @@ def test_actions_and_observations_of_the_wrong_kind_are_refused_before_the_first
 @pytest.mark.parametrize(
     ("algorithm", "learner", "overrides", "message"),
     [
-        ("SAC", "adaption_penalty", [], "adaption_penalty needs a penalty per changed step"),
-        (
-            "SAC",
-            "{kind: adaption_penalty, penalty: -1}",
-            [],
-            "learner.penalty: .* greater than or equal to 0, got -1",
-        ),
-        (
-            "SAC",
-            "{kind: safe_action, penalty: 1}",
-            [],
-            "safe_action takes no penalty; adaption_penalty does",
-        ),
-        ("DQN", "safe_action", [], "is for continuous actions, and DQN has"),
-        ("SAC", "safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
-        ("SAC", "safe_action", ["hyperparameters.n_steps=3"], "has one-step returns"),
-        ("SAC", "naive", ["hyperparameters.replay_buffer_kwargs={}"], "unknown name 'replay_buffer_kwargs'"),
-        ("PPO", "safe_action", [], "Use naive or adaption_penalty, or safe_action with SAC"),
         ("TD3", "naive", ["hyperparameters={}"], r"TD3 is deterministic .*\{normal: 0.1\}"),
         ("SAC", "{cost_limit: 1}", ["normalize.reward=true"], "leave normalize out"),
         ("SAC", "{cost_limit: -1}", [], "cost_limit"),

@@ -1,4 +1,7 @@
-"""What a config may say: as the command reads it, as its schema tells editors, and as the pages have it."""
+"""What a config may say: to the command, to editors by its schema, on the pages, and in the envs that are made.
+
+One table has what is refused, by the command and, where it can know, by the schema.
+"""
 
 import json
 import re
@@ -6,13 +9,27 @@ import runpy
 from dataclasses import fields
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import yaml
 
-from safe_wrappers.errors import ConfigurationError
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError
+from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train import cli
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.config import FilterConfig, models, parse_experiment, read_config
+from safe_wrappers.train.config import (
+    EnvConfig,
+    FilterConfig,
+    LearnerConfig,
+    models,
+    parse_experiment,
+    read_config,
+    stored_arm,
+)
+from safe_wrappers.train.experiment import check_training
+from safe_wrappers.train.run.stack import make_stack
 
 ROOT = Path(__file__).parents[2]
 CONFIGS, DOCS = ROOT / "configs", ROOT / "docs"
@@ -31,6 +48,9 @@ def changed(**settings):
     return parse_experiment({**MINIMAL, **settings})
 
 
+# What it means ----------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_config_of_the_repo_is_valid_and_fits_the_schema_that_it_names(path):
     assert path.read_text().startswith("# yaml-language-server: $schema=schema.json\n")
@@ -45,26 +65,18 @@ def test_every_config_of_the_repo_is_valid_and_fits_the_schema_that_it_names(pat
     assert experiment.evaluation_filter.kind == "protect"
 
 
-def test_an_evaluation_may_name_its_own_filter():
-    arms = {"unfiltered": {"filter": "none"}}
-    assert changed(arms=arms).evaluation_filter.kind == "none"
-    on = changed(arms=arms, evaluation={"episodes": 1, "filter": {"protect": {"margin": 0.1}}})
-    assert on.evaluation_filter.protect == {"margin": 0.1}
-    filtered = changed(evaluation={"filter": "none"})
-    assert filtered.evaluation_filter.kind == "none"
-    judged = {"env": {"id": "Reacher-v5", "judge": "constraints"}, "evaluation": {"filter": "protect"}}
-    assert changed(arms=arms, **judged).arms[0].env.judge == FilterConfig(protect={})
-
-
 def test_defaults_and_shorthands():
-    experiment = changed()
-    (arm,) = experiment.arms
-    assert (arm.env.id, arm.env.kwargs) == ("InvertedPendulum-v5", {})
-    assert (arm.filter.kind, arm.n_envs, arm.device) == ("none", 1, "cpu")
-    assert (arm.normalize.observation, arm.normalize.reward) == (False, False)
-    assert experiment.evaluation.episodes == 10
-    assert experiment.folder == Path("runs/x")
-    assert experiment.workers is None
+    nothing = {"n_envs": None, "normalize": None, "workers": None}
+    for experiment in (changed(), changed(**nothing, arms={"unfiltered": {"filter": None}})):
+        (arm,) = experiment.arms
+        assert (arm.env.id, arm.env.kwargs) == ("InvertedPendulum-v5", {})
+        assert (arm.filter.kind, arm.n_envs, arm.device) == ("none", 1, "cpu")
+        assert (arm.normalize.observation, arm.normalize.reward) == (False, False)
+        assert experiment.evaluation.episodes == 10
+        assert experiment.folder == Path("runs/x")
+        assert experiment.workers is None
+    (arm,) = changed(arms={"a": {"filter": {"protect": None}}}).arms
+    assert (arm.filter.kind, arm.filter.protect) == ("protect", {})
 
 
 def test_arms_override_the_common_settings():
@@ -86,77 +98,41 @@ def test_arms_override_the_common_settings():
     assert (b.hyperparameters, b.total_steps, b.n_envs) == ({"n_steps": 64, "gamma": 0.8}, 5, 3)
     assert b.device == "auto"
     # Another algorithm does not inherit PPO's hyperparameters.
-    assert c.hyperparameters == {"learning_starts": 10}
-    assert c.normalize.reward
+    assert c.hyperparameters == {"learning_starts": 10} and c.normalize.reward
     assert (d.env.id, d.env.kwargs, d.checkpoint_every) == ("Pendulum-v1", {"g": 9.0}, 7)
     assert experiment.evaluation_filter == a.filter
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"totalsteps": 3}, "config: unknown name 'totalsteps'. Did you mean 'total_steps'?"),
-        ({"algorithm": "PP0"}, "algorithm: unknown name 'PP0'. Did you mean 'PPO'?"),
-        ({"env": "InvertedPendulums-v5"}, "Did you mean 'InvertedPendulum-v5'?"),
-        ({"hyperparameters": {"nsteps": 3}}, "of PPO: unknown name 'nsteps'. Did you mean 'n_steps'?"),
-        (
-            {"arms": {"a": {"filter": "protected"}}},
-            "a.filter: unknown name 'protected'. Did you mean 'protect'?",
-        ),
-        ({"evaluation": {"filter": "protct"}}, "Did you mean 'protect'?"),
-        ({"device": "gpu"}, "device: input should be 'cpu', 'cuda' or 'auto', got 'gpu'."),
-        ({"total_steps": 0}, "total_steps: input should be greater than or equal to 1, got 0."),
-        ({"seeds": []}, "seeds: list should have at least 1 item"),
-        ({"seeds": [1, 1]}, "seeds: each may be given once, got [1, 1]."),
-        ({"arms": {}}, "arms: expected at least one"),
-        ({"arms": {"../x": {}}}, "arms.../x.name: expected a name that can be a folder's"),
-        ({"arms": {"a": {"filter": False}}}, "a.filter: expected a mapping of protect, factory, kwargs"),
-        (
-            {"arms": {"a": {"filter": {"kwargs": {"x": 1}}}}},
-            "a.filter: expected none, protect, {protect: {...}}",
-        ),
-        ({"arms": {"a": {"filter": {"lease": {}}}}}, "beside it"),
-        ({"arms": {"a": {"learner": {"kind": "safe_action"}}}}, "without a filter no action is ever changed"),
-        (
-            {"hyperparameters": {"learning_rate": -1}},
-            "learning_rate: input should be greater than 0, got -1.",
-        ),
-        ({"hyperparameters": {"use_sde": 1}}, "use_sde: input should be a valid boolean, got 1."),
-        (
-            {"env": {"id": "Reacher-v5", "judge": "constraints"}},
-            "env.judge: there is no filter whose constraints",
-        ),
-        (
-            {"env": {"id": "Reacher-v5", "observation": "constraints"}},
-            "env.observation: there is no filter whose",
-        ),
-        ({"env": {"id": "Reacher-v5", "judge": {"protect": {}}, "cost": "a:b"}}, "cost and judge both say"),
-    ],
-)
-def test_unknown_names_and_bad_values_are_refused_with_what_is_valid(settings, message):
-    with pytest.raises(ConfigurationError) as refusal:
-        changed(**settings)
-    assert message in str(refusal.value)
+def test_an_evaluation_may_name_its_own_filter_which_may_judge():
+    assert changed().evaluation_filter.kind == "none"
+    on = changed(evaluation={"episodes": 1, "filter": {"protect": {"margin": 0.1}}})
+    assert on.evaluation_filter.protect == {"margin": 0.1}
+    judged = {"env": {"id": "Reacher-v5", "judge": "constraints"}, "evaluation": {"filter": "protect"}}
+    assert changed(**judged).arms[0].env.judge == FilterConfig(protect={})
 
 
-def test_a_key_without_a_value_has_its_default():
-    (arm,) = changed(n_envs=None, normalize=None, workers=None, arms={"a": {"filter": None}}).arms
-    assert (arm.n_envs, arm.normalize.reward, arm.filter.kind) == (1, False, "none")
-    (arm,) = changed(arms={"a": {"filter": {"protect": None}}}).arms
-    assert (arm.filter.kind, arm.filter.protect) == ("protect", {})
+ARMS = {
+    "protect": {"filter": {"protect": {"margin": 0.1}, "lease": {"budget": {"closing_speed": 3.0}}}},
+    "factory": {"filter": {"factory": "fake_task:shield", "kwargs": {"margin": None}}},
+    "priced": {"hyperparameters": {"clip_range": "linear_0.2"}, "learner": {"cost_limit": 25}},
+    "held": {"normalize": {"observation": True}, "action_repeat": 4, "n_envs": 3},
+    "seen": {"env": {"id": "SafePointGoal1-v0", "observation": "constraints"}},
+    "judged": {"env": {"id": "Reacher-v5", "judge": "constraints"}},
+}
 
 
-def test_yaml_numbers_as_people_write_them(tmp_path):
+def test_an_arm_is_read_back_from_what_its_folder_says():
+    for arm in changed(arms=ARMS, evaluation={"filter": "protect"}).arms:
+        assert stored_arm(arm.name, json.loads(json.dumps(arm.fingerprint()))) == arm
+
+
+def test_files_and_overrides_as_people_write_them(tmp_path):
     path = tmp_path / "c.yaml"
-    path.write_text("a: 3e-4\nb: -1E5\nc: 1e\nd: 12\n")
-    assert read_config(path) == {"a": 3e-4, "b": -1e5, "c": "1e", "d": 12}
-
-
-def test_overrides(tmp_path):
-    path = tmp_path / "c.yaml"
-    path.write_text("a: {b: 1}\nc:\n")
+    path.write_text("a: {b: 1}\nc:\nd: 3e-4\ne: -1E5\nf: 1e\n")
+    read = {"a": {"b": 1}, "c": None, "d": 3e-4, "e": -1e5, "f": "1e"}
+    assert read_config(path) == read
     settings = read_config(path, ["a.b=2", "a.d=[1, 2]", "c.e.f=none", "g=1e3", "g=2"])
-    assert settings == {"a": {"b": 2, "d": [1, 2]}, "c": {"e": {"f": "none"}}, "g": 2}
+    assert settings == {**read, "a": {"b": 2, "d": [1, 2]}, "c": {"e": {"f": "none"}}, "g": 2}
 
 
 @pytest.mark.parametrize(
@@ -178,6 +154,103 @@ def test_bad_files_and_overrides(tmp_path, text, override, message):
     with pytest.raises(ConfigurationError) as refusal:
         read_config(path, [override] if override else [])
     assert message in str(refusal.value)
+
+
+# What is refused, before a step is made ---------------------------------------------------------------------------
+
+
+def of_arm(**settings):
+    return {"arms": {"a": settings}}
+
+
+def of_env(env_id, **settings):
+    return {"env": {"id": env_id, **settings}}
+
+
+def learnt(kind, algorithm="SAC", **settings):
+    """A filtered arm with a learner."""
+    return {"algorithm": algorithm, **of_arm(filter="protect", learner=kind), **settings}
+
+
+def judged(env_id, factory, **kwargs):
+    judge = {"factory": factory, "kwargs": kwargs}
+    return of_env(env_id, judge="constraints") | {"evaluation": {"filter": judge}}
+
+
+LEASE = {"budget": {"closing_speed": 3.0}, "min_lease_s": 0.02}
+SEEN = [  # by the schema, too
+    ({"totalsteps": 3}, "config: unknown name 'totalsteps'. Did you mean 'total_steps'?"),
+    ({"algorithm": "PP0"}, "algorithm: unknown name 'PP0'. Did you mean 'PPO'?"),
+    ({"env": None}, "arms.unfiltered: 'env' is missing."),
+    ({"device": "gpu"}, "device: input should be 'cpu', 'cuda' or 'auto', got 'gpu'."),
+    ({"total_steps": 0}, "total_steps: input should be greater than or equal to 1, got 0."),
+    ({"n_envs": 0}, "n_envs: input should be greater than or equal to 1, got 0."),
+    ({"trackers": ["wand"]}, "input should be 'wandb' or 'mlflow'"),
+    ({"seeds": []}, "seeds: list should have at least 1 item"),
+    ({"seeds": 0}, "seeds: input should be a valid list"),
+    ({"arms": {}}, "arms: expected at least one"),
+    ({"normalize": {"reward": 1}}, "normalize.reward: input should be a valid boolean"),
+    ({"evaluation": {"episodes": "many"}}, "evaluation.episodes: "),
+    ({"evaluation": {"filter": "protct"}}, "Did you mean 'protect'?"),
+    (of_arm(filter="protected"), "a.filter: unknown name 'protected'. Did you mean 'protect'?"),
+    (of_arm(filter=False), "a.filter: expected a mapping of protect, factory, kwargs"),
+    (of_arm(filter={"margin": 0.1}), "a.filter: unknown name 'margin'"),
+    (of_env("SafePointGoal1-v0", judge="filter"), "env.judge: unknown name 'filter'"),
+    (learnt("naiv"), "learner.kind: input should be 'naive'"),
+    (learnt({"kind": "adaption_penalty", "penalty": -1}), "penalty: input should be greater than or equal to 0"),
+    (learnt({"cost_limit": -1}), "cost_limit: input should be greater than or equal to 0"),
+]  # fmt: skip
+UNSEEN = [
+    ({"env": "InvertedPendulums-v5"}, "Did you mean 'InvertedPendulum-v5'?"),
+    ({"hyperparameters": {"nsteps": 3}}, "of PPO: unknown name 'nsteps'. Did you mean 'n_steps'?"),
+    ({"hyperparameters": {"learning_rate": -1}}, "learning_rate: input should be greater than 0, got -1."),
+    ({"hyperparameters": {"use_sde": 1}}, "use_sde: input should be a valid boolean, got 1."),
+    ({"seeds": [1, 1]}, "seeds: each may be given once, got [1, 1]."),
+    ({"arms": {"../x": {}}}, "arms.../x.name: expected a name that can be a folder's"),
+    # What does not go together.
+    (of_arm(filter={"kwargs": {"x": 1}}), "a.filter: expected none, protect, {protect: {...}}"),
+    (of_arm(filter={"lease": {}}), "beside it"),
+    (of_arm(learner="safe_action", algorithm="SAC"), "without a filter no action is ever changed"),
+    (learnt("adaption_penalty"), "adaption_penalty needs a penalty per changed step"),
+    (learnt({"kind": "safe_action", "penalty": 1}), "safe_action takes no penalty; adaption_penalty does"),
+    (learnt("safe_action", "DQN"), "is for continuous actions, and DQN has"),
+    (learnt("safe_action", "PPO"), "Use naive or adaption_penalty, or safe_action with SAC"),
+    (learnt("safe_action", hyperparameters={"n_steps": 3}), "has one-step returns"),
+    (learnt("naive", hyperparameters={"replay_buffer_kwargs": {}}), "unknown name 'replay_buffer_kwargs'"),
+    (learnt("naive", "TD3"), "TD3 is deterministic"),
+    (learnt({"cost_limit": 1}, normalize={"reward": True}), "leave normalize out"),
+    (of_env("Reacher-v5", judge="constraints"), "env.judge: there is no filter whose constraints"),
+    (of_env("Reacher-v5", observation="constraints"), "env.observation: there is no filter whose"),
+    (of_env("Reacher-v5", judge="constraints", cost="a:b"), "cost and judge both say"),
+    # What only the task can tell.
+    (of_env("Pendulum-v1", kwargs={"no_such": 1}), "env: Pendulum-v1 with kwargs {'no_such': 1} cannot be made"),
+    (of_env("CartPole-v1") | {"algorithm": "SAC"}, "arms.unfiltered: SAC needs actions of a Box, and CartPole"),
+    ({"algorithm": "DQN"}, "arms.unfiltered: DQN needs actions of a Discrete, and InvertedPendulum-v5 has"),
+    (of_env("MountainCar-v0") | of_arm(filter="protect"), "no recipe for"),
+    (of_arm(filter={"factory": "nowhere:shield"}), "filter.factory: cannot import 'nowhere:shield'"),
+    (of_arm(filter={"factory": "fake_task:shield", "kwargs": {"no_such": 1}}), "kwargs: shield() got an unexpected"),
+    (of_env("Reacher-v5", faults={"Outage": {}}), "'Outage'. Did you mean 'Outages'"),
+    (of_env("Reacher-v5", faults={"Outages": {}}), "env.faults.Outages: "),
+    (of_env("OccludedCrossing-v0", occlusion={}), "env.occlusion: "),
+    (of_env("SafePointGoal1-v0") | of_arm(filter={"protect": {}, "lease": {"budget": {"closing": 1.0}}}), "closing"),
+    (of_env("Pusher-v5") | of_arm(filter={"protect": {}, "lease": LEASE}), "2 constraints; say which one"),
+    (
+        of_env("fake_task:FakeGoal-v0")
+        | of_arm(filter={"factory": "fake_task:shield"}, learner={"kind": "adaption_penalty", "penalty": 1}),
+        "AdaptionPenalty needs a CBFActionFilter inside",
+    ),
+    (judged("Reacher-v5", "fake_task:without_h"), "env.judge: RowsOnly has no h "),
+    (judged("Pendulum-v1", "fake_task:slow_pendulum", delay_s=0.05), "the filter's plant looks 0.05 s ahead"),
+    (judged("Pendulum-v1", "gymnasium:Wrapper"), "env.judge: the filter has no constraints and plant"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("settings", "message"), SEEN + UNSEEN, ids=str)
+def test_what_is_refused_and_with_which_words(settings, message):
+    with pytest.raises(SafeWrappersError) as refusal:
+        check_training(changed(**settings))
+    assert message in str(refusal.value)
+    assert fits({**MINIMAL, **settings}, SCHEMA) == ((settings, message) in UNSEEN)
 
 
 # The schema -------------------------------------------------------------------------------------------------------
@@ -227,31 +300,19 @@ def test_the_command_prints_what_lies_beside_the_configs(capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "taken"),
+    "settings",
     [
-        ("n_env=4", False), ("algorithm=PPPO", False), ("n_envs=0", False), ("device=gpu", False),
-        ("arms.filtered.filter=protekt", False), ("arms.filtered.filter={margin: 0.1}", False), ("seeds=0", False),
-        ("arms.filtered.learner.kind=naiv", False), ("normalize.reward=1", False),
-        ("env={id: SafePointGoal1-v0, judge: filter}", False), ("seeds=[]", False),
-        ("arms={}", False), ("total_steps=-1", False), ("evaluation.episodes=many", False), ("env=", False),
-        ("n_envs=", True), ("arms.filtered=", True), ("arms.filtered.filter={protect: {margin: 0.1}}", True),
-        ("total_steps=3e5", True), ("arms.filtered.learner={kind: adaption_penalty, penalty: 0.1}", True),
-        ("env={id: SafePointGoal1-v0, observation: constraints}", True), ("trackers=[wandb]", True),
-        ("device=", True),
+        {"n_envs": None, "device": None, "trackers": ["wandb"]},
+        {"total_steps": 300_000},
+        {"arms": {"filtered": None}},
+        of_arm(filter={"protect": {"margin": 0.1}}, learner={"kind": "adaption_penalty", "penalty": 0.1}),
+        of_env("SafePointGoal1-v0", observation="constraints") | {"evaluation": {"filter": "protect"}},
     ],
-)  # fmt: skip
-def test_it_says_what_the_command_says(change, taken):
-    settings = read_config(CONFIGS / "pointgoal1_300k.yaml", [change])
-    if taken:
-        parse_experiment(settings)
-    else:
-        with pytest.raises(ConfigurationError):
-            parse_experiment(settings)
-    whole = {
-        key: int(value) if isinstance(value, float) and value.is_integer() else value
-        for key, value in settings.items()
-    }
-    assert fits(whole, SCHEMA) == taken
+    ids=str,
+)
+def test_what_the_command_takes_fits_the_schema(settings):
+    changed(**settings)
+    assert fits({**MINIMAL, **settings}, SCHEMA)
 
 
 # The pages have every option and every key, with the defaults that there are ---------------------------------------
@@ -281,11 +342,11 @@ def test_every_field_of_the_models_is_on_the_page():
 
 
 def test_the_page_s_required_keys_are_those_of_a_config():
-    given = {"name": "x", "env": "Pendulum-v1", "algorithm": "PPO", "total_steps": 9, "arms": {"a": {}}}
-    parse_experiment({**given, "seeds": [0]})
     required = {name for name, key in rows().items() if key.default == "required"}
-    inner = {"env.id", "sweep.parameters"}
-    assert required == given.keys() | {"seeds"} | inner
+    assert required == MINIMAL.keys() | {"env.id", "sweep.parameters"}
+    for key in MINIMAL:
+        with pytest.raises(ConfigurationError, match=f"config: '{key}' is missing"):
+            parse_experiment({name: value for name, value in MINIMAL.items() if name != key})
 
 
 def test_every_command_and_option_is_on_its_page():
@@ -294,3 +355,56 @@ def test_every_command_and_option_is_on_its_page():
         assert f"| `{command}` |" in text
         for option in re.findall(r"(?<!\w)--[a-z]+\b", cli.make_parser(command).format_help()):
             assert option == "--help" or re.search(rf"`{option}[` ]", text), option
+
+
+# What it puts around the task -------------------------------------------------------------------------------------
+
+
+def test_the_stack_has_every_layer_in_its_place():
+    outages = {"mean_between_s": 0.2, "mean_length_s": 0.2}
+    faults = {"Outages": outages, "RepeatedCommands": {"share": 0.1}}
+    filtered = FilterConfig(protect={"margin": 0.1}, lease=LEASE, escape={"progress": 0.1})
+    learner = LearnerConfig("adaption_penalty", penalty=2.0)
+    stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), filtered, learner)
+    assert stack.penalty == 2.0
+    kinds = [type(wrapper).__name__ for wrapper in wrappers_of(stack)]
+    order = ["AdaptionPenalty", "Monitor", "RepeatedCommands", "Outages", "RecordInterventions"]
+    order += ["StuckEscape", "LeaseExpiry", "CBFActionFilter"]
+    assert [kind for kind in kinds if kind in order] == order
+    stack.reset(seed=0)
+    infos = [stack.step(np.array([0.3, 0.1], np.float32))[4] for _ in range(100)]
+    assert any(i["fault/active"] for i in infos) and any(i["lease/remaining_s"] > 0.02 for i in infos)
+    assert not any(i["cost"] for i in infos)
+    assert stack.get_wrapper_attr("filter_time_us") > 0
+    (clearance,) = stack.get_wrapper_attr("filter").constraints
+    (own,) = sw.protect(gym.make("SafePointGoal1-v0")).constraints
+    assert clearance.margin == pytest.approx(own.margin + 0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
+def test_the_occlusion_penalty_is_inside_the_filter_and_the_recorder_counts_what_it_tells():
+    occlusion = {
+        "tracks": [{"bodies": "car*", "acceleration_noise": [0.0225, 0], "start_position_std": [0.3, 0]}],
+        "sensor": {"camera": "eye", "range_m": 6},
+        "tolerance": 0.5,
+        "weight": 0.1,
+    }
+    env = EnvConfig("OccludedCrossing-v0", {}, {}, occlusion)
+    stack = make_stack(env, FilterConfig(protect={"cars": "estimated"}))
+    stack.reset(seed=0)
+    total, taken, info, done = 0.0, 0.0, {}, False
+    while not done:
+        _, reward, _, done, info = stack.step(np.array([0.0, 1.0, 0.2], np.float32))
+        total, taken = total + reward, taken + info["occlusion/penalty"]
+    assert info["interventions"]["return"] == pytest.approx(total + taken)
+    assert info["episode"]["r"] == pytest.approx(total, abs=1e-5)  # Monitor's holds the penalty
+    assert info["interventions"]["return"] > total and "collisions" in info["interventions"]
+
+
+def test_all_arms_observe_the_same_features():
+    env = {"id": "SafePointGoal1-v0", "observation": "constraints"}
+    alone = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0"))).reset(seed=3)[0]
+    for arm in changed(env=env, arms={"bare": {}, "filtered": {"filter": "protect"}}).arms:
+        for used in (arm.filter, FilterConfig()):
+            np.testing.assert_array_equal(make_stack(arm.env, used).reset(seed=3)[0], alone)

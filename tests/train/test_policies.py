@@ -1,7 +1,8 @@
-"""What a run leaves for others: the same actions, no foreign code, another env or filter refused."""
+"""What a run leaves for others: driven as it was trained, no foreign code, another env or filter refused."""
 
 import json
 import shutil
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -15,10 +16,12 @@ import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, RunStateError
 from safe_wrappers.train import policies
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.config import parse_experiment, stored_arm
-from safe_wrappers.train.files import write_rows
+from safe_wrappers.train.config import EvaluationConfig, parse_experiment
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
+from safe_wrappers.train.files import read_rows, write_rows
 from safe_wrappers.train.policies import load_policy, write_card
 from safe_wrappers.train.run.data_pickles import read_pickle
+from safe_wrappers.train.run.stack import make_vec_env
 from safe_wrappers.train.run.training import train_run
 
 SHIPPED = Path(__file__).parents[2] / "configs" / "policies"
@@ -93,6 +96,60 @@ def test_it_sees_scaled_observations_and_has_its_filter(reacher):
     assert np.array_equal(trained(observation), proposed) and np.any(proposed)
 
 
+SEEN = {
+    "env": {"id": "SafePointGoal1-v0", "observation": "constraints", "kwargs": {"max_episode_steps": 50}},
+    "hyperparameters": {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
+    "total_steps": 16,
+    "action_repeat": 4,
+}
+
+
+def test_it_acts_in_evaluation_as_it_was_trained(tmp_path):
+    """Beside SB3's own `predict` in a loop over ActionRepeat."""
+    run = trained({**PPO, **SEEN, "normalize": None, "n_envs": 1}, tmp_path)
+    policy = load_policy(run)
+    arm = policy.arm
+    envs = make_vec_env(arm)
+    envs.reset()
+    dones = [envs.step(np.zeros((1, 2), dtype=np.float32))[2][0] for _ in range(13)]
+    assert dones[-1] and not any(dones[:-1])  # its steps are the policy's
+    evaluate_run(arm, 0, run, EvaluationConfig(episodes=2, seed=7), arm.filter, SILENT)
+    env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=50)))
+    env = sw.ActionRepeat(sw.RecordInterventions(env), 4)
+    for seed, row in zip((7, 8), read_rows(evaluation_folder(run) / "filter_on.csv"), strict=True):
+        observation, _ = env.reset(seed=seed)
+        truncated = False
+        while not truncated:
+            action = policy.model.predict(observation, deterministic=True)[0]
+            observation, _, _, truncated, info = env.step(action)
+        assert row["return"] == pytest.approx(info["interventions"]["return"], abs=1e-12)
+        assert row["length"] == 50
+    held = evaluated_steps(run, "filter_on").proposed[:48].reshape(12, 4, 2)
+    assert (held == held[:, :1]).all()
+    policy.deterministic = False
+    policy.reset()
+    first = policy(observation)
+    policy.reset()
+    assert not np.array_equal(policy(observation), first)
+
+
+def test_fetch_reach_is_trained_and_evaluated_by_its_plain_id(tmp_path):
+    pytest.importorskip("gymnasium_robotics")
+    short = {"hyperparameters": {"n_steps": 50, "batch_size": 50, "n_epochs": 1}, "total_steps": 100}
+    run = trained({**PPO, **short, "env": "FetchReach-v4", "n_envs": 2}, tmp_path)
+    policy = load_policy(run)
+    assert type(policy.model.policy).__name__ == "MultiInputActorCriticPolicy"  # its observations are dicts
+    evaluate_run(policy.arm, 0, run, EvaluationConfig(episodes=1), policy.arm.filter, SILENT)
+    (row,) = read_rows(evaluation_folder(run) / "filter_on.csv")
+    assert row["length"] == 50
+    code = (  # a new process registers the id when it is asked for
+        "import gymnasium as gym; from safe_wrappers.train.config import check_env_id;"
+        "assert 'FetchReach-v4' not in gym.registry; check_env_id('FetchReach-v4');"
+        "assert 'FetchReach-v4' in gym.registry"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
 @pytest.mark.parametrize("name", ["filtered", "unfiltered"])
 def test_the_policies_that_ship_act_safely_in_their_filter(name):
     trained = load_policy(SHIPPED / name)
@@ -129,40 +186,21 @@ def test_another_env_is_refused_unless_told(policy):
 
 
 @pytest.mark.parametrize("run_or_folder", ["", "policy"])
-def test_another_filter_is_refused_unless_told(reacher, run_or_folder):
-    limit = sw.constraints.JointSpeedLimit(limit=4.0)
+def test_another_filter_is_refused_unless_told(reacher, run_or_folder, monkeypatch):
+    folder, limit = reacher / run_or_folder, sw.constraints.JointSpeedLimit(limit=4.0)
     for env, here in (
         (gym.make("Reacher-v5"), "here: no filter"),
         (sw.CBFActionFilter(gym.make("Reacher-v5"), [limit]), r"here: JointSpeedLimit\(limit=4\.0"),
     ):
         with pytest.raises(ConfigurationError, match=rf"(?s)trained: JointSpeedLimit\(limit=5\.0.*{here}"):
-            load_policy(reacher / run_or_folder, env)
-        load_policy(reacher / run_or_folder, env, other_filter=True)
-    load_policy(reacher / run_or_folder, sw.RecordInterventions(sw.protect(gym.make("Reacher-v5"))))
-
-
-def test_a_recipe_that_has_changed_since_is_refused_unless_told(policy, monkeypatch):
+            load_policy(folder, env)
+        load_policy(folder, env, other_filter=True)
+    load_policy(folder, sw.RecordInterventions(sw.protect(gym.make("Reacher-v5"))))
+    # So is, for a policy's folder, a recipe that has changed since.
     monkeypatch.setattr(policies, "constraints_of_arm", lambda arm: ["JointSpeedLimit(limit=9.0)"])
     with pytest.raises(ConfigurationError, match=r"(?s)through another filter.*limit=9\.0"):
-        load_policy(policy)
-    load_policy(policy, other_filter=True)
-
-
-ARMS = {
-    "protect": {"filter": {"protect": {"margin": 0.1}, "lease": {"budget": {"closing_speed": 3.0}}}},
-    "factory": {"filter": {"factory": "fake_task:shield", "kwargs": {"margin": None}}},
-    "priced": {"hyperparameters": {"clip_range": "linear_0.2"}, "learner": {"cost_limit": 25}},
-    "held": {"normalize": {"observation": True}, "action_repeat": 4, "n_envs": 3},
-    "seen": {"env": {"id": "SafePointGoal1-v0", "observation": "constraints"}},
-    "judged": {"env": {"id": "Reacher-v5", "judge": "constraints"}},
-}
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_an_arm_is_read_back_from_what_its_folder_says(name):
-    given = {**REACHER, **PPO, "env": "SafePointGoal1-v0", "arms": ARMS, "evaluation": {"filter": "protect"}}
-    arm = next(arm for arm in parse_experiment(given).arms if arm.name == name)
-    assert stored_arm(name, json.loads(json.dumps(arm.fingerprint()))) == arm
+        load_policy(reacher / "policy")
+    load_policy(reacher / "policy", other_filter=True)
 
 
 def test_the_card_has_what_was_measured_and_says_what_was_not_judged(reacher, tmp_path):
@@ -172,11 +210,8 @@ def test_the_card_has_what_was_measured_and_says_what_was_not_judged(reacher, tm
     (run / "episodes.csv").unlink()
     write_card(arm, 0, run)
     assert "Nothing was measured yet." in card.read_text()
-    columns = ("return", "length", "intervention_rate", "infeasible")
-    rows = [
-        {"return": value, "length": 50, "intervention_rate": 0.5, "infeasible": 1} for value in (-4.0, -8.0)
-    ]
-    write_rows(run / "evaluation" / "filter_on.csv", columns, rows)
+    row = {"return": -4.0, "length": 50, "intervention_rate": 0.5, "infeasible": 1}
+    write_rows(run / "evaluation" / "filter_on.csv", row, [row, {**row, "return": -8.0}])
     write_card(arm, 0, run)
     text = card.read_text()
     for line in (
@@ -205,10 +240,10 @@ def hub(tmp_path, monkeypatch):
 
     package = types.SimpleNamespace(push_to_hub=push_to_hub, load_from_hub=load_from_hub)
     monkeypatch.setitem(sys.modules, "huggingface_sb3", package)
-    return there
 
 
-def test_a_policy_goes_to_the_hub_and_comes_back(reacher, hub, capsys):
+@pytest.mark.usefixtures("hub")
+def test_a_policy_goes_to_the_hub_and_comes_back(reacher, capsys):
     write_card(load_policy(reacher).arm, 0, reacher)
     assert main(["push", str(reacher), "me/reacher"]) == 0
     names = "config.json, model.zip, vecnormalize.pkl, README.md"

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up import SILENT as JUDGES_NOTHING
-from made_up import episode, fill, steps, write_evaluation
-from running import SILENT, trained
+from running import JUDGES_NOTHING, SILENT, episode, fill, steps, trained, write_evaluation
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train import videos
@@ -85,15 +83,8 @@ def test_the_page_is_whole_alone_and_of_what_was_measured(finished, monkeypatch)
         "Cost in substeps / episode",
     ):
         assert expected in said, expected
-    parts = (
-        "Return per evaluation episode",
-        "In numbers",
-        "The same episode",
-        "While training",
-        "How it was made",
-    )
-    order = [said.index(part) for part in parts]
-    assert order == sorted(order)
+    parts = ("Return per evaluation", "In numbers", "The same episode", "While training", "How it was made")
+    assert re.search(".*".join(parts), said)
 
 
 def test_training_alone_with_one_seed_and_without_a_filter(fake_experiment):
@@ -105,6 +96,7 @@ def test_training_alone_with_one_seed_and_without_a_filter(fake_experiment):
     assert "There is no filter to compare with yet." in said and "[n/a]" in said and "over them" not in said
     assert "Violations are not judged: the task reports no cost." in said and "0 of" not in said
     assert "No recorded steps with a filter on." in said and "No videos." in said
+    assert "Training, all episodes" in said and "Evaluation, filter" not in said
 
 
 def test_constraints_places_and_what_was_left_out(fake_experiment):
@@ -127,18 +119,6 @@ def test_constraints_places_and_what_was_left_out(fake_experiment):
         "TMLR 2023: filtered adaption_penalty",
     ):
         assert expected in said, expected
-
-
-def test_a_task_without_a_cost_shows_none(fake_experiment):
-    experiment = fake_experiment()
-    fill(experiment, JUDGES_NOTHING | {"return": 20}, JUDGES_NOTHING | {"return": 10})
-    said = reported(experiment)
-    table = said.partition("In numbers")[2].partition("The same episode")[0]
-    assert (
-        table.count("not judged") == 1 + 2 * 6
-    )  # the note; cost and violations of two arms in three conditions
-    for left_out in ("cost per episode", "0 of 1,000"):
-        assert left_out not in said.partition("How to read this")[0], left_out
 
 
 HOSTILE = "\"'><script>alert(1)<b onload=x a='\n```&amp;|# "
@@ -195,39 +175,24 @@ def test_no_word_becomes_markup(fake_experiment, tmp_path):
 # The verdict. Training: 10 episodes of 100 steps for each of 2 seeds; evaluation 2 each: 2,400 steps a side -------
 
 
+HURT = {"violations": 5}
+LESS = {"violations": 1}
+UNJUDGED = JUDGES_NOTHING | {"unsafe": 3}
+
+
 @pytest.mark.parametrize(
     ("off", "on", "sentence"),
     [
-        (
-            {"violations": 5, "return": 20},
-            {"return": 10},
-            "With the filter none of 2,400 steps was in violation; without it 120 of 2,400 steps (5 %) were.",
-        ),
-        (
-            {"violations": 5},
-            {"violations": 1},
-            "lowered violations without removing them: 24 of 2,400 steps (1 %) with it, 120 of 2,400 steps (5 %)",
-        ),
-        (
-            {"violations": 1},
-            {"violations": 1},
-            "The filter did not lower violations: 24 of 2,400 steps (1 %) with",
-        ),
-        ({"return": 10}, {"return": 12}, "none without it: the task did not put it to the test."),
-        (
-            {"violations": 1},
-            {"intervention_rate": 0.25, "infeasible": 2, "fallback": 3},
-            "The filter changed 25 % of the evaluation steps. Of 2,400 steps with it 48 steps were infeasible and"
-            " 72 ran the fallback.",
-        ),
-        ({"violations": 1}, {"intervention_rate": 1e-5}, "changed less than 0.01 % of the evaluation steps."),
-        (
-            JUDGES_NOTHING,
-            JUDGES_NOTHING | {"unsafe": 3},
-            "72 of 2,400 steps with it began outside the safe set.",
-        ),
+        (HURT, {}, "With the filter none of 2,400 steps was in violation; without it 120 of 2,400 steps (5 %) were."),
+        (HURT, LESS, "lowered violations without removing them: 24 of 2,400 steps (1 %) with it, 120 of 2,400 steps"),
+        (LESS, LESS, "The filter did not lower violations: 24 of 2,400 steps (1 %) with"),
+        ({}, {}, "none without it: the task did not put it to the test."),
+        (LESS, {"intervention_rate": 0.25}, "The filter changed 25 % of the evaluation steps."),
+        (LESS, {"intervention_rate": 1e-5}, "changed less than 0.01 % of the evaluation steps."),
+        (LESS, {"infeasible": 2, "fallback": 3}, "with it 48 steps were infeasible and 72 ran the fallback."),
+        (JUDGES_NOTHING, UNJUDGED, "72 of 2,400 steps with it began outside the safe set."),
     ],
-)
+)  # fmt: skip
 def test_the_verdict_says_what_the_numbers_say(fake_experiment, off, on, sentence):
     experiment = fake_experiment()
     fill(experiment, off, on)
@@ -263,10 +228,8 @@ def test_the_verdict_names_what_either_policy_returns_and_how_surely(fake_experi
     assert f"none of {100 * n} steps was in violation; without it {5 * n} of {100 * n} steps (5 %)" in safety
     means = [float(each) for each in re.findall(r"filter (?:off|on) (-?[\d.]+) \[", returns)]
     assert means == pytest.approx([21.1, 12.7, 9.4, 5.03], abs=0.06)
-    assert (
-        f"filter off 9.4 [{'n/a' if n < 2 else ''}" in returns
-        and f"with {3 * n} of {100 * n} steps" in returns
-    )
+    assert f"filter off 9.4 [{'n/a' if n < 2 else ''}" in returns
+    assert f"with {3 * n} of {100 * n} steps" in returns
     assert f"trained without it returned more ({surely})." in choice
     assert n > 2 or not re.search("lie apart|overlap|95 %", choice)
 
@@ -283,10 +246,8 @@ def test_where_policies_are_the_same_their_evaluation_alone_is_compared(fake_exp
     experiment = fake_experiment(f"arms={arms}", "evaluation.filter={factory: 'fake_task:shield'}")
     fill(experiment, {"violations": 5}, {})
     said = " ".join(verdict(experiment, summarize(experiment)))
-    assert (
-        f"none of {compared} steps was in violation; without it {compared // 20} of {compared} steps (5 %)"
-        in said
-    )
+    of = f"of {compared} steps"
+    assert f"none {of} was in violation; without it {compared // 20} {of} (5 %)" in said
 
 
 # Pictures: their sentences against planted numbers, and what they are drawn from -----------------------------------

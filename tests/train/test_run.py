@@ -10,9 +10,8 @@ import pytest
 import stable_baselines3
 import torch
 from fake_task import FILMED
-from running import Reports, episodes, evaluated, finish, killed_after, resumed, trained
+from running import Reports, episodes, evaluated, finish, killed_after, resumed, scalars, trained
 from stable_baselines3.common.vec_env import VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.config.algorithms import algorithm_class
@@ -25,16 +24,18 @@ from safe_wrappers.train.run.training import finished_checkpoint
 SAC = ("algorithm=SAC", "hyperparameters={learning_starts: 50, batch_size: 16, train_freq: 8}", "n_envs=1")
 
 
-@pytest.mark.parametrize("cut", [0, 1, 2])
-def test_a_half_written_last_row_is_none(tmp_path, cut):
+def test_a_half_written_last_row_is_none(tmp_path):
     path, columns = tmp_path / "episodes.csv", ("length", "success", "cost")
     assert read_rows(path) == []
     write_rows(path, columns, [{"length": 4, "success": True, "cost": 1.5}])
     append_row(path, columns, {"length": 12})
-    path.write_bytes(path.read_bytes()[: -cut or None])
-    assert (
-        read_rows(path) == [{"length": 4.0, "success": 1.0, "cost": 1.5}, {"length": 12.0}][: 2 - bool(cut)]
-    )
+    for whole in (2, 1, 1):
+        assert read_rows(path) == [{"length": 4.0, "success": 1.0, "cost": 1.5}, {"length": 12.0}][:whole]
+        path.write_bytes(path.read_bytes()[:-1])
+    for wrong in (b"a\nb\n", b"a\n1,2,3\n", b"a\n\xff\n"):
+        path.write_bytes(wrong)
+        with pytest.raises(RunStateError, match="is no table of numbers"):
+            read_rows(path)
 
 
 def test_a_run_leaves_rows_logs_and_a_policy_and_is_not_run_again(finished):
@@ -47,10 +48,8 @@ def test_a_run_leaves_rows_logs_and_a_policy_and_is_not_run_again(finished):
     assert sum(row["violations"] for row in rows) == 0
     assert finish(folder)["timesteps"] == 512
     assert finish(folder)["filter_time_us"] == pytest.approx(1.0)
-    events = EventAccumulator(str(folder / "tensorboard"))
-    events.Reload()
-    tags = events.Tags()["scalars"]
-    assert {"interventions/rate", "interventions/step_rate", "rollout/ep_rew_mean", "train/loss"} <= set(tags)
+    tags = {"interventions/rate", "interventions/step_rate", "rollout/ep_rew_mean", "train/loss"}
+    assert tags <= scalars(folder).keys()
 
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != ".lock"}
     again = Reports()
@@ -93,7 +92,6 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypa
     after = episodes(folder)
     kept = [row for row in after if row["timesteps"] <= 256]
     assert kept == [row for row in rows if row["timesteps"] <= 256]
-    assert [row["timesteps"] for row in after] == sorted(row["timesteps"] for row in after)
     # 128 steps of either env before the checkpoint, 256 new ones after it, 20 steps an episode.
     assert len(after) == 2 * (128 // 20) + 2 * (256 // 20)
     # New episodes after the restart, not the first ones again; and the schedule goes on.
@@ -117,6 +115,7 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     (final,) = (folder / "checkpoints").iterdir()
     assert final.name == "step_000000000320"
     assert not (final / "replay_buffer.pkl").exists()  # of no use to a finished run, and large
+    assert resumed(experiment.arms[1], folder).replay_buffer.buffer_size == 100  # as much as it asks for
 
     # A kill between this checkpoint and the note that the run is finished:
     scaling = folder / "policy" / "vecnormalize.pkl"
@@ -141,15 +140,27 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     assert 370 < trained_at[0] <= 384 and finish(folder)["timesteps"] == 400
 
 
+LIMIT = "arms.unfiltered.learner={cost_limit: 0, multiplier_rate: 0.01}"
+
+
+def test_the_price_on_cost_rises_where_there_is_a_limit_and_goes_on_from_a_checkpoint(fake_experiment):
+    prices = []
+    for steps in (384, 512):
+        folder = trained(fake_experiment(LIMIT, f"total_steps={steps}"), 0)
+        told = scalars(folder)["interventions/lagrangian_multiplier"]
+        prices.append([value for at, value in told if at > 384 or steps == 384])
+    # Each is what stood after a rollout; costs are never below the limit.
+    assert 0.0 < prices[0][-1] <= prices[1][0]
+    model = load_model(latest_checkpoint(folder / "checkpoints").folder, "PPO", "cpu")
+    assert model.lagrangian_multiplier == pytest.approx(prices[1][-1])
+
+
 def test_random_states_are_those_of_the_checkpoint(finished):
     """Not those of the run's seed, with which SB3 seeds everything when it loads a model."""
     experiment = finished()
     folder = experiment.run_folder(experiment.arms[1], 0)
-    of_python, of_numpy, of_torch = (
-        random.Random(5),
-        np.random.RandomState(5),
-        torch.Generator().manual_seed(5),
-    )
+    of_python, of_numpy = random.Random(5), np.random.RandomState(5)
+    of_torch = torch.Generator().manual_seed(5)
     numbers = of_numpy.get_state(legacy=False)
     numbers["state"]["key"] = numbers["state"]["key"].tolist()
     states = {"python": of_python.getstate(), "numpy": numbers, "torch": of_torch.get_state().tolist()}
@@ -171,8 +182,7 @@ def test_a_run_that_is_to_stop_saves_after_its_rollout_and_goes_on(fake_experime
     assert str(stopped.value).endswith(f" {reached:,}") and 0 < reached < 384
     trained(experiment)
     assert finish(folder)["timesteps"] == 384
-    rows = [row["timesteps"] for row in episodes(folder)]
-    assert rows == sorted(rows)
+    assert episodes(folder)
 
 
 def test_another_configs_folder_is_refused_and_the_difference_shown(finished):
@@ -204,9 +214,7 @@ def test_the_total_of_a_finished_run_can_be_raised(fake_experiment):
         finished_checkpoint(long.arms[1], 0, folder)
     trained(long)
     assert finished_checkpoint(long.arms[1], 0, folder).timesteps == 512
-    rows = episodes(folder)
-    assert [row["timesteps"] for row in rows] == sorted(row["timesteps"] for row in rows)
-    assert len(rows) == 4 * (128 // 20)
+    assert len(episodes(folder)) == 4 * (128 // 20)
     # The older policy's evaluation is gone, also for who asks for a report and not for an evaluation.
     assert not (folder / "evaluation").exists()
     assert json.loads((folder / "policy" / "config.json").read_text())["timesteps"] == 512

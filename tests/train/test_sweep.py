@@ -15,43 +15,25 @@ from safe_wrappers.train.config import read_config
 from safe_wrappers.train.processes import Interrupted
 from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.run import Progress
-from safe_wrappers.train.sweep import Space, sweep_experiment
+from safe_wrappers.train.sweep import Space
 
 optuna = pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")
 
 FAKE = Path(__file__).parent / "fake.yaml"
 RATE, MARGIN = "hyperparameters.learning_rate", "arms.filtered.filter.kwargs.margin"
 PARAMETERS = {RATE: {"low": 1e-5, "high": 1e-2, "log": True}, MARGIN: {"choices": [0.0, 0.1, 0.2]}}
-QUIET = Console(quiet=True)
 
 
-def settings(folder, **sweep):
+def settings(folder, **given):
     overrides = [f"output={folder}", "total_steps=128", "seeds=[0]", "evaluation.episodes=1"]
-    return {**read_config(FAKE, overrides), "sweep": {"parameters": PARAMETERS, **sweep}}
+    return {**read_config(FAKE, overrides), "sweep": {"parameters": PARAMETERS, **given}}
 
 
-@pytest.fixture
-def in_process(monkeypatch):
-    """Trials run here, one after the other; at which of their calls a signal comes is told."""
-    made, stops = [], set()
-
-    def note(call):
-        def noted(*given):
-            made.append(call.__name__)
-            if len(made) in stops:
-                raise Interrupted(2)
-            call(*given)
-
-        return noted
-
-    def run(jobs, *_, **__):
-        for job in jobs:
-            job.call(*job.arguments, Progress(lambda _: None, lambda _: None))
-
-    monkeypatch.setattr(sweep, "run_jobs", run)
-    for name in ("train_run", "evaluate_run"):
-        monkeypatch.setattr(sweep, name, note(getattr(sweep, name)))
-    return SimpleNamespace(made=made, stops=stops)
+def searched(folder, changed=(), console=None, **given):
+    """Searches, with other settings beside those of the sweep; returns the rows of its table by trial."""
+    whole = {**settings(folder, **given), **dict(changed)}
+    sweep.sweep_experiment(whole, FAKE, (), console or Console(quiet=True))
+    return rows(folder)
 
 
 def rows(folder):
@@ -59,13 +41,39 @@ def rows(folder):
         return sorted(csv.DictReader(file), key=lambda row: int(row["trial"]))
 
 
+@pytest.fixture
+def in_process(monkeypatch):
+    """Trials run here, one after the other; at which of their calls a signal comes, and which fail, is told."""
+    told = SimpleNamespace(made=[], stops=set(), fails=set())
+
+    def note(call):
+        def noted(*given):
+            told.made.append(call.__name__)
+            if len(told.made) in told.stops:
+                raise Interrupted(2)
+            call(*given)
+
+        return noted
+
+    def run(jobs, *_, **__):
+        failed = [job.name for job in jobs if job.name in told.fails]
+        for job in jobs:
+            if job.name not in failed:
+                job.call(*job.arguments, Progress(lambda _: None, lambda _: None))
+        if failed:
+            raise RunsFailedError("too hot", failed)
+
+    monkeypatch.setattr(sweep, "run_jobs", run)
+    for name in ("train_run", "evaluate_run"):
+        monkeypatch.setattr(sweep, name, note(getattr(sweep, name)))
+    return told
+
+
 def test_the_command_searches_and_its_trials_are_ordinary_experiments(tmp_path, capsys):
     config = tmp_path / "searched.yaml"
-    given = settings(tmp_path, trials=2, at_once=2)
-    config.write_text(yaml.safe_dump(given, sort_keys=False))
+    config.write_text(yaml.safe_dump(settings(tmp_path, trials=2, at_once=2), sort_keys=False))
     assert main(["sweep", str(config), "workers=2"]) == 0
-    told = capsys.readouterr().out
-    found = rows(tmp_path)
+    told, found = capsys.readouterr().out, rows(tmp_path)
     assert [row["trial"] for row in found] == ["0", "1"]
     assert {row["state"] for row in found} == {"at cost zero"}
     best = max(found, key=lambda row: float(row["return"]))
@@ -74,90 +82,61 @@ def test_the_command_searches_and_its_trials_are_ordinary_experiments(tmp_path, 
     trial = tmp_path / "fake" / "sweep" / "trial_0001"
     assert main(["report", str(trial / "config.yaml")]) == 0
     assert (trial / "report.html").exists()
-    assert yaml.safe_load((trial / "config.yaml").read_text())["hyperparameters"]["learning_rate"] == float(
-        found[1][RATE]
-    )
+    tried = yaml.safe_load((trial / "config.yaml").read_text())["hyperparameters"]["learning_rate"]
+    assert tried == float(found[1][RATE])
     assert main(["sweep", str(config)]) == 0  # all is done
     assert rows(tmp_path) == found
 
 
 @pytest.mark.parametrize("stop", [4, 6])
 def test_a_sweep_that_was_stopped_tries_the_same_as_one_that_was_not(tmp_path, in_process, stop):
-    whole, cut = settings(tmp_path / "a", trials=4, at_once=2), settings(tmp_path / "b", trials=4, at_once=2)
-    sweep_experiment(whole, FAKE, (), QUIET)
-    assert len(in_process.made) == 2 * 4
-    expected = rows(tmp_path / "a")
-    assert len({row[RATE] for row in expected}) == 4
+    four = {"trials": 4, "at_once": 2}
+    expected = searched(tmp_path / "a", **four)
+    assert len(in_process.made) == 2 * 4 and len({row[RATE] for row in expected}) == 4
     in_process.made.clear()
     in_process.stops.add(stop)
     with pytest.raises(Interrupted):
-        sweep_experiment(cut, FAKE, (), QUIET)
-    sweep_experiment(cut, FAKE, (), QUIET)
-    assert rows(tmp_path / "b") == expected
+        searched(tmp_path / "b", **four)
+    assert searched(tmp_path / "b", **four) == expected
 
 
 def test_a_study_of_other_settings_is_refused_but_for_more_trials(tmp_path, in_process):
-    sweep_experiment(settings(tmp_path, trials=1), FAKE, (), QUIET)
+    searched(tmp_path, trials=1)
     with pytest.raises(RunStateError, match="another sweep"):
-        sweep_experiment(settings(tmp_path, trials=2, seed=1), FAKE, (), QUIET)
-    sweep_experiment(settings(tmp_path, trials=2), FAKE, (), QUIET)
-    assert len(rows(tmp_path)) == 2
+        searched(tmp_path, trials=2, seed=1)
+    assert len(searched(tmp_path, trials=2)) == 2
 
 
-def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_process, monkeypatch, capsys):
-    run = sweep.run_jobs
-
-    def failing(jobs, *_, **__):
-        run([job for job in jobs if job.name != "trial_0000"])
-        failed = [job.name for job in jobs if job.name == "trial_0000"]
-        if failed:
-            raise RunsFailedError("too hot", failed)
-
-    monkeypatch.setattr(sweep, "run_jobs", failing)
-    sweep_experiment(settings(tmp_path, trials=2, at_once=2), FAKE, (), QUIET)
-    assert [row["state"] for row in rows(tmp_path)] == ["fail", "at cost zero"]
-    assert rows(tmp_path)[0]["return"] == ""
+def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_process, capsys):
+    in_process.fails.add("trial_0000")
+    found = searched(tmp_path, trials=2, at_once=2)
+    assert [row["state"] for row in found] == ["fail", "at cost zero"]
+    assert found[0]["return"] == ""
     # So is one whose values the task refuses.
-    given = settings(tmp_path / "other", trials=1)
-    given["env"] = {"id": "fake_task:FakeGoal-v0"}
-    given["sweep"]["parameters"] = {"env.kwargs.colour": {"choices": ["red", "blue"]}}
-    sweep_experiment(given, FAKE, (), Console())
-    assert [row["state"] for row in rows(tmp_path / "other")] == ["fail"]
+    coloured = {"env": {"id": "fake_task:FakeGoal-v0"}}
+    colours = {"env.kwargs.colour": {"choices": ["red", "blue"]}}
+    (row,) = searched(tmp_path / "b", coloured, Console(), trials=1, parameters=colours)
     told = capsys.readouterr().out
-    assert "trial_0000: " in told and "colour" in told and "none is recommended" in told
+    assert row["state"] == "fail" and "trial_0000: " in told and "colour" in told
+    assert "none is recommended" in told
 
 
-def test_a_task_that_reports_no_cost_is_refused(tmp_path):
-    given = settings(tmp_path)
-    given["env"] = "fake_task:SilentGoal-v0"
+def test_a_task_that_reports_no_cost_is_refused(tmp_path, in_process):
     with pytest.raises(ConfigurationError, match=r"the task reports no cost.*env\.judge"):
-        sweep_experiment(given, FAKE, (), QUIET)
-
-
-def told(outcomes):
-    """A study in memory: (return, violations) per trial; no violations: pruned."""
-    made = optuna.create_study(direction="maximize")
-    for value, violations in outcomes:
-        trial = made.ask()
-        if violations is None:
-            made.tell(trial, state=optuna.trial.TrialState.PRUNED)
-        else:
-            trial.set_constraint(sweep.VIOLATIONS, violations)
-            made.tell(trial, value)
-    return made
+        searched(tmp_path, {"env": "fake_task:SilentGoal-v0"})
 
 
 def test_a_violation_ranks_below_every_return_at_cost_zero():
-    made = told([(9.0, 2.0), (1.0, 0.0), (99.0, None), (3.0, 0.0), (8.0, 0.5), (2.0, 0.0)])
-    assert [trial.number for trial in sweep.ranked(made)] == [3, 5, 1, 4, 0, 2]
-    assert made.best_trial.number == 3  # Optuna's own opinion
-
-
-# What may be searched -----------------------------------------------------------------------------
-
-
-def space(parameters, *overrides, **given):
-    return Space({**read_config(FAKE, overrides), "sweep": {"parameters": parameters, **given}})
+    study = optuna.create_study(direction="maximize")
+    for value, violations in ((9.0, 2.0), (1.0, 0.0), (99.0, None), (3.0, 0.0), (8.0, 0.5), (2.0, 0.0)):
+        trial = study.ask()
+        if violations is None:
+            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+        else:
+            trial.set_constraint(sweep.VIOLATIONS, violations)
+            study.tell(trial, value)
+    assert [trial.number for trial in sweep.ranked(study)] == [3, 5, 1, 4, 0, 2]
+    assert study.best_trial.number == 3  # Optuna's own opinion
 
 
 @pytest.mark.parametrize(
@@ -170,20 +149,17 @@ def space(parameters, *overrides, **given):
         ({MARGIN: {"low": 0, "high": 4, "step": "x"}}, r"expected .*low"),
         ({"total_steps": {"low": 100, "high": 500}}, r"compared at the same steps"),
         ({"n_envs": {"low": 0, "high": 5}}, r"n_envs: .*greater than or equal to 1"),
-        (
-            {"arms.filtered.filter": {"choices": ["none", {"factory": "fake_task:shield"}]}},
-            r"there is no filter",
-        ),
+        ({"arms.filtered.filter": {"choices": ["none", {"factory": "fake_task:shield"}]}}, r"there is no filter"),
     ],
-)
-def test_parameters_that_do_not_exist_or_are_refused(parameters, said):
+)  # fmt: skip
+def test_parameters_that_do_not_exist_or_are_refused(tmp_path, parameters, said):
     with pytest.raises(ConfigurationError, match=said):
-        space(parameters)
+        Space(settings(tmp_path, parameters=parameters))
 
 
 def test_a_trial_is_the_ranked_arm(tmp_path):
-    searched = space({MARGIN: {"low": 0.0, "high": 0.2}}, f"output={tmp_path}")
-    written, trial = searched.trial("trial_0003", {MARGIN: 0.125})
+    space = Space(settings(tmp_path, parameters={MARGIN: {"low": 0.0, "high": 0.2}}))
+    written, trial = space.trial("trial_0003", {MARGIN: 0.125})
     assert [arm.name for arm in trial.arms] == ["filtered"]
     assert trial.arms[0].filter.kwargs == {"margin": 0.125}
     assert trial.folder == tmp_path / "fake" / "sweep" / "trial_0003"

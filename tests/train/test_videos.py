@@ -3,6 +3,7 @@
 import io
 import os
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import gymnasium as gym
 import mujoco
@@ -56,16 +57,24 @@ def said(experiment):
     return console.file.getvalue()
 
 
-def test_every_arm_is_filmed_in_the_same_episode_once_and_again_for_another(finished, inline, monkeypatch):
+def taken(names):
+    """The films that were made since it was last asked."""
+    made = sorted(names)
+    names.clear()
+    return made
+
+
+EVERY = [f"video {arm} filter {state}" for arm in ("filtered", "unfiltered") for state in ("off", "on")]
+
+
+def test_every_arm_is_filmed_in_the_very_episode_that_was_evaluated(finished, inline, monkeypatch):
     def fake_filter(env):
         return next((inner for inner in wrappers_of(env) if type(inner).__name__ == "FakeFilter"), None)
 
     monkeypatch.setattr(videos, "filter_inside", fake_filter)
     experiment = finished()
-    assert said(experiment) == ""
-    names = [f"video {arm} filter {state}" for arm in ("filtered", "unfiltered") for state in ("off", "on")]
-    assert sorted(inline) == names
-    seed, changed = shown_episode(experiment).episode_seed, 0
+    assert said(experiment) == "" and taken(inline) == EVERY
+    seed, total = shown_episode(experiment).episode_seed, 0
     for arm in experiment.arms:
         folder, lower = experiment.run_folder(arm, 0), []
         for condition in ("filter_off", "filter_on"):
@@ -73,12 +82,11 @@ def test_every_arm_is_filmed_in_the_same_episode_once_and_again_for_another(fini
             rows = read_rows(evaluation_folder(folder) / f"{condition}.csv")
             log = evaluated_steps(folder, condition)
             (row,) = [row for row in rows if row["episode_seed"] == seed]
-            # The film is of the very episode that was evaluated.
             count = round(row.get("intervention_rate", 0) * row["length"])
             of_steps = f"of {row['length']:.0f} steps {row['violations']:.0f} in violation, {count} changed."
             assert told.startswith(f"Episode {seed}, return {row['return']:.1f}: {of_steps}")
             assert told.endswith("Shown 0.5 times as fast as real.")  # 20 steps at 10 a second: 2 s in 4
-            changed += count
+            total += count
             frames, _ = frames_of(animation)
             dot = np.argwhere(frames[0][:HEIGHT, :, 0] - frames[0][:HEIGHT, :, 1] > 100).mean(axis=0)[::-1]
             # Where this episode starts, to half a pixel of the task's.
@@ -88,28 +96,31 @@ def test_every_arm_is_filmed_in_the_same_episode_once_and_again_for_another(fini
             lower.append(frames[19][348:356, 225:260].mean())
         # What a filter did is drawn into its film, and into no other.
         assert lower == pytest.approx([5 * 19, 43], abs=8)
-    assert changed > 0
+    assert total > 0
 
-    inline.clear()
-    said(experiment)
-    assert inline == []
+
+def test_films_are_made_once_and_again_for_another_episode(finished, inline, monkeypatch):
+    experiment = finished()
+    for expected in (EVERY, []):
+        said(experiment)
+        assert taken(inline) == expected
     video_path(experiment, experiment.arms[0], "filter_on").unlink()
     said(experiment)
-    assert inline == ["video unfiltered filter on"]
-    inline.clear()
-    other = finished("evaluation.seed=500", "seeds=[0]")
-    for arm in (0, 1):
-        evaluated(other, arm)
-    said(other)
-    assert sorted(inline) == names
+    assert taken(inline) == ["video unfiltered filter on"]
+
+    def evaluate(again):
+        for arm in (0, 1):
+            evaluated(again, arm)
+        return again
+
+    said(evaluate(finished("evaluation.seed=500", "seeds=[0]")))
+    assert taken(inline) == EVERY
 
     def crash(jobs, workers, console, title):  # which does not fail the evaluation
         raise RunsFailedError("Videos: 1 of 4 failed.\nvideo: its process was killed")
 
     monkeypatch.setattr(videos, "run_jobs", crash)
-    for arm in (0, 1):
-        evaluated(experiment, arm)
-    assert said(experiment).startswith("No videos: filming failed: video: its process was killed")
+    assert said(evaluate(experiment)).startswith("No videos: filming failed: video: its process was killed")
     # Films of another episode are gone even where none can be made.
     assert load_video(video_path(experiment, experiment.arms[0], "filter_off")) is None
 
@@ -121,7 +132,7 @@ def test_where_nothing_can_be_drawn_one_line_says_so_and_nothing_is_tried(finish
     assert said(experiment) == "No videos: MUJOCO_GL=disabled has MuJoCo draw nothing.\n"
     monkeypatch.setattr(videos, "make_env", lambda *_: gym.make("fake_task:FakeGoal-v0"))
     assert "draws no frames (it has no render mode rgb_array)" in said(experiment)
-    assert inline == []
+    assert said(finished("evaluation.films=false")) == "" and taken(inline) == []
 
 
 @pytest.mark.slow
@@ -164,19 +175,10 @@ class Shot(gym.Env):
         return 0, 0.0, False, self.at >= self.steps, info
 
 
-class Still:
-    """A policy."""
-
-    def reset(self):
-        pass
-
-    def __call__(self, observation):
-        return 0
-
-
 def played(env):
     """Frames and durations of the env's film, and what is said of it."""
-    data, told = film_episode(Still(), env, 0)
+    still = Mock(return_value=0)  # a policy
+    data, told = film_episode(still, env, 0)
     return *frames_of(data), told
 
 

@@ -93,7 +93,7 @@ class HeadingDriveClearance(Detour, Model):
         return Trajectory(control, self._now.motion[None])
 
     def h_along(self, path: Trajectory) -> Array:
-        """The least clearance until rest, and the one at its end, m, shape (2, k); k is 0 where no disc is near."""
+        """The least clearance until rest, and that at its end, m, shape (2, k): of each model, and each disc near."""
         now = self._now
         if path.control is None:
             return now.clearances
@@ -161,7 +161,8 @@ class HeadingDriveClearance(Detour, Model):
 
     def _side_of_the_nearest(self, drive: float, turn: float) -> float:
         """Where to pass the disc ahead that a control comes nearest: 1 on the left, -1 on the right; 0: none is."""
-        left, (x, y, heading) = self._left(drive, turn)[0], self._now.motion[:3].tolist()
+        left = self._left(drive, turn)[0].reshape(len(self.models), -1).min(axis=0)
+        x, y, heading = self._now.motion[:3].tolist()
         ahead = np.copysign(1.0, drive) * np.array([np.cos(heading), np.sin(heading)])
         to = self._now.discs[:, :2] - [x, y]
         is_ahead = to @ ahead > 0.0

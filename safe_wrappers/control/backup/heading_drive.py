@@ -173,14 +173,14 @@ def _turning_gap(body: HeadingDrive, motion: Motion, disc: Array) -> float:
 
 @compiled
 def clearances(models: Array, start: Array, drive: float, turn: float, discs: Array, to_rest: bool) -> Array:
-    """What a held control, and braking after it until rest, leaves of the distance to discs, m, shape (2, n).
+    """What a held control, and braking after it until rest, leaves of the distance to discs, m, shape (2, c n).
 
     The first row is the least at any physics step, the present one included; the second what is left at the end. A
     trajectory is followed as long as it can come closer to a disc than it was.
 
     Args:
-        models: Constants of bodies, shape (c, 12): of the one by which it brakes, and of others that it may be. What
-            is counted is the least of all.
+        models: Constants of bodies, shape (c, 12): of the one by which it brakes, and of others that it may be. The
+            discs of the first come first.
         start: As `Motion`, shape (6,).
         drive: Held for one control step.
         turn: Likewise.
@@ -188,15 +188,14 @@ def clearances(models: Array, start: Array, drive: float, turn: float, discs: Ar
         to_rest: Whether all trajectories are followed until rest.
     """
     n = len(discs)
-    left, gaps, brakes = np.full((2, n), math.inf), np.empty(n), _body(models[0])
+    every, gaps, brakes = np.full((2, len(models) * n), math.inf), np.empty(n), _body(models[0])
     places = np.empty((brakes.substeps, 2))
-    for model in models:
+    for which, model in enumerate(models):
+        left = every[:, which * n : which * n + n]
         body, motion, far = _body(model), _motion(start), math.inf
         ahead, around, swivel = drive, turn, 2.0 * abs(body.com_offset)
         for i in range(n):
-            gaps[i] = _gap(discs[i], motion.x, motion.y)
-            if not gaps[i] >= left[0, i]:  # what is not a number stays
-                left[0, i] = gaps[i]
+            left[0, i] = gaps[i] = _gap(discs[i], motion.x, motion.y)
         holds = int(_LONGEST * body.mass / (body.damping * body.timestep * body.substeps)) + 1
         for _ in range(holds):
             motion = advance(body, motion, ahead, around, places)
@@ -206,19 +205,17 @@ def clearances(models: Array, start: Array, drive: float, turn: float, discs: Ar
                     continue
                 for k in range(body.substeps):
                     gaps[i] = _gap(discs[i], places[k, 0], places[k, 1])
-                    if not gaps[i] >= left[0, i]:
+                    if not gaps[i] >= left[0, i]:  # what is not a number stays
                         left[0, i] = gaps[i]
                 nears = nears or gaps[i] - far - swivel < left[0, i]
             if far < REST_M or not nears:
                 break
             ahead, around = brake_control(brakes, motion), 0.0
         for i in range(n):
-            end = _turning_gap(body, motion, discs[i])
-            if not end >= left[1, i]:
-                left[1, i] = end
+            left[1, i] = end = _turning_gap(body, motion, discs[i])
             if not end - far >= left[0, i]:
                 left[0, i] = end - far
-    return left
+    return every
 
 
 class Sight(NamedTuple):
@@ -228,7 +225,7 @@ class Sight(NamedTuple):
         motion: As `Motion`, shape (6,).
         brake: The drive control that brakes.
         discs: Those that one control step and braking after it can come near, or the nearest: shape (k, 3).
-        clearances: What braking leaves of them, shape (2, k).
+        clearances: What braking leaves of them, shape (2, c k).
         loss: The most that another control can leave less, m.
     """
 

@@ -12,7 +12,7 @@ from safe_wrappers.plants.mujoco.model import AT_A_JOINT, HINGE, inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _ROUND = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("SPHERE", "CYLINDER", "CAPSULE")]
-_AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
+_FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
 _FLAT = 1e-6  # level part of an axle's direction below which it has none
 
 
@@ -24,12 +24,12 @@ class DrivenWheels:
 
     Attributes:
         wheel: Radius, inertia about the axle and damping in the plant's model.
-        feedback: Of the speed servos on each wheel, shape (n,), N m s/rad.
+        effect: Torque per control inside the actuators' clamps, shape (n, nu), N m.
 
     Raises:
         ConfigurationError: No names, a name twice, or no hinge with a round geom and actuators of its own.
         UnknownNameError: No joint of that name.
-        UnsupportedEnvError: A speed servo that settles sooner than the wheel's answer to a torque can be seen.
+        UnsupportedEnvError: A wheel that a servo drives.
     """
 
     def __init__(self, plant: MujocoPlant, names: Sequence[str]) -> None:
@@ -62,22 +62,13 @@ class DrivenWheels:
         self._force = np.zeros(6)
         about_axle = np.diag(inertia(m, data))[self.dofs]
         self.wheel = Wheel(m.geom_size[self._geoms, 0], about_axle, m.dof_damping[self.dofs])
-        # The torque of a servo that a forcerange may clamp counts as constant, not as feedback.
-        servos, clamped = m.actuator_biastype == _AFFINE_BIAS, m.actuator_forcelimited.astype(bool)
-        gear, damping = m.actuator_gear[:, 0], -m.actuator_biasprm[:, 2]
-        self._opposing = self._drives * np.where(servos & ~clamped, gear * damping, 0.0)
-        self.feedback = np.asarray((self._opposing * gear).sum(axis=1))
-        # The answer is seen within a physics step; that to a torque that counts as constant within a control step.
-        # Measured, with twice that: 40 to 99 % of harmless commands are changed.
-        span_s = np.where(clamped, plant.substeps, 1) * m.opt.timestep
-        share = self._drives * np.where(servos, gear**2 * damping * span_s, 0.0) / about_axle[:, None]
-        for wheel, i in np.argwhere(share > 1.0):
-            longest = "a control step (its torque is clamped)" if clamped[i] else "a physics step"
+        motors = (m.actuator_gaintype == _FIXED_GAIN) & (m.actuator_biastype == _NO_BIAS)
+        for wheel, i in np.argwhere(self._drives & ~motors).tolist():
             raise UnsupportedEnvError(
-                f"the speed servo {m.actuator(int(i)).name or self.names[wheel]!r} is too stiff for a slip "
-                f"limit: it settles within {longest}, so that its torque says nothing of the ground. Use a "
-                f"motor, or a kv of at most {0.99 * damping[i] / share[wheel, i]:.3g}"
+                f"the actuator {m.actuator(i).name or self.names[wheel]!r} is a servo, whose torque follows the "
+                "wheel and hides what the ground does: drive the wheel by a motor"
             )
+        self.effect = np.asarray(self._drives * (m.actuator_gear[:, 0] * m.actuator_gainprm[:, 0]))
 
     def motion(self) -> tuple[Array, Array, Array]:
         """Of each wheel, shapes (n,): its rate about its axle, rad/s, positive ahead; its centre's speed, m/s.
@@ -106,19 +97,8 @@ class DrivenWheels:
         return loads
 
     def torque(self, data: mujoco.MjData) -> Array:
-        """Torque of the drives without `feedback`, shape (n,), N m, in an env's last physics substep."""
-        return np.asarray(data.qfrc_actuator[self.dofs] + self._opposing @ data.actuator_velocity)
-
-    def drive(self) -> tuple[Array, Array]:
-        """`torque = bias + effect @ u - feedback * rate` inside the actuators' clamps: (n,) in N m and (n, nu)."""
-        plant, m, driven = self._plant, self._plant.model, self._drives
-        gear = m.actuator_gear[:, 0]
-        joint = np.where(driven.any(axis=0), m.actuator_trnid[:, 0], 0)
-        length = gear * plant.qpos[m.jnt_qposadr[joint]]
-        velocity = gear * plant.qvel[m.jnt_dofadr[joint]]
-        gain, bias = plant.actuators.gain_and_bias(length, velocity)
-        at_rest = (driven * (gear * bias)).sum(axis=1) + self._opposing @ velocity
-        return np.asarray(at_rest), np.asarray(driven * (gear * gain))
+        """Torque of the drives, shape (n,), N m, in an env's last physics substep."""
+        return np.asarray(data.qfrc_actuator[self.dofs])
 
 
 def _round_geom(plant: MujocoPlant, joint: int) -> int:

@@ -1,13 +1,13 @@
-"""Hold lag and phase budget against python-control's margins, exact sampled loops and their stability limits."""
+"""Bandwidth: hold lag and margins by python-control and known stability limits, modes by SciPy's eigenvalues."""
 
 import control as ct
 import numpy as np
 import pytest
+import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.bandwidth import ControlLoop
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.control.bandwidth import ControlLoop, modes
 
 
 def phase_lag(crossover, hold, delay=0.0):
@@ -20,11 +20,8 @@ def test_a_hold_lags_by_half_its_interval(crossover, share_of_the_sampling_rate)
     hold = share_of_the_sampling_rate * 2 * np.pi / crossover
     hold_response = (1 - np.exp(-1j * crossover * hold)) / (1j * crossover * hold)
     assert phase_lag(crossover, hold) == pytest.approx(-np.angle(hold_response), rel=1e-9)
-
-
-def test_the_printed_number():
-    crossover, rate = 7.0, 50.0
-    assert np.degrees(phase_lag(crossover, 1 / rate)) == pytest.approx(28.65 * crossover / rate, rel=1e-4)
+    # The printed number.
+    assert np.degrees(phase_lag(crossover, hold)) == pytest.approx(28.65 * crossover * hold, rel=1e-4)
 
 
 S = ct.tf("s")
@@ -53,7 +50,7 @@ def test_the_margin_that_is_left_is_the_sampled_loop_s(name, late_by):
     assert np.radians(margin) - predicted > 0.06 * (1 + 2 * late_by)  # what the two agree on is not small
 
 
-@pytest.mark.parametrize(("late_by", "off"), [(0, 0.6), (1, 0.06), (3, 0.01), (10, 0.001)])
+@pytest.mark.parametrize(("late_by", "off"), [(1, 0.06), (3, 0.01), (10, 0.001)])
 def test_the_loop_turns_unstable_where_nothing_is_left_in_the_baseband_only(late_by, off):
     """k / s, held and n samples late: z^n (z - 1) + k T has its first roots on the circle at a known gain."""
     hold = 0.01
@@ -67,9 +64,30 @@ def test_the_loop_turns_unstable_where_nothing_is_left_in_the_baseband_only(late
     exact = 2 * np.sin(np.pi / (2 * (2 * late_by + 1))) / hold
     assert radius(exact * 0.999) < 1 < radius(exact * 1.001)
     predicted = np.pi / (2 * late_by + 1) / hold  # where pi / 2 is used up
-    if late_by:
-        assert phase_lag(predicted, hold, late_by * hold) == pytest.approx(np.pi / 2, abs=1e-12)
-    else:  # Nyquist already: the formula says nothing there, and refuses
-        with pytest.raises(ConfigurationError, match="Nyquist"):
-            phase_lag(predicted, hold)
+    assert phase_lag(predicted, hold, late_by * hold) == pytest.approx(np.pi / 2, abs=1e-12)
     assert 0 < predicted / exact - 1 < off
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_modes_are_scipys_and_light_damping_moves_its_eigenvalues_as_they_say(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 5))
+    roots = rng.normal(size=(3, n, n))
+    inertia = roots[0] @ roots[0].T + 0.3 * np.eye(n)
+    stiffness = roots[1] @ np.diag(np.r_[0.0, rng.uniform(50, 900, n - 1)]) @ roots[1].T  # one rigid motion
+    damping = 1e-4 * roots[2] @ roots[2].T
+    found = modes(inertia, stiffness, damping)
+    squares = np.sort(scipy.linalg.eigh(stiffness, inertia, eigvals_only=True))
+    np.testing.assert_allclose(found.resonances**2, squares, rtol=1e-6, atol=1e-6 * squares[-1])
+    assert found.resonances[0] == found.damping_ratios[0] == 0.0
+    np.testing.assert_allclose(found.shapes.T @ inertia @ found.shapes, np.eye(n), atol=1e-7)
+    system = np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(inertia, np.hstack([stiffness, damping]))]]
+    )
+    values = np.linalg.eigvals(system)
+    ringing = values[values.imag > 1e-3]
+    ringing = ringing[np.argsort(np.abs(ringing))]
+    np.testing.assert_allclose(found.resonances[1:], np.abs(ringing), rtol=1e-4)
+    np.testing.assert_allclose(
+        found.damping_ratios[1:], -ringing.real / np.abs(ringing), rtol=1e-2, atol=1e-9
+    )
