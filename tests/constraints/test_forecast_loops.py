@@ -202,7 +202,7 @@ LOOPS = {
     "feet of Hopper": feet("Hopper-v5", at_random, steps=60),
     "feet of Walker2d": feet("Walker2d-v5", bang_bang, steps=60),
     "a table that is pushed over": Loop(
-        lambda: table(),
+        table,
         [of.SupportMargin(0.05)],
         inside_the_hull(0.05),
         (at_random, bang_bang, full),

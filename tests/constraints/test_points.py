@@ -120,6 +120,17 @@ def test_a_control_is_admitted_by_the_speed_it_leads_to(v, u, direction, average
     assert limit.value()[0] == pytest.approx(2.0 - MEASURES[direction](start), abs=1e-9)
 
 
+@pytest.mark.parametrize(("average", "speed"), [("step", 0.3), ("substep", 0.5)])
+def test_the_present_speed_is_that_of_the_last_step_or_substep(average, speed):
+    env = slider(10.0)  # from rest, at 10 m/s^2: 0.1 m/s more in every substep
+    limit, plant = watching(env, average=average, body="b0", direction="+x")
+    assert limit.value()[0] == pytest.approx(50.0)
+    limit.executed(np.full(1, 10.0))
+    env.step(np.full(1, 10.0))
+    plant.observe()
+    assert limit.value()[0] == pytest.approx(50.0 - speed)
+
+
 def downhill(**options):
     """Whether brakes and full throttle are admitted at 0.6 m/s where a control step adds 0.2 m/s at the least."""
     env = slider()
