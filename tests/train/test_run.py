@@ -117,10 +117,11 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     assert not (final / "replay_buffer.pkl").exists()  # of no use to a finished run, and large
     assert resumed(experiment.arms[1], folder).replay_buffer.buffer_size == 100  # as much as it asks for
 
-    # A kill between this checkpoint and the note that the run is finished:
+    # A kill between this checkpoint and the note that the run is finished, while its policy is written:
     scaling = folder / "policy" / "vecnormalize.pkl"
     before = vars(read_pickle(scaling).obs_rms)
     (folder / "finished.json").unlink()
+    (folder / ".policy").mkdir()  # half of one
     trained(experiment)
     assert finish(folder)["timesteps"] == 320
     np.testing.assert_equal(vars(read_pickle(scaling).obs_rms), before)
