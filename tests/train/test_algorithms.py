@@ -252,14 +252,12 @@ def check_evaluation(experiment, model):
     assert changed, "with no changed step there would be nothing to leave out"
 
 
-# Refusals ---------------------------------------------------------------------------------------------------------
+# Refusals; those that need no env of this file are in test_config --------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("algorithm", "env", "message"),
     [
-        ("SAC", "test_algorithms:DiscreteGoal-v0", r"SAC needs actions of a Box, and .*Discrete\(3\).*PPO"),
-        ("DQN", "fake_task:FakeGoal-v0", r"DQN needs actions of a Discrete, and fake_task.*PPO"),
         ("sbx.PPO", "test_algorithms:DictGoal-v0", "sbx.PPO observes one array"),
         (
             "sbx.SAC",
@@ -268,32 +266,12 @@ def check_evaluation(experiment, model):
         ),
     ],
 )
-def test_actions_and_observations_of_the_wrong_kind_are_refused_before_the_first_step(
+def test_observations_of_the_wrong_kind_are_refused_before_the_first_step(
     fake_experiment, algorithm, env, message
 ):
     (arm,) = one_arm(fake_experiment, algorithm, "naive", "arms={a: {filter: none}}", f"env={env}").arms
     with pytest.raises(ConfigurationError, match=f"arms.a: {message}"):
         check_task(arm, make_stack(arm.env, arm.filter))
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "learner", "overrides", "message"),
-    [
-        ("TD3", "naive", ["hyperparameters={}"], r"TD3 is deterministic .*\{normal: 0.1\}"),
-        ("SAC", "{cost_limit: 1}", ["normalize.reward=true"], "leave normalize out"),
-        ("SAC", "{cost_limit: -1}", [], "cost_limit"),
-        ("sbx.PPO", "safe_action", [], "sbx.PPO cannot learn from the executed action"),
-        ("sbx.PPO", "naive", ["hyperparameters.target_kl=0.1"], "target_kl adapts. Leave .* out"),
-        ("sbx.PPO", "naive", ["hyperparameters.clip_range_vf=0.1"], "nothing with clip_range_vf"),
-        ("sbx.CrossQ", "naive", ["hyperparameters.learning_rate=linear_1e-3"], "sbx.CrossQ cannot fall"),
-        ("sbx.SAC", "naive", ["device=auto"], "where the environment variable JAX_PLATFORMS says"),
-    ],
-)
-def test_what_does_not_go_together_is_refused_with_the_reason(
-    fake_experiment, algorithm, learner, overrides, message
-):
-    with pytest.raises(ConfigurationError, match=message):
-        one_arm(fake_experiment, algorithm, learner, *overrides)
 
 
 @pytest.mark.parametrize(

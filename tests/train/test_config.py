@@ -219,6 +219,11 @@ UNSEEN = [
     (learnt("naive", hyperparameters={"replay_buffer_kwargs": {}}), "unknown name 'replay_buffer_kwargs'"),
     (learnt("naive", "TD3"), "TD3 is deterministic"),
     (learnt({"cost_limit": 1}, normalize={"reward": True}), "leave normalize out"),
+    (learnt("safe_action", "sbx.PPO"), "sbx.PPO cannot learn from the executed action"),
+    (learnt("naive", "sbx.PPO", hyperparameters={"target_kl": 0.1}), "target_kl adapts. Leave "),
+    (learnt("naive", "sbx.PPO", hyperparameters={"clip_range_vf": 0.1}), "nothing with clip_range_vf"),
+    (learnt("naive", "sbx.CrossQ", hyperparameters={"learning_rate": "linear_1e-3"}), "sbx.CrossQ cannot fall"),
+    (learnt("naive", "sbx.SAC", device="auto"), "where the environment variable JAX_PLATFORMS says"),
     (of_env("Reacher-v5", judge="constraints"), "env.judge: there is no filter whose constraints"),
     (of_env("Reacher-v5", observation="constraints"), "env.observation: there is no filter whose"),
     (of_env("Reacher-v5", judge="constraints", cost="a:b"), "cost and judge both say"),
@@ -247,6 +252,8 @@ UNSEEN = [
 
 @pytest.mark.parametrize(("settings", "message"), SEEN + UNSEEN, ids=str)
 def test_what_is_refused_and_with_which_words(settings, message):
+    if str(settings.get("algorithm")).startswith("sbx."):
+        pytest.importorskip("sbx")
     with pytest.raises(SafeWrappersError) as refusal:
         check_training(changed(**settings))
     assert message in str(refusal.value)
