@@ -1,92 +1,19 @@
 """The stack as one: faults over handover over lease over filter, on MuJoCo tasks."""
 
-import itertools
 import math
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from braked_cart import BrakedCart, cart_plant, lease, read_cart, stop
+from braked_cart import BrakedCart, cart_plant, read_cart, stop
 
 import safe_wrappers as sw
 from safe_wrappers.wrappers.faults import Outages, RepeatedCommands
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
-RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
-HAZARDS = [sw.constraints.Discs("hazard_positions", radius=0.2)]
-
-
-class Task:
-    """What each layer is given on an env."""
-
-    def __init__(self, env_id, constraint, lease):
-        self.env_id, self.constraint, self.lease = env_id, constraint, lease
-
-    def filter(self, env):
-        return sw.CBFActionFilter(env, [self.constraint()])
-
-    def record(self, env):
-        return sw.RecordInterventions(env)
-
-    def penalty(self, env):
-        return sw.AdaptionPenalty(env, penalty=0.1)
-
-    def expiry(self, env):
-        return lease(env, self.constraint(), **self.lease)
-
-    def handover(self, env):
-        return sw.ChunkHandover(env, 6, 3, [0, 2], rate_limit=40.0)
-
-    def outages(self, env):
-        return Outages(env, mean_between_s=0.3, mean_length_s=0.2)
-
-    def repeats(self, env):
-        return RepeatedCommands(env, share=0.4)
-
-    def build(self, layers):
-        env = gym.make(self.env_id)
-        for layer in layers:
-            env = getattr(self, layer)(env)
-        return env
-
-
-TASKS = {
-    "point": Task(
-        "SafePointGoal1-v0",
-        lambda: sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.004),
-        {"closing_speed": 4.0, "max_lease_s": 0.15},
-    ),
-    "pendulum": Task(
-        "InvertedPendulum-v5",
-        lambda: sw.constraints.Clearance(RAIL, bodies=["cart"], braking=8.0),
-        {"acceleration": 20.0, "max_lease_s": 0.2},
-    ),
-    "reacher": Task(
-        "Reacher-v5",
-        lambda: sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint1"]),
-        {"closing_speed": 10.0, "max_lease_s": 0.15},
-    ),
-}
-ORDER = ["filter", "expiry", "record", "penalty", "handover", "outages", "repeats"]
-"""From the innermost to the outermost."""
-
-
-def legal(layers):
-    return "penalty" not in layers or "filter" in layers
-
-
-PAIRS = [list(p) for p in itertools.combinations(ORDER, 2)]
-PAIRS = [p if legal(p) else ["filter", *p] for p in PAIRS]
-
-
-def actions(env, steps, seed=0):
-    """Bang-bang held for a while, and now and then not a number."""
-    rng = np.random.default_rng(seed)
-    space = env.action_space
-    held = rng.choice([0.0, 1.0], (steps // 5 + 1, *space.shape)).repeat(5, axis=0)[:steps]
-    made = (space.low + held * (space.high - space.low)).astype(space.dtype)
-    made[7::19] = np.nan
-    return made
+HAZARDS = sw.constraints.HeadingDriveClearance(
+    [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004
+)
 
 
 class Watch(gym.Wrapper):
@@ -149,11 +76,9 @@ def reckless(robot, rng, t):
 def test_a_leased_and_filtered_point_goal_never_violates_whatever_the_policy_or_the_link_do(
     least, fault, filters
 ):
-    made = TASKS["point"]
-    env = made.filter(gym.make(made.env_id, max_episode_steps=400))
-    env = sw.LeaseExpiry(
-        env, sw.StoppingBudget(made.constraint(), closing_speed=4.0), max_lease_s=0.3, min_lease_s=least
-    )
+    env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0", max_episode_steps=400), [HAZARDS])
+    budget = sw.StoppingBudget(HAZARDS, closing_speed=4.0)
+    env = sw.LeaseExpiry(env, budget, max_lease_s=0.3, min_lease_s=least)
     env = fault(sw.RecordInterventions(env))
     rng = np.random.default_rng(0)
     told = dict.fromkeys(("lease/braking", "cbf/intervened"), 0)
