@@ -1,179 +1,302 @@
-"""Which constraint refused, what fails least where all fail, and what counts as an intervention."""
+"""What the constructors refuse: numbers, names, envs and wrappers inside, each with words that name the remedy."""
+
+import math
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
+from chunk_worlds import Line
+from wrapper_examples import EXAMPLES, example, inside, made
 
 import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.wrappers.faults import FAULTS, Outages, RepeatedCommands
 
-pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
+SPEED = sw.constraints.JointSpeedLimit(2.0)
+RAIL = sw.constraints.Clearance([sw.constraints.Plane([-0.9], [1])], bodies=["cart"], braking=8.0)
+SPOTS = sw.occlusion.Track(published="pillar_positions", acceleration_noise=1)
 
-LIMITS = {
-    "Reacher-v5": [
-        sw.constraints.JointSpeedLimit(6.0),
-        sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint0"], horizon=6),
-        sw.constraints.Workspace(
-            keep_out=[sw.constraints.Disc([0.0, 0.15], 0.06)], bodies=["fingertip"], horizon=6
-        ),
-        sw.constraints.SpeedLimit(0.8, "fingertip", horizon=2),
-        sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"], horizon=6),
+
+def bad(name, words, error=ConfigurationError, on=None, **arguments):
+    """A wrapper with its example's arguments, but for these, around its example's env or another one."""
+    return pytest.param(name, words, error, on, arguments, id=f"{name}, {words}")
+
+
+def cars(**arguments):
+    return [sw.occlusion.Track(**{"bodies": "car*", "acceleration_noise": 0.1} | arguments)]
+
+
+def reacher(wrap):
+    return lambda: wrap(gym.make("Reacher-v5"))
+
+
+def acting(space):
+    """An env with another action space."""
+
+    def build():
+        env = gym.make("Reacher-v5").unwrapped
+        env.action_space = space
+        return env
+
+    return build
+
+
+def pictured(mode, renderer=True):
+    """An env with another render mode, which is MuJoCo's or not."""
+
+    def build():
+        env = gym.make("SafePointGoal1-v0", render_mode="rgb_array")
+        env.unwrapped.render_mode = mode
+        if not renderer:
+            env.unwrapped.mujoco_renderer = None
+        return env
+
+    return build
+
+
+def bare(env_id):
+    return lambda: gym.make(env_id)
+
+
+CHANGES = r"inside the filter changes the actions .* put it outside"
+NO_VECTOR = "expected a continuous Box action space of shape"
+NO_CONTACTS = "no body of this model can touch"
+ORDER = "d <= s <= H - d must hold"
+REFUSED = [
+    bad("ActionRepeat", "repeat .* got 0", repeat=0),
+    bad("ActionRepeat", "repeat .* got 2.5", repeat=2.5),
+    bad("ActionRepeat", "repeat .* got '4'", repeat="4"),
+    bad("ActionShield", "a discrete action has no zero", fallback="zero"),
+    bad("ActionShield", "use CBFActionFilter for a Box", on=bare("Reacher-v5")),
+    bad("ActionShield", "1,024; got Discrete", on=acting(gym.spaces.Discrete(1025))),
+    bad("AdaptionPenalty", "needs a CBFActionFilter inside", on=bare("Reacher-v5")),
+    bad("AdaptionPenalty", "penalty must be a finite number > 0", penalty=0.0),
+    bad("AdaptionPenalty", "penalty must be a finite number", penalty=math.nan),
+    bad("AdaptionPenalty", "penalty must be a number in the task's reward", penalty="much"),
+    bad("BalanceMonitor", "bodies is a list of names of bodies, or None", bodies="torso"),
+    bad("BalanceMonitor", "bodies is a list", bodies=[]),
+    bad("BalanceMonitor", "no body 'tail'; give another", UnknownNameError, bodies=["torso", "tail"]),
+    bad("BalanceMonitor", "of this model can touch", UnsupportedEnvError, on=bare("Reacher-v5")),
+    bad("CBFActionFilter", "constraints is a list with at least one, got", constraints=[]),
+    bad("CBFActionFilter", "expected a constraint .* got 3", constraints=[3]),
+    bad("CBFActionFilter", "unknown constraint kind 'Wall'", UnknownNameError, constraints=[{"kind": "Wall"}]),
+    bad("CBFActionFilter", "margin", margin=-0.1),
+    bad("CBFActionFilter", CHANGES, on=reacher(lambda env: gym.wrappers.StickyAction(env, 0.5))),
+    bad("CBFActionFilter", CHANGES, on=reacher(lambda env: gym.wrappers.MaxAndSkipObservation(env, skip=4))),
+    bad("CBFActionFilter", CHANGES, on=reacher(lambda env: gym.wrappers.RescaleAction(env, -2.0, 2.0))),
+    bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Dict(a=gym.spaces.Box(-1.0, 1.0, (2,))))),
+    bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Tuple([gym.spaces.Box(-1.0, 1.0, (2,))]))),
+    bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Discrete(3))),
+    bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Box(-1.0, 1.0, (1, 2)))),
+    bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Box(-1, 1, (2,), np.int64))),
+    bad("ChunkHandover", f"{ORDER}.*H = 8 control steps", execution_horizon=9),
+    bad("ChunkHandover", ORDER, inference_delay=5),
+    bad("ChunkHandover", ORDER, inference_delay=[0, 5], execution_horizon=8),
+    bad("ChunkHandover", ORDER, inference_delay=3, execution_horizon=2),
+    bad("ChunkHandover", "inference_delay .* at least 0; got -1", inference_delay=-1),
+    bad("ChunkHandover", "at least 0; got -1", inference_delay=[-1, 2]),
+    bad("ChunkHandover", r"\[least, most\]", inference_delay=[2, 1]),
+    bad("ChunkHandover", "chunk_size .* at least 1; got True", chunk_size=True),
+    bad("ChunkHandover", "execution_horizon .* at least 1; got 0", execution_horizon=0),
+    bad("ChunkHandover", "rate_limit .*> 0", rate_limit=0.0),
+    bad("ChunkHandover", "rate_limit .*finite", rate_limit=math.nan),
+    bad("ChunkHandover", "one for each of the 2 action components", rate_limit=[5.0, 5.0, 5.0]),
+    bad("ChunkHandover", "blend_time .*> 0", blend_time=0.0),
+    bad("ChunkHandover", "a blend of 8 .* choose a longer chunk_size", blend_time=0.18, inference_delay=0),
+    bad("ChunkHandover", "6 control steps", blend_time=0.14),
+    bad("ChunkHandover", "Give rate_limit, blend_time or limits", rate_limit=None),
+    bad("ChunkHandover", "no fallback 'sleep'; choose brake, hold, zero", UnknownNameError, fallback="sleep"),
+    bad("ChunkHandover", "(?i)mujoco", UnsupportedEnvError, on=Line, rate_limit=1.0),
+    bad("ChunkHandover", "plant is a MujocoPlant", plant=3),
+    bad("ChunkHandover", "limits.velocity must be a finite number > 0", limits={"velocity": 0.0}),
+    bad("ChunkHandover", "limits.jerk", limits={"jerk": [1.0, -2.0]}),
+    bad("ChunkHandover", "limits.velocity is one number, or one for each", limits={"velocity": [1.0] * 3}),
+    bad("ChunkHandover", "limits has no 'speed'; it has velocity", UnknownNameError, limits={"speed": 1.0}),
+    bad("ChunkHandover", "limits is a SeamLimits", limits=3.0),
+    bad("ChunkHandover", "no position servo", UnsupportedEnvError, limits={"torque": 3.0}),
+    bad("ChunkHandover", '"moving" or "rest"', limits={"arrival": "soon", "acceleration": 2.0}),
+    bad("ChunkHandover", "beside an acceleration", limits={"arrival": "rest", "velocity": 1.0}),
+    bad("ChunkHandover", "steps_per_entry", steps_per_entry=0),
+    bad("ChunkHandover", "steps_per_entry", steps_per_entry=1.5),
+    bad("ChunkHandover", "at least 2", chunk_size=1, execution_horizon=1, inference_delay=0, steps_per_entry=2),
+    bad("ChunkHandover", "H = 29 control steps", execution_horizon=30, steps_per_entry=4),
+    bad("ContactMonitor", "no body 'tail'", UnknownNameError, bodies=["tail"]),
+    bad("ContactMonitor", r"MuJoCo's \.model", UnsupportedEnvError, on=bare("Pendulum-v1")),
+    bad("CostFunction", "or its name 'module:function'; got 3", fn=3),
+    bad("CostFunction", "or its name 'module:function'; got 'math'", fn="math"),
+    bad("CostFunction", "got 'math:pi'", fn="math:pi"),
+    bad("CostFunction", "cannot be imported: No module named 'no_such_module'", fn="no_such_module:cost"),
+    bad("CostFunction", "cannot be imported: module 'math' has no attribute", fn="math:no_such"),
+    bad("CostFunction", "cannot be imported", fn="a b:c"),
+    bad("FilterObservation", "without one give it constraints", constraints=None),
+    bad("FilterObservation", "shows what the filter inside", on=reacher(lambda e: sw.CBFActionFilter(e, [SPEED]))),
+    bad("FilterObservation", "neighbours", neighbours=-1),
+    bad("LeaseExpiry", "min_lease_s.*CBFActionFilter", min_lease_s=0.1),
+    bad("LeaseExpiry", "min_lease_s", min_lease_s=-0.1),
+    bad("OcclusionPenalty", "tolerance.*> 0 in m, got 0", tolerance=0.0),
+    bad("OcclusionPenalty", "weight", weight=-0.1),
+    bad("OcclusionPenalty", "sigmas", sigmas=0.0),
+    bad("OcclusionPenalty", "'xy' or 'xyz', got 'xz'", axes="xz"),
+    bad("OcclusionPenalty", "at least one Track", tracks=[]),
+    bad("OcclusionPenalty", "at least one Track", tracks="car*"),
+    bad("OcclusionPenalty", "a track is a Track", tracks=["car*"]),
+    bad("OcclusionPenalty", "'cat'; it has: .*car0", UnknownNameError, tracks=cars(bodies="cat")),
+    bad("OcclusionPenalty", "no body ''", UnknownNameError, tracks=cars(bodies="")),
+    bad("OcclusionPenalty", "'pillars'.*pillar_positions", UnknownNameError,
+        tracks=cars(bodies=None, published="pillars")),
+    bad("OcclusionPenalty", r"shape \(k, 2\)", tracks=cars(bodies=None, published="dt")),
+    bad("OcclusionPenalty", "one per coordinate", tracks=cars(acceleration_noise=[[1, 2], [2, 1]])),
+    bad("OcclusionPenalty", "start_position_std", tracks=cars(start_position_std=-1)),
+    bad("OcclusionPenalty", "no camera 'nose'; it has: .*eye", UnknownNameError, sensor="nose"),
+    bad("OcclusionPenalty", "no site 'nose'; it has", UnknownNameError, sensor={"site": "nose"}),
+    bad("OcclusionPenalty", "velocities are measured of bodies", tracks=[SPOTS],
+        sensor={"camera": "eye", "velocity_std": 0.1}),
+    bad("OcclusionPenalty", r"MuJoCo's \.model", UnsupportedEnvError, on=bare("Pendulum-v1")),
+    bad("SafetyOverlay", r"is None: .*gym.make\(\.\.\., render_mode='rgb_array'", on=pictured(None)),
+    bad("SafetyOverlay", "'depth_array'", on=pictured("depth_array")),
+    bad("SafetyOverlay", r"is 'human': .*render_mode='rgb_array'\)", on=pictured("human", renderer=False)),
+    bad("StuckEscape", "needs a CBFActionFilter inside", on=bare("Reacher-v5")),
+    bad("StuckEscape", "after_s", after_s=0.0),
+    bad("StuckEscape", "escape_s", escape_s=-1.0),
+    bad("StuckEscape", "progress", progress=math.nan),
+    bad("TeleopChannel", "delay_s", uplink=-0.1),
+    bad("TeleopChannel", "loss", downlink={"loss": 2.0}),
+    bad("TeleopChannel", "impedance", on=bare("TeleopContact-v0"), impedance=0.0),
+    bad("TeleopChannel", "need a port", impedance=10.0),
+    bad("TeleopChannel", "human_s", human_s=-0.1),
+    bad("TeleopChannel", "longest_s", longest_s=0.0),
+    bad("TeleopChannel", "StoppingBudget", budget=0.2),
+    bad("TeleopChannel", "how fast it is approached", budget={"clearance": SPEED, "closing_speed": 1.0}),
+    bad("TeleopChannel", "Box action space", on=bare("CartPole-v1")),
+    bad("TeleopChannel", "MuJoCo", UnsupportedEnvError, on=bare("Pendulum-v1"),
+        budget={"clearance": RAIL, "acceleration": 1.0}),
+    bad("WholeBodyFilter", "friction_share", friction_share=0.0),
+    bad("WholeBodyFilter", "friction_share", friction_share=1.1),
+    bad("WholeBodyFilter", "tolerance", tolerance=-1.0),
+    bad("WholeBodyFilter", "joint_tolerance", joint_tolerance=-0.1),
+    bad("WholeBodyFilter", "inset", zmp_inset=0.0),
+    bad("WholeBodyFilter", NO_CONTACTS, UnsupportedEnvError, on=bare("InvertedPendulum-v5")),
+    bad("WholeBodyFilter", NO_CONTACTS, UnsupportedEnvError, on=bare("Swimmer-v5")),
+    bad("WholeBodyFilter", "MuJoCo", UnsupportedEnvError, on=bare("Pendulum-v1")),
+    bad("WholeBodyFilter", "joint_tolerance=None", UnsupportedEnvError, on=bare("SafePointGoal1-v0")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "words", "error", "on", "arguments"), REFUSED)
+def test_a_wrapper_refuses_what_it_cannot_work_with(name, words, error, on, arguments):
+    env_id, usual = example(name, next(iter(EXAMPLES[name])))
+    env = inside(name, made(name, env_id)) if on is None else on()
+    with pytest.raises(error, match=words) as raised:
+        getattr(sw, name)(env, **usual() | arguments)
+    assert type(raised.value) is error
+
+
+def fixed(env):
+    return 1.0, 0.0
+
+
+@pytest.mark.parametrize(
+    ("setting", "arguments", "words"),
+    [
+        (sw.StoppingBudget, {"clearance": fixed, "acceleration": 1.0}, "acceleration and braking"),
+        (sw.StoppingBudget, {"clearance": fixed, "braking": 1.0}, "acceleration and braking"),
+        (sw.StoppingBudget, {"clearance": RAIL}, "takes acceleration, and maybe top_speed"),
+        (sw.StoppingBudget, {"clearance": RAIL, "acceleration": 1.0, "braking": 9.0}, "takes acceleration, and"),
+        (sw.StoppingBudget, {"clearance": SPEED, "acceleration": 1.0}, "takes closing_speed; got"),
+        (sw.StoppingBudget, {"clearance": SPEED, "closing_speed": 1.0, "top_speed": 1.0}, "takes closing_speed;"),
+        (sw.occlusion.Imu, {"site": "eye", "accelerometer_std": -1.0}, "accelerometer_std"),
+        (sw.occlusion.Imu, {"site": "eye", "fix_every_s": 0.0}, "fix_every_s"),
+        (sw.occlusion.Sensor, {}, "at a camera or at a site: name one"),
+        (sw.occlusion.Sensor, {"camera": "eye", "site": "eye"}, "at a camera or at a site: name one"),
+        (sw.occlusion.Sensor, {"camera": "eye", "position_std": None}, "measures nothing: give position_std"),
+        (sw.occlusion.Sensor, {"camera": "eye", "range_m": 0.0}, "range_m"),
+        (sw.occlusion.Track, {"acceleration_noise": 0.1}, "follows bodies by name or pattern, or published"),
+        (sw.occlusion.Track, {"bodies": "a", "acceleration_noise": 0.1, "reversion_s": 0.0}, "reversion_s"),
+        (sw.teleop.Link, {"delay_s": -0.1}, "delay_s"),
+        (sw.teleop.Link, {"delay_s": math.nan}, "delay_s"),
+        (sw.teleop.Link, {"delay_s": "soon"}, "delay_s"),
+        (sw.teleop.Link, {"jitter_s": -1.0}, "jitter_s"),
+        (sw.teleop.Link, {"loss": 1.1}, "loss"),
+        (sw.teleop.Link, {"loss": -0.1}, "loss"),
+        (RepeatedCommands, {"env": Line(), "share": -0.1}, "share"),
+        (RepeatedCommands, {"env": Line(), "share": 1.1}, "share"),
+        (RepeatedCommands, {"env": Line(), "share": None}, "share"),
+        (Outages, {"env": Line(), "mean_between_s": 0.0, "mean_length_s": 1.0}, "mean_between_s"),
+        (Outages, {"env": Line(), "mean_between_s": 1.0, "mean_length_s": -1.0}, "mean_length_s"),
+        (Outages, {"env": Line(), "mean_between_s": 1.0, "mean_length_s": math.inf}, "mean_length_s"),
+        (Outages, {"env": Line(), "mean_between_s": "never", "mean_length_s": 1.0}, "mean_between_s"),
     ],
-    "HalfCheetah-v5": [
-        sw.constraints.SpeedLimit(0.5, "torso", "+x"),
-        sw.constraints.Workspace(low=[None, None, 0.5], bodies=["torso"], horizon=3),
-        sw.constraints.JointSpeedLimit(12.0),
-    ],
-}
+)  # fmt: skip
+def test_settings_and_faults_refuse_what_makes_no_sense(setting, arguments, words):
+    with pytest.raises(ConfigurationError, match=words):
+        setting(**arguments)
 
 
-def made(env_id, limits, **options):
-    return sw.CBFActionFilter(gym.make(env_id, disable_env_checker=True), limits, **options)
+# What a single constructor does not see, and remedies that work ---------------------------------------------------
 
 
-def bang_bang(env, k, rng):
-    bits = np.random.default_rng(k // 6).random(env.action_space.shape) < 0.5
-    return (env.action_space.high * np.where(bits, -1.0, 1.0)).astype(np.float32)
+def test_one_plant_for_two_envs():
+    plant = sw.MujocoPlant()
+    sw.CBFActionFilter(gym.make("Reacher-v5"), [SPEED], plant=plant)
+    with pytest.raises(ConfigurationError, match="bound to another env already; give every filter a plant"):
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [SPEED], plant=plant)
 
 
-# Which refuse -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("env_id", LIMITS)
-def test_refused_names_exactly_those_that_refuse_alone(env_id):
-    # Each constraint has an env and a filter of its own, which is put into the same state before every step.
-    together = made(env_id, LIMITS[env_id])
-    alone = [made(env_id, [limit]) for limit in LIMITS[env_id]]
-    for env in (together, *alone):
-        env.reset(seed=1)
-    rng, seen = np.random.default_rng(0), np.zeros(len(alone), dtype=int)
-    several = 0
-    for k in range(60):
-        action = bang_bang(together, k, rng) if k % 3 else np.zeros(together.action_space.shape, np.float32)
-        refused = []
-        for env in alone:
-            mujoco.mj_copyData(env.unwrapped.data, together.unwrapped.model, together.unwrapped.data)
-            refused.append(bool(env.step(action)[4]["cbf/refused"][0]))
-        info = together.step(action)[4]
-        assert info["cbf/refused"].dtype == np.bool_
-        assert info["cbf/refused"].tolist() == refused
-        assert info["cbf/refused"].any() == (info["cbf/intervened"] or info["cbf/infeasible"])
-        seen += refused
-        several += sum(refused) > 1
-    assert (seen > 0).sum() >= 3 and several > 0, seen
-
-
-# Where all fail -----------------------------------------------------------------------------------------------
-
-
-def stuck(fallback="brake", **options):
-    """Two demands that no control meets: the tip is to be left of one line and right of another."""
-    limits = [
-        sw.constraints.Workspace(high=[0.0, None, None], bodies=["fingertip"], horizon=4),
-        sw.constraints.Workspace(low=[0.1, None, None], bodies=["fingertip"], horizon=4),
-        sw.constraints.JointSpeedLimit(3.0),
-    ]
-    return made("Reacher-v5", limits, fallback=fallback, **options)
-
-
-def too_fast():
-    """A cheetah thrown at twice the limit: no control keeps it."""
-    env = made(
-        "HalfCheetah-v5",
-        [sw.constraints.SpeedLimit(2.0, "torso", "+x"), sw.constraints.JointSpeedLimit(10.0)],
+def test_another_control_interval_than_the_env_s():
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.zeros(2), g=lambda x: np.ones((2, 1)), state=lambda env: env.state, control_dt=0.3
     )
-    env.reset(seed=0)
-    env.unwrapped.data.qvel[0] = 4.0
-    return env
+    slow = sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2)
+    with pytest.raises(ConfigurationError, match=r"control_dt = 0\.3 s, but one step of this env lasts"):
+        sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant)
 
 
-def failing(env, control):
-    """The filter's own measure: the largest violation in shares of the constraint's scale."""
-    return max(-c.slack(control) / c.spec.scale for c in env.filter.bound)
+def test_a_lease_is_never_less_than_max_lease_s():
+    filtered = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [RAIL])
+    with pytest.raises(ConfigurationError, match="min_lease_s"):
+        sw.LeaseExpiry(filtered, sw.StoppingBudget(RAIL, acceleration=1.0), min_lease_s=2.0)
 
 
-def compared(env, steps, monkeypatch):
-    """For every infeasible step: how the executed control fails, the proposal, and the brake."""
-    from safe_wrappers.filter.fallback import brake
-
-    real, seen = env.unwrapped.step, []
-
-    def judged(action):
-        # The plant still stands at the state before this step.
-        executed = np.asarray(action, dtype=np.float64)
-        seen.append((failing(env, executed), failing(env, proposed), failing(env, brake(env.plant))))
-        return real(action)
-
-    monkeypatch.setattr(env.unwrapped, "step", judged)
-    out = []
-    for k in range(steps):
-        proposed = bang_bang(env, k, None).astype(np.float64)
-        info = env.step(proposed.astype(np.float32))[4]
-        if info["cbf/infeasible"]:
-            assert info["cbf/fallback"]
-            out.append(seen[-1])
-        seen.clear()
-    return np.array(out)
+@pytest.mark.parametrize("kind", FAULTS)
+def test_an_env_that_does_not_say_how_long_a_step_lasts_is_told_what_to_give(kind):
+    env = gym.make("MountainCarContinuous-v0")
+    arguments = {"Outages": (1.0, 0.8), "RepeatedCommands": (0.4,)}[kind]
+    with pytest.raises(ConfigurationError, match=r"give the env one, such as env\.unwrapped\.dt = 0\.05"):
+        FAULTS[kind](env, *arguments)
+    env.unwrapped.dt = 0.05
+    assert FAULTS[kind](env, *arguments).control_dt == 0.05
 
 
-@pytest.mark.parametrize("make", [too_fast, stuck])
-def test_what_is_executed_fails_no_more_than_the_brake_and_the_proposal(make, monkeypatch):
-    env = make()
-    if make is stuck:
+@pytest.mark.parametrize("bad", [math.nan, math.inf, None, "1", [1.0], np.zeros(2), 1j])
+def test_a_cost_that_is_no_finite_number(bad):
+    env = sw.CostFunction(gym.make("Pendulum-v1"), lambda env: bad)
+    with pytest.raises(ConfigurationError, match="must return one finite number, got"):
         env.reset(seed=0)
-    failed = compared(env, 25, monkeypatch)
-    assert len(failed) >= 3 and (failed[:, 0] > 0.0).all()
-    # 1e-6: the executed one is rounded to float32
-    assert (failed[:, 0] <= failed[:, 1] + 1e-6).all()
-    assert (failed[:, 0] <= failed[:, 2] + 1e-6).all()
-    assert (failed[:, 0] < failed[:, 1] - 1e-3).any()
 
 
-@pytest.mark.parametrize(
-    ("fallback", "expected"),
-    [
-        ("zero", lambda last: np.zeros(2)),
-        ("hold", lambda last: last),
-        (lambda plant: np.array([0.25, -0.5]), lambda last: np.array([0.25, -0.5])),
-    ],
-)
-def test_a_fallback_that_was_chosen_is_what_is_executed(fallback, expected):
-    env = stuck(fallback)
-    env.reset(seed=0)
-    last = np.zeros(2)
-    for k in range(10):
-        info = env.step(bang_bang(env, k, None))[4]
-        assert info["cbf/infeasible"] and info["cbf/fallback"]
-        np.testing.assert_array_equal(info["executed_action"], expected(last))
-        last = info["executed_action"]
-
-
-# What is an intervention --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("make", "may_agree"),
-    [
-        (too_fast, False),
-        (stuck, False),
-        (lambda: stuck("hold"), True),
-        (lambda: stuck("zero"), True),
-        (lambda: made("Reacher-v5", LIMITS["Reacher-v5"]), False),
-    ],
-    ids=["too fast", "stuck", "stuck, hold", "stuck, zero", "possible"],
-)
-def test_intervened_says_whether_the_executed_action_is_another_one(make, may_agree):
-    env = make()
-    if make is not too_fast:
+def test_a_task_s_own_cost_is_not_hidden():
+    env = sw.CostFunction(gym.make("SafePointGoal1-v0"), lambda env: 0.0)
+    with pytest.raises(ConfigurationError, match="reports a cost of its own"):
         env.reset(seed=0)
-    agreed = 0
-    for k in range(40):
-        action = np.zeros(env.action_space.shape, np.float32) if k % 4 == 3 else bang_bang(env, k, None)
-        info = env.step(action)[4]
-        assert info["cbf/intervened"] == bool((info["executed_action"] != action).any())
-        assert info["cbf/intervened"] == (info["cbf/correction"] > 0.0)
-        assert not info["cbf/infeasible"] or info["cbf/refused"].any()
-        agreed += info["cbf/infeasible"] and not info["cbf/intervened"]
-    assert (
-        agreed > 0 or not may_agree
-    )  # the fallback chose what the policy wanted: infeasible, no intervention
+
+
+@pytest.mark.parametrize("name", ["CBFActionFilter", "LeaseExpiry", "TeleopChannel", "ChunkHandover"])
+def test_an_action_of_another_shape_is_refused_and_the_env_not_stepped(name):
+    env_id, arguments = example(name, next(iter(EXAMPLES[name])))
+    env = getattr(sw, name)(gym.make(env_id), **arguments())
+    env.reset(seed=0)
+    shape = env.action_space.shape
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(env.unwrapped, "step", lambda action: pytest.fail("the env was stepped"))
+        for action in (
+            np.zeros((*shape, 1)),
+            np.zeros((1, *shape)),
+            0.5,
+            [],
+            "left",
+            None,
+            [[0.5], [1, 2]],
+            {},
+        ):
+            with pytest.raises(sw.errors.ActionError, match=rf"expected an action of shape \({shape[0]},"):
+                env.step(action)

@@ -15,13 +15,10 @@ class Cart(gym.Env):
         self.dt = dt
         self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), dtype)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
-        self.latency_steps = latency_steps
-        self.given, self.seeds, self.options = [], [], []
+        self.latency_steps, self.given = latency_steps, []
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.seeds.append(seed)
-        self.options.append(options)
         self.state = np.array((options or {}).get("state", [0.0, 0.0]), dtype=np.float64)
         self.queue = [0.0] * self.latency_steps
         self.farthest = self.state[0]
@@ -51,15 +48,24 @@ def read(env):
     return env.state
 
 
-def cart_plant(dt=0.1, delay_s=0.0, **bounds):
-    return sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=dt, delay_s=delay_s, **bounds)
+def cart_plant(dt=0.1, delay_s=0.0):
+    return sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=dt, delay_s=delay_s)
 
 
 def wall(at, **more):
     """Stay left of a wall, on the cart's line."""
-    return sw.constraints.Clearance(
-        [sw.constraints.Plane([at], [-1.0])], braking=1.0, position=[0], velocity=[1], **more
-    )
+    planes = [sw.constraints.Plane([at], [-1.0])]
+    return sw.constraints.Clearance(planes, braking=1.0, position=[0], velocity=[1], **more)
+
+
+def filtered_cart(constraints, *, dt=0.1, env=None, delay_s=0.0, **options):
+    return sw.CBFActionFilter(env or Cart(dt), constraints, plant=cart_plant(dt, delay_s), **options)
+
+
+def full_throttle(filtered, steps, state=(0.0, 0.0)):
+    """Always the largest action; returns the infos."""
+    filtered.reset(seed=0, options={"state": list(state)})
+    return [filtered.step(np.array([1.0], np.float32))[4] for _ in range(steps)]
 
 
 @dataclass
