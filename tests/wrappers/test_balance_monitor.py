@@ -12,7 +12,6 @@ from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.wrappers.monitors import PRESSING
 
 FLOATS = (keys.BALANCE_FRICTION_USED, keys.BALANCE_ZMP_MARGIN)
@@ -199,16 +198,3 @@ def test_no_number_that_is_none_is_reported(bad):
 
 
 # Bad input --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"bodies": "torso"}, ConfigurationError, "bodies is a list of names of bodies, or None for all"),
-        ({"bodies": []}, ConfigurationError, "bodies is a list"),
-        ({"bodies": ["torso", "tail"]}, UnknownNameError, "no body 'tail'; give another"),
-    ],
-)
-def test_bad_arguments_are_refused_in_words(arguments, error, message):
-    with pytest.raises(error, match=message):
-        sw.BalanceMonitor(gym.make("Ant-v5"), **arguments)

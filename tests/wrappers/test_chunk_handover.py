@@ -11,7 +11,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from slow_handover import Slow, measured
 
-from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.wrappers.layer import CommandReceiver, WrapperRng
 
 HOLD = 0.1
@@ -411,63 +410,6 @@ def test_within_a_wide_limit_the_new_chunk_comes_at_once_and_its_seam_is_measure
 def handover(env, **changed):
     arguments = {"chunk_size": 8, "execution_horizon": 4, "fallback": "zero", "rate_limit": 5.0, **changed}
     return ChunkHandover(env, **arguments)
-
-
-@pytest.mark.parametrize(
-    ("changed", "says"),
-    [
-        ({"execution_horizon": 9}, "d <= s <= H - d must hold.*H = 8 control steps"),
-        ({"inference_delay": 5}, "d <= s <= H - d must hold"),
-        ({"inference_delay": [0, 5], "execution_horizon": 8}, "d <= s <= H - d"),
-        ({"inference_delay": 3, "execution_horizon": 6}, "d <= s <= H - d"),
-        ({"inference_delay": 3, "execution_horizon": 2}, "d <= s <= H - d"),
-        ({"inference_delay": -1}, "inference_delay .* at least 0; got -1"),
-        ({"inference_delay": [2, 1]}, r"\[least, most\]"),
-        ({"inference_delay": [-1, 2]}, "at least 0; got -1"),
-        ({"chunk_size": True, "execution_horizon": 1}, "chunk_size .* at least 1; got True"),
-        ({"chunk_size": 0}, "at least 1; got 0"),
-        ({"execution_horizon": 0}, "at least 1; got 0"),
-        ({"rate_limit": 0.0}, "rate_limit .*> 0"),
-        ({"rate_limit": math.nan}, "rate_limit .*finite"),
-        ({"rate_limit": [5.0, 5.0]}, "one for each of the 1 action components"),
-        ({"blend_time": 0.0}, "blend_time .*> 0"),
-        (
-            {"blend_time": 0.9},
-            "a blend of 8 control steps .* 8 control steps: choose a longer chunk_size",
-        ),
-        ({"blend_time": 0.7, "inference_delay": 3}, "5 control steps"),
-        ({"rate_limit": None}, "Give rate_limit, blend_time or limits"),
-        ({"fallback": "sleep"}, "no fallback 'sleep'; choose brake, hold, zero"),
-        ({"fallback": "brake"}, "(?i)mujoco"),
-        ({"plant": 3}, "plant is a MujocoPlant"),
-    ],
-)
-def test_bad_arguments_are_refused_with_a_way_out(changed, says):
-    with pytest.raises(ConfigurationError, match=says):
-        handover(Line(), **changed)
-
-
-@pytest.mark.parametrize(
-    "chunk",
-    [
-        np.zeros((4, 1)),
-        np.zeros((8, 2)),
-        np.zeros(8),
-        np.zeros((1, 8, 1)),
-        0.0,
-        None,
-        "go",
-        [[1.0], [2.0, 3.0]],
-        {},
-    ],
-)
-def test_wrong_shapes_are_refused_and_the_env_is_not_stepped(chunk):
-    env = handover(Line())
-    env.reset(seed=0)
-    with pytest.raises(ActionError, match=r"expected an action of shape \(8, 1\)"):
-        env.step(chunk)
-    assert env.unwrapped.given == []
-    assert env.step([[0.25]] * 8)[4]["handover/latency"] == 0, "a list of the right shape is a chunk"
 
 
 # What is told to those inside ---------------------------------------------------------------------------------

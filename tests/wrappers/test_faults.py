@@ -294,12 +294,3 @@ def test_numbers_that_make_no_sense(kind, bad):
     name = next((k for k, v in bad.items() if v not in (1.0,)), "")
     with pytest.raises(ConfigurationError, match=name):
         FAULTS[kind](BrakedCart(), **bad)
-
-
-@every_fault
-def test_an_env_that_does_not_say_how_long_a_step_lasts_is_refused_with_a_remedy_that_works(kind):
-    env = gym.make("MountainCarContinuous-v0")
-    with pytest.raises(ConfigurationError, match=r"give the env one, such as env\.unwrapped\.dt = 0\.05"):
-        FAULTS[kind](env, **EXAMPLES[kind])
-    env.unwrapped.dt = 0.05
-    assert FAULTS[kind](env, **EXAMPLES[kind]).control_dt == 0.05

@@ -39,12 +39,6 @@ def test_rewards_and_costs_are_summed_up_and_the_filter_checks_every_control_ste
     assert info[keys.EPISODE_SUMMARY]["length"] == 50
 
 
-@pytest.mark.parametrize("repeat", [0, 2.5, "4"])
-def test_a_repeat_that_is_no_count_is_refused(repeat):
-    with pytest.raises(sw.SafeWrappersError, match="repeat"):
-        sw.ActionRepeat(stack(), repeat)
-
-
 LIMIT = 0.25
 """The cart may not be faster; from rest at full throttle it gets there in 2.5 steps of 0.1 s."""
 
@@ -99,25 +93,6 @@ def test_a_non_finite_action_costs_the_penalty(value):
     assert info[keys.CBF_INTERVENED] and info[keys.CBF_NONFINITE]
     assert info[keys.ADAPTION_PENALTY] == 0.5
     assert np.isfinite(reward)
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: sw.AdaptionPenalty(PaidCart(), 1.0), "needs a CBFActionFilter inside"),
-        (lambda: sw.AdaptionPenalty(sw.RecordInterventions(PaidCart()), 1.0), "needs a CBFActionFilter"),
-        (
-            lambda: sw.AdaptionPenalty(sw.RecordInterventions(sw.AdaptionPenalty(filtered(), 1.0)), 1.0),
-            "has an AdaptionPenalty already",
-        ),
-        (lambda: sw.AdaptionPenalty(filtered(), 0.0), "penalty must be a finite number > 0"),
-        (lambda: sw.AdaptionPenalty(filtered(), np.nan), "penalty must be a finite number > 0"),
-        (lambda: sw.AdaptionPenalty(filtered(), "much"), "penalty must be a number in the task's reward"),
-    ],
-)
-def test_what_it_refuses(build, message):
-    with pytest.raises(sw.SafeWrappersError, match=message):
-        build()
 
 
 LOOKED_AT = ("SafePointGoal1-v0", "SafeCarGoal2-v0", "InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5")

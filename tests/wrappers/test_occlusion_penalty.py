@@ -11,11 +11,6 @@ from oracles import blind_covariance, double_integrator_covariance
 from scipy.spatial.transform import Rotation
 
 import safe_wrappers as sw
-from safe_wrappers.errors import (
-    ConfigurationError,
-    UnknownNameError,
-    UnsupportedEnvError,
-)
 
 EYE = sw.occlusion.Sensor(site="eye", position_std=0.05)
 
@@ -266,67 +261,6 @@ def test_the_observation_gains_the_estimates_relative_to_the_robot(axes):
 
 
 # What is refused --------------------------------------------------------------------------------------------------
-
-
-def made(env=None, tracks=None, sensor=EYE, tolerance=1.0, **options):
-    return sw.OcclusionPenalty(
-        Turning() if env is None else env,
-        [straight()] if tracks is None else tracks,
-        sensor,
-        tolerance,
-        **options,
-    )
-
-
-@pytest.mark.parametrize(
-    ("given", "error", "words"),
-    [
-        ({"tolerance": 0.0}, ConfigurationError, "tolerance.*> 0 in m, got 0"),
-        ({"weight": -0.1}, ConfigurationError, "weight"),
-        ({"sigmas": 0.0}, ConfigurationError, "sigmas"),
-        ({"axes": "xz"}, ConfigurationError, "'xy' or 'xyz', got 'xz'"),
-        ({"tracks": []}, ConfigurationError, "at least one Track"),
-        ({"tracks": "thing"}, ConfigurationError, "at least one Track"),
-        ({"tracks": ["thing"]}, ConfigurationError, "a track is a Track"),
-        ({"tracks": [straight("think")]}, UnknownNameError, "'think'; it has: robot, thing, thing2"),
-        ({"tracks": [straight("")]}, UnknownNameError, "no body ''"),
-        (
-            {"tracks": [sw.occlusion.Track(published="spot", acceleration_noise=1)]},
-            UnknownNameError,
-            "'spot'.*spots",
-        ),
-        (
-            {"tracks": [sw.occlusion.Track(published="dt", acceleration_noise=1)]},
-            ConfigurationError,
-            r"shape \(k, 2\)",
-        ),
-        (
-            {"tracks": [straight(acceleration_noise=[[1, 2], [2, 1]])]},
-            ConfigurationError,
-            "one per coordinate",
-        ),
-        ({"tracks": [straight(start_position_std=-1)]}, ConfigurationError, "start_position_std"),
-        ({"sensor": "eye"}, UnknownNameError, "no camera 'eye'; it has: front"),
-        ({"sensor": sw.occlusion.Sensor(site="front")}, UnknownNameError, "no site 'front'; it has: eye"),
-        (
-            {
-                "sensor": sw.occlusion.Sensor("front", velocity_std=0.1),
-                "tracks": [sw.occlusion.Track(published="spots", acceleration_noise=1)],
-            },
-            ConfigurationError,
-            "velocities are measured of bodies",
-        ),
-        ({"env": gym.make("Pendulum-v1")}, UnsupportedEnvError, "model and .data"),
-        (
-            {"env": Turning(space=gym.spaces.Dict({"tracks": gym.spaces.Box(0, 1, (2,))}))},
-            ConfigurationError,
-            "'tracks' already",
-        ),
-    ],
-)
-def test_what_cannot_be_is_refused_at_construction_with_the_reason(given, error, words):
-    with pytest.raises(error, match=words):
-        made(**given)
 
 
 PUSH = np.full(1, 0.004)  # about 4 rad/s²

@@ -54,6 +54,13 @@ def pictured(mode, renderer=True):
     return build
 
 
+def tracked():
+    """A crossing whose observation has tracks of its own."""
+    env = gym.make("OccludedCrossing-v0").unwrapped
+    env.observation_space = gym.spaces.Dict({"tracks": gym.spaces.Box(0.0, 1.0, (2,))})
+    return env
+
+
 def bare(env_id):
     return lambda: gym.make(env_id)
 
@@ -152,6 +159,7 @@ REFUSED = [
     bad("OcclusionPenalty", "velocities are measured of bodies", tracks=[SPOTS],
         sensor={"camera": "eye", "velocity_std": 0.1}),
     bad("OcclusionPenalty", r"MuJoCo's \.model", UnsupportedEnvError, on=bare("Pendulum-v1")),
+    bad("OcclusionPenalty", "'tracks' already", on=tracked, observe=True),
     bad("SafetyOverlay", r"is None: .*gym.make\(\.\.\., render_mode='rgb_array'", on=pictured(None)),
     bad("SafetyOverlay", "'depth_array'", on=pictured("depth_array")),
     bad("SafetyOverlay", r"is 'human': .*render_mode='rgb_array'\)", on=pictured("human", renderer=False)),

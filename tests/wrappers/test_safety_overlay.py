@@ -11,7 +11,6 @@ import pytest
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.envs.safe_rover import WHEELS
-from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.safety_overlay import KEEP_OUT, LIMIT, MOST_MARKS, WAY
 
 TASK = "SafePointGoal1-v0"
@@ -121,15 +120,6 @@ def overlay(renderer, mode="rgb_array"):
     env.unwrapped.mujoco_renderer, env.unwrapped.render_mode = renderer, mode
     env.unwrapped.render = lambda: np.full((200, 300, 3), 255, np.uint8)
     return sw.SafetyOverlay(sw.protect(env))
-
-
-def test_an_env_without_frames_is_refused_with_the_line_to_write():
-    with pytest.raises(ConfigurationError, match=r"is None: .*gym.make\(\.\.\., render_mode='rgb_array'"):
-        overlay(Renderer(), None)
-    with pytest.raises(ConfigurationError, match="'depth_array'"):
-        overlay(Renderer(), "depth_array")
-    with pytest.raises(ConfigurationError, match=r"is 'human': .*render_mode='rgb_array'\)"):
-        overlay(None, "human")
 
 
 def test_another_env_gets_a_strip_on_a_frame_of_the_same_shape():

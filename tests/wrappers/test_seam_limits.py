@@ -194,21 +194,6 @@ def test_what_is_no_position_servo_tells_no_torque(actuator):
 # Bad input --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("limits", "says"),
-    [
-        ({"velocity": 0.0}, "limits.velocity must be a finite number > 0"),
-        ({"jerk": [1.0, -2.0]}, "limits.jerk"),
-        ({"velocity": [1.0, 2.0]}, "limits.velocity is one number, or one for each of the 1 action"),
-        ({"speed": 1.0}, "limits has no 'speed'; it has velocity"),
-        (3.0, "limits is a SeamLimits"),
-    ],
-)
-def test_bad_limits_are_refused(limits, says):
-    with pytest.raises(ConfigurationError, match=says):
-        ChunkHandover(Line(1), 8, 4, fallback="hold", limits=limits)
-
-
 @pytest.mark.parametrize(("entries", "steps"), [(2, 3), (5, 4), (9, 33)])
 def test_commands_between_entries_are_the_spline_through_them(entries, steps):
     chunk = np.random.default_rng(0).normal(size=(entries, 3))

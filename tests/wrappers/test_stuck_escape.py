@@ -97,17 +97,3 @@ def test_a_policy_that_makes_progress_is_not_stuck(paid):
     infos = [env.step(np.ones(1, dtype=np.float32))[4] for _ in range(30)]
     assert infos[-1][keys.CBF_INTERVENED]
     assert infos[-1][keys.CBF_STUCK] == (paid == 0.0)
-
-
-def test_refused():
-    env = gym.make("SafePointGoal1-v0")
-    with pytest.raises(sw.SafeWrappersError, match="needs a CBFActionFilter inside"):
-        sw.StuckEscape(env)
-    env = sw.protect(env)
-    for arguments in ({"after_s": 0.0}, {"escape_s": -1.0}, {"progress": np.nan}):
-        with pytest.raises(sw.SafeWrappersError, match=next(iter(arguments))):
-            sw.StuckEscape(env, **arguments)
-    with pytest.raises(sw.SafeWrappersError, match="use one"):
-        sw.StuckEscape(sw.StuckEscape(env))
-    with pytest.raises(sw.SafeWrappersError, match="put it outside"):
-        sw.LeaseExpiry(sw.StuckEscape(env), env.constraints[0])
