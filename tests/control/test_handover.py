@@ -118,10 +118,8 @@ def test_without_a_bridge_that_keeps_the_step_there_is_none():
 
 @st.composite
 def streams(draw):
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    m = draw(st.integers(1, 3))
-    sent = rng.uniform(-1, 1, (draw(st.integers(1, 4)), m))
-    new = rng.uniform(-1, 1, (draw(st.integers(2, 9)), m))
+    sent, _, new, *_ = draw(seams())
+    assume(len(new) > 1)
     return sent, new, draw(st.integers(0, len(new) - 1))
 
 
