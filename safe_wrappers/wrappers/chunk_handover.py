@@ -32,7 +32,7 @@ from safe_wrappers.errors import (
 )
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants import own_plant
-from safe_wrappers.plants.env_checks import check_actions, check_timing
+from safe_wrappers.plants.env_checks import check_actions, check_timing, refuse_changed_actions
 from safe_wrappers.plants.mujoco.binding import actions_are_controls
 from safe_wrappers.plants.mujoco.dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.model import control_range
@@ -87,7 +87,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
         limits: Of the machine, a `SeamLimits` or the dict of one. With it blends are quintics with second derivatives
             matched at both ends, which are stretched until they keep the limits in between, too; without one that
-            does, or with an end out of reach, the chunk is refused.
+            does, or with an end out of reach, the chunk is refused. Between chunks of one `rate_limit` alone counts.
 
     Info, at every step: ``handover/peak_jerk``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
     ``action/clipped``; that of the layers inside is merged over the control steps (`safe_wrappers.info`).
@@ -132,7 +132,10 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         largest = min(float(np.finfo(self._dtype).max), float(np.finfo(np.float32).max))
         self._low = np.maximum(np.asarray(space.low, np.float64), -largest)
         self._high = np.minimum(np.asarray(space.high, np.float64), largest)
-        if blend_time is None and rate_limit is None and limits is None:
+        if limits is not None:
+            limits = settings_from(SeamLimits, limits, "limits")
+        given = [] if limits is None else vars(limits).values()
+        if all(one is None for one in (blend_time, rate_limit, *given)):
             raise ConfigurationError("how long are blends? Give rate_limit, blend_time or limits")
         self._fewest = 0 if blend_time is None else self._fewest_steps(blend_time)
         self._rate_limit = limit_of_each("rate_limit", rate_limit, self._controls, "action units per second")
@@ -143,7 +146,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._check: SeamCheck | None = None
         self._admission: Admission | None = None
         if limits is not None:
-            limits = settings_from(SeamLimits, limits, "limits")
             self._check = self._bound_check(limits)
             if limits.arrival is not None:
                 self._admission = Admission(env, limits, self._check)
@@ -323,7 +325,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         too_far = np.abs(sent - last) > self._step
         sent = np.where(too_far, np.nextafter(sent, last.astype(self._dtype)), sent)
         hair = 2.0 * float(np.finfo(self._dtype).eps) * np.maximum(np.abs(control), np.abs(last))
-        self._limited += bool((np.abs(control - kept) > hair).any())
+        self._limited += bool((np.abs(control - kept) > np.minimum(hair, 0.5 * self._step)).any())
         return sent
 
     def _beyond(self, chunk: Array) -> float:
@@ -370,6 +372,7 @@ class Admission:
             raise ConfigurationError(
                 "limits.arrival is for setpoints: actions in units of the actuators' lengths"
             )
+        refuse_changed_actions(env)
         if limits.arrival not in ("moving", "rest") or limits.acceleration is None:
             raise ConfigurationError(
                 f'limits.arrival is "moving" or "rest", beside an acceleration; got {limits}'

@@ -122,9 +122,9 @@ class TeleopChannel(CommandGate):
         impedance: Characteristic impedance b of waves, N s/m; None sends flow and effort themselves.
         budget: A `StoppingBudget` or the dict of one, whose clearance is a `Clearance` or a function of the env.
             None: authority is never revoked.
-        video_s: T_video, exposure, encoding and display, without the downlink, s.
-        human_s: T_human, the operator's reaction, s.
-        longest_s: No ceiling is higher, s: an operator who is silent for longer loses authority at rest, too.
+        video_s: Of the budget's ceiling: T_video, exposure, encoding and display, without the downlink, s.
+        human_s: Likewise T_human, the operator's reaction, s.
+        longest_s: It is never higher, s: an operator who is silent for longer loses authority at rest, too.
         fallback: The local brake: "brake", "hold", "zero", or a function of the plant.
         plant: For the budget's constraint and the fallback; None reads the env's MuJoCo model.
 

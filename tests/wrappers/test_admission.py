@@ -98,3 +98,10 @@ def test_limits_are_for_mujocos_actuators():
         handover(Line())
     with pytest.raises(ConfigurationError, match="setpoints"):
         handover(gym.wrappers.RescaleAction(Servos([0.0], [0.0]), -1.0, 1.0))
+    env = Servos([0.0], [0.0])
+    with pytest.raises(ConfigurationError, match="changes the actions"):
+        handover(
+            gym.wrappers.TransformAction(
+                env, lambda action: np.clip(10.0 * action, -9.0, 9.0), env.action_space
+            )
+        )

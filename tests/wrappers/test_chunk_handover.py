@@ -226,6 +226,14 @@ def test_without_need_for_a_blend_the_chunks_bits_are_executed(limits, dtype):
     assert [i["handover/starved"] for i in infos] == [2] + [0] * 7
 
 
+def test_what_is_held_back_is_counted_where_the_dtype_hardly_resolves_the_limit():
+    env = ChunkHandover(Line(1, -1e6, 1e6), 8, 4, rate_limit=0.01, fallback="zero")
+    env.reset(seed=0)
+    env.step(np.full((8, 1), 1e5, np.float32))
+    swing = np.float32(1e5 + 0.02 * (-1.0) ** np.arange(8)[:, None])
+    assert all(env.step(swing)[4]["handover/limited"] for _ in range(5))
+
+
 def test_ordinary_policies_pass_bit_for_bit_as_chunks_of_one():
     rng = np.random.default_rng(1)
     actions = rng.uniform(-1, 1, (50, 3)).astype(np.float32)
