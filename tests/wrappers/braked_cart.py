@@ -55,13 +55,13 @@ class BrakedCart(gym.Env):
         end = len(self.given) * self.dt
         while self.coming and self.coming[0][0] < end:
             due, command = self.coming.pop(0)
-            self._roll(due - self.t)
+            self.roll(due - self.t)
             self.applied = command
-        self._roll(end - self.t)
+        self.roll(end - self.t)
         self.t = end
         return np.array([self.x, self.v]), -abs(float(throttle)), False, False, {}
 
-    def _roll(self, left):
+    def roll(self, left):
         throttle, brake = self.applied
         while left > 0.0:
             pull, drag = throttle * self.drive, brake * self.braking
