@@ -5,7 +5,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from braked_cart import BrakedCart
+from braked_cart import BrakedCart, cart_plant
 from worlds import Raw
 from wrapper_examples import EXAMPLES, example, inside, made
 
@@ -124,6 +124,7 @@ REFUSED = [
     bad("ChunkHandover", "Give rate_limit, blend_time or limits", rate_limit=None, limits={}),
     bad("ChunkHandover", "no fallback 'sleep'; choose brake, hold, zero", UnknownNameError, fallback="sleep"),
     bad("ChunkHandover", "(?i)mujoco", UnsupportedEnvError, on=BrakedCart, rate_limit=1.0),
+    bad("ChunkHandover", '"brake" needs a MujocoPlant', on=BrakedCart, rate_limit=1.0, plant=cart_plant(0.1)),
     bad("ChunkHandover", "plant is a MujocoPlant", plant=3),
     bad("ChunkHandover", "limits.velocity must be a finite number > 0", limits={"velocity": 0.0}),
     bad("ChunkHandover", "limits.jerk", limits={"jerk": [1.0, -2.0]}),
