@@ -323,6 +323,17 @@ def test_a_lease_on_a_mujoco_cart_is_the_appendix_s(kind):
     assert 5 < found.count(None) < 55
 
 
+def test_an_error_that_is_in_the_value_is_counted_once():
+    leases = []
+    for radius, error in ((0.3, 0.0), (0.2, 0.1)):
+        discs = [sw.constraints.Discs("hazard_positions", radius)]
+        clearance = sw.constraints.HeadingDriveClearance(discs, state_error=error)
+        env = lease(gym.make("SafePointGoal1-v0"), clearance, closing_speed=4.0)
+        env.reset(seed=0)
+        leases.append(granted(env, np.zeros(2, np.float32)))
+    assert leases[0] == pytest.approx(leases[1]) and leases[0] < 1.0
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.2])
 @pytest.mark.parametrize("throttle", [0.0, 0.7, -0.7])
 def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight(delay, throttle):
