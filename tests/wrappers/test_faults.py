@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
+from safe_wrappers.errors import ActionError
 from safe_wrappers.wrappers.faults import FAULTS, Outages, RepeatedCommands
 from safe_wrappers.wrappers.layer import CommandReceiver
 
@@ -134,6 +135,25 @@ def test_without_a_receiver_the_robot_goes_on_with_the_last_command(kind):
     for (_, made), executed in zip(heard, cart.given, strict=True):
         last = last if made is None else made
         assert executed[0] == pytest.approx(last / 1000.0)
+
+
+@every_fault
+@pytest.mark.parametrize("bad", [[np.nan, 0.0], [0.0], ["fast", 0.0], 1.0])
+def test_what_is_no_action_is_refused_and_not_carried(kind, bad):
+    cart = BrakedCart()
+    env = faulty(kind, cart)
+    env.reset(seed=0)
+    with pytest.raises(ActionError):
+        env.step(bad)
+    assert not cart.given
+    deciding = faulty(kind, leased(BrakedCart()))
+    deciding.reset(seed=0)
+    if np.size(bad) == 2 and bad[0] != "fast":  # a lease has an answer to what is not finite
+        info = deciding.step(np.array(bad))[4]
+        assert info["lease/refused"] != info["fault/active"]
+    else:
+        with pytest.raises(ActionError):
+            deciding.step(bad)
 
 
 # Random -----------------------------------------------------------------------------------------------------------

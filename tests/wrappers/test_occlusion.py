@@ -19,7 +19,7 @@ TEXT = """
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
     <geom type="box" pos="2 0 {wall}" size="0.1 3 1"/>
-    <body name="robot" pos="0 0 0.5">
+    <body name="robot" pos="0.2 -0.1 0.5">
       <joint name="turn" axis="0 0 1"/><geom size="0.05" mass="1"/>
       <site name="eye" pos="{arm}" euler="30 40 50"/>
     </body>
@@ -158,7 +158,7 @@ def test_a_wall_hides_last_seen_stays_and_permission_comes_back_in_sight():
     # One comes out from behind the wall, one drives behind it.
     world = Turning(((0, 2.5, 2.0, 1.5, 0), (0, 0, 1.0, 1.0, 0)), LEVEL)
     env = looking(world, straight("thing*", acceleration_noise=0.2, start_position_std=1.0), tolerance=0.5)
-    for k in range(60):
+    for k in range(80):
         before = env.last_seen_positions.copy()
         info = env.step(STILL)[4]
         visible = info["occlusion/visible"]
@@ -337,13 +337,35 @@ def test_what_is_seen_is_put_where_the_reckoned_pose_has_it():
     np.testing.assert_allclose(observation[1:3] + ego.position[:2], env.tracking.positions[0], atol=1e-9)
 
 
-def test_errors_of_the_readings_add_up_until_the_next_fix():
-    env = reckoning(accelerometer_std=1.0, gyro_std=0.5, fix_every_s=0.4)
-    off = []
+def reckoned(env):
+    """By how much position, m, velocity, m/s, and orientation, rad, of the body are off, shape (3, 3)."""
+    ego, raw = env.ego_motion, env.unwrapped
+    mujoco.mj_kinematics(raw.model, raw.data)
+    truth, six = raw.data.body("robot"), np.zeros(6)
+    mujoco.mj_objectVelocity(raw.model, raw.data, mujoco.mjtObj.mjOBJ_XBODY, truth.id, six, 0)
+    turned = ego.orientation * Rotation.from_matrix(truth.xmat.reshape(3, 3)).inv()
+    return np.array([ego.position - truth.xpos, ego.velocity - six[3:], turned.as_rotvec()])
+
+
+def test_the_errors_of_a_step_are_those_of_its_readings():
+    env, off, rate = reckoning(accelerometer_std=1.0, gyro_std=0.5), [], []
+    for seed in range(200):
+        env.reset(seed=seed)
+        env.step(STILL)
+        off.append(reckoned(env))
+        rate.append(env.ego_motion.rate)
+    deviation = np.std(off, axis=0)
+    across = np.hypot(0.04, 0.4 * 0.5)  # on an arm of 0.4 m the turn rate matters, too
+    np.testing.assert_allclose(deviation[1], [0.04, across, across], rtol=0.2)
+    np.testing.assert_allclose(deviation[2], 0.5 * 0.04, rtol=0.2)
+    np.testing.assert_allclose(np.std(rate, axis=0), 0.5, rtol=0.2)
+
+
+def test_errors_add_up_until_the_next_fix():
+    env, off = reckoning(accelerometer_std=1.0, gyro_std=0.5, fix_every_s=0.4), []
     for _ in range(30):
         env.step(PUSH)
-        mujoco.mj_kinematics(env.unwrapped.model, env.unwrapped.data)
-        off.append(np.linalg.norm(env.ego_motion.position - env.unwrapped.data.body("robot").xpos))
+        off.append(np.abs(reckoned(env)[[0, 2]]).max())
     assert (np.array(off) < 1e-9).nonzero()[0].tolist() == [9, 19, 29]
     assert max(off) > 1e-3
 
