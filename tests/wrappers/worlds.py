@@ -58,7 +58,7 @@ def wall(at, **more):
 
 def filtered_cart(constraints, *, dt=0.1, env=None, delay_s=0.0, **options):
     env = env or Cart(dt)
-    return sw.CBFActionFilter(env, constraints, plant=cart_plant(dt, delay_s, env.unit), **options)
+    return sw.CBFActionFilter(env, constraints, plant=cart_plant(dt, delay_s, env.unwrapped.unit), **options)
 
 
 def full_throttle(filtered, steps, state=(0.0, 0.0)):
