@@ -1,5 +1,7 @@
 """What safety costs in return, task by task: SAC without a filter, through it, with it afterwards, and Lagrangian.
 
+SAC is Stable-Baselines3's or, with `_sbx` in a task's name, sbx's (`pip install 'safe-wrappers[sbx]'`).
+
     make table
     python -m benchmarks table --only SafeCarGoal1_sac --arms filtered --seeds 0
     python -m benchmarks table --collect
@@ -10,12 +12,13 @@ its run is found anew, so that several machines fill one table. `--collect` make
 """
 
 import csv
+import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from benchmarks.tables import RESULTS as FOLDER
@@ -23,11 +26,13 @@ from benchmarks.tables import options
 from safe_wrappers.train.config import ExperimentConfig, parse_experiment, read_config
 from safe_wrappers.train.evaluation.summary import estimate, number, summarize
 from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
-from safe_wrappers.train.files import write_rows
+from safe_wrappers.train.files import read_json, read_rows, write_rows
+from safe_wrappers.train.run.folder import POLICY
+from safe_wrappers.train.run.policy import CONFIG
 
 ROOT = Path(__file__).parents[1]
 RESULTS = FOLDER / "table.csv"
-VERSIONS = ("gymnasium", "mujoco", "stable-baselines3", "torch")
+VERSIONS = ("gymnasium", "mujoco", "stable-baselines3", "torch", "sbx-rl")
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class Task:
 
 SLOWER = ("action_repeat=8", "hyperparameters.gamma=0.97")
 """An action for eight control steps: half the decisions, and half the updates."""
+SBX = "algorithm=sbx.SAC"
 TASKS = (
     Task("SafePointGoal1-v0", "goal_sac", 5),
     Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000",), "_1m"),
@@ -66,8 +72,17 @@ TASKS = (
     Task("SafeSwimmerVelocity-v0", "velocity_sac", 3, ("hyperparameters.gamma=0.9999",)),
     Task("SafeAntVelocity-v0", "velocity_sac", 3),
     Task("SafeHumanoidVelocity-v0", "velocity_sac", 3),
+    Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000", SBX), "_sbx_1m"),
+    Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=125000", SBX, *SLOWER), "_sbx_8_1m"),
+    Task("SafeCarGoal1-v0", "goal_sac", 3, (SBX,), "_sbx"),
+    Task("SafeCarGoal2-v0", "goal_sac", 3, ("total_steps=125000", SBX, *SLOWER), "_sbx_8_1m"),
+    Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5, ("total_steps=400000", SBX), "_sbx_400k"),
+    Task("SafeHopperVelocity-v0", "velocity_sac", 3, ("total_steps=400000", SBX), "_sbx_400k"),
+    Task("SafeWalker2dVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX), "_sbx_1m"),
+    Task("SafeAntVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX), "_sbx_1m"),
+    Task("SafeHumanoidVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX), "_sbx_1m"),
 )
-METRICS = ("return", "cost", "violations", "stuck", "infeasible", "intervention_rate")
+METRICS = ("return", "return_decile", "cost", "violations", "stuck", "infeasible", "intervention_rate")
 COLUMNS = (
     "task",
     "algorithm",
@@ -80,8 +95,9 @@ COLUMNS = (
     "steps",
     *METRICS,
     "versions",
+    "commit",
 )
-KEY = ("task", "control_steps", "action_repeat", "arm", "seed", "condition")
+KEY = ("task", "algorithm", "control_steps", "action_repeat", "arm", "seed", "condition")
 ARMS = ("unfiltered", "filtered", "lagrangian")
 CONDITIONS = ("training", "filter_off", "filter_on")
 
@@ -98,18 +114,25 @@ def rows_of(task: Task, experiment: ExperimentConfig) -> list[dict[str, Any]]:
     found = []
     for row in summarize(experiment).per_seed:
         arm = next(arm for arm in experiment.arms if arm.name == row["arm"])
-        if not (experiment.run_folder(arm, row["seed"]) / "evaluation" / "evaluation.json").exists():
+        folder = experiment.run_folder(arm, row["seed"])
+        if not (folder / "evaluation" / "evaluation.json").exists():
             continue
         steps = arm.total_steps * arm.action_repeat
         about = {"task": task.env_id, "algorithm": arm.algorithm, "control_steps": steps}
-        about |= {"action_repeat": arm.action_repeat, "versions": made_with()}
+        versions = read_json(folder / POLICY / CONFIG)["versions"]
+        about |= {"action_repeat": arm.action_repeat, "commit": commit()}
+        about |= {"versions": ", ".join(f"{name} {versions[name]}" for name in VERSIONS if name in versions)}
+        if (episodes := folder / "evaluation" / f"{row['condition']}.csv").exists():
+            returns = [float(each["return"]) for each in read_rows(episodes)]
+            about |= {"return_decile": float(np.quantile(returns, 0.1))}
         found.append(about | {key: row.get(key, "") for key in COLUMNS if key not in about})
     return found
 
 
-def made_with() -> str:
-    """The versions of a row that is written now."""
-    return ", ".join(f"{name} {version(name)}" for name in VERSIONS)
+def commit() -> str:
+    """Of the checkout that the runs are collected in, which is to be the one that they were made with."""
+    told = subprocess.run(["git", "rev-parse", "--short=8", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    return told.stdout.strip()
 
 
 def merged(kept: list[dict[str, Any]], found: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -117,16 +140,10 @@ def merged(kept: list[dict[str, Any]], found: list[dict[str, Any]]) -> list[dict
     rows = {tuple(str(row[key]) for key in KEY): row for row in [*kept, *found]}
     tasks = list(dict.fromkeys(task.env_id for task in TASKS))
 
-    def place(key: tuple[str, ...]) -> tuple[int, ...]:
-        task, steps, repeat, arm, seed, condition = key
-        return (
-            tasks.index(task),
-            int(repeat),
-            int(steps),
-            ARMS.index(arm),
-            CONDITIONS.index(condition),
-            int(seed),
-        )
+    def place(key: tuple[str, ...]) -> tuple[Any, ...]:
+        task, algorithm, steps, repeat, arm, seed, condition = key
+        of_arm = ARMS.index(arm), CONDITIONS.index(condition), int(seed)
+        return tasks.index(task), int(repeat), algorithm, int(steps), *of_arm
 
     return [rows[key] for key in sorted(rows, key=place)]
 
@@ -147,13 +164,13 @@ def cell(rows: Iterable[dict[str, Any]], metric: str) -> str:
 def markdown(rows: list[dict[str, Any]]) -> str:
     """The table that the docs show."""
     lines = [
-        "| task | control steps x seeds | steps per action | trained | training: violations, all seeds "
-        "| filter off: return; cost | filter on: return; cost | stuck | infeasible |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| task | learner | control steps x seeds | steps per action | trained | training: violations, all seeds "
+        "| filter off: return; cost | filter on: return; cost | lowest tenth of the episodes | stuck | infeasible |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    told = ("task", "control_steps", "action_repeat")
-    for task, steps, repeat in dict.fromkeys(tuple(row[key] for key in told) for row in rows):
-        of_task = [row for row in rows if tuple(row[key] for key in told) == (task, steps, repeat)]
+    for told in dict.fromkeys(tuple(row[key] for key in KEY[:4]) for row in rows):
+        task, algorithm, steps, repeat = told
+        of_task = [row for row in rows if tuple(row[key] for key in KEY[:4]) == told]
         for arm in dict.fromkeys(row["arm"] for row in of_task):
             same = [row for row in of_task if row["arm"] == arm]
             training, off, on = (
@@ -168,12 +185,14 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             ]
             columns = [
                 task.removesuffix("-v0"),
+                algorithm,
                 f"{int(steps):,} x {len(on)}",
                 str(repeat),
                 arm,
                 number(sum(float(row["violations"]) for row in training)),
                 f"{cell(off, 'return')}; {cell(off, 'cost')}",
                 f"{cell(on, 'return')}; {cell(on, 'cost')}",
+                cell(on, "return_decile"),
                 *shares,
             ]
             lines.append("| " + " | ".join(columns) + " |")

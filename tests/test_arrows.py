@@ -7,10 +7,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("control", "plants", "filter", "constraints", "wrappers", "sb3")
-LAYERS = {name: ROOT / "safe_wrappers" / name for name in FOLDERS} | {
-    name: ROOT / name for name in ("envs", "train")
-}
 FLOORS = (
     {"errors", "info"},
     {"control"},
@@ -19,100 +15,72 @@ FLOORS = (
     {"constraints"},
     {"wrappers", "sb3"},
     {"diagnosis"},
-    {"", "train"},
+    {"__init__", "train"},
 )
-"""Folders and single modules, from the lowest floor up, "" the package itself; each uses itself and lower floors."""
+"""Folders and single modules, from the lowest floor up; each uses itself and lower floors."""
 LEARNERS = {"torch", "stable_baselines3"}
 SIMULATORS = {"gymnasium", "mujoco"}
-FORBIDDEN = {"control": LEARNERS | SIMULATORS, "filter": LEARNERS | SIMULATORS, "sb3": set(), "train": set()}
-"""By layer; elsewhere the learners."""
+FORBIDDEN = dict.fromkeys(("control", "filter", "errors", "info"), LEARNERS | SIMULATORS) | {
+    "sb3": set(),
+    "train": set(),
+}
+"""By folder; elsewhere the learners."""
 IN_A_FUNCTION = {"models.py": {"torch"}}
 """What a module imports only where it is asked to fit; the test of the wheel says that importing us does not."""
 
 
-def modules(layer):
-    return sorted(LAYERS[layer].rglob("*.py"))
-
-
-def imports(path, package):
+def imports(path, module):
     """Absolute dotted names of everything a module imports, inside functions too."""
-    found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                above = package.split(".")[: len(package.split(".")) - node.level + 1]
-                base = ".".join([*above, base]).rstrip(".")
-            found |= {f"{base}.{alias.name}" for alias in node.names}
-    return found
+            above = ["safe_wrappers", *module.split(".")][: -node.level or None] if node.level else []
+            base = ".".join([*above, *filter(None, [node.module])])
+            yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
-def dotted(layer, path):
-    single = path.parent == ROOT / "safe_wrappers"
-    inside = [] if single else [layer, *path.relative_to(LAYERS[layer]).parent.parts]
-    return ".".join(["safe_wrappers", *inside])
+def sources():
+    """The path of every module by its dotted name without the package's; `envs` and `train` are installed inside."""
+    for folder, inside in (("safe_wrappers", ()), ("envs", ("envs",)), ("train", ("train",))):
+        for path in (ROOT / folder).rglob("*.py"):
+            yield ".".join([*inside, *path.relative_to(ROOT / folder).with_suffix("").parts]), path
 
 
-def used(layer, path):
-    """The folders and single modules that a module imports; "" is a public name of the package itself."""
-    found = set()
-    for name in imports(path, dotted(layer, path) if layer in LAYERS else "safe_wrappers"):
-        top, _, rest = name.partition(".")
-        if top == "safe_wrappers":
-            second = rest.split(".")[0]
-            known = second in LAYERS or (ROOT / "safe_wrappers" / f"{second}.py").exists()
-            found.add(second if known else "")
-    return found
+PATHS = dict(sources())
+IMPORTS = {module: set(imports(path, module)) for module, path in PATHS.items()}
+PLACES = {module.partition(".")[0] for module in PATHS}
 
 
-@pytest.mark.parametrize("floor", range(len(FLOORS)))
-def test_no_arrow_points_back_up(floor):
-    below = set().union(*FLOORS[:floor])
-    for layer in FLOORS[floor]:
-        single = ROOT / "safe_wrappers" / f"{layer or '__init__'}.py"
-        paths = modules(layer) if layer in LAYERS else [single]
-        assert paths, f"{layer} has no modules: the test looks in the wrong place"
-        for path in paths:
-            wrong = used(layer, path) - below - {layer}
-            assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
-
-
-@pytest.mark.parametrize("layer", LAYERS)
-def test_heavy_libraries_stay_in_their_layers(layer):
-    lowest = [ROOT / "safe_wrappers" / f"{name}.py" for name in FLOORS[0]]  # which control stands on
-    for path in [*modules(layer), *(lowest if layer == "control" else [])]:
-        roots = {name.split(".")[0] for name in imports(path, dotted(layer, path))}
-        wrong = roots & FORBIDDEN.get(layer, LEARNERS) - IN_A_FUNCTION.get(path.name, set())
-        assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
+def place(name):
+    """The folder or single module that an import is of; a public name is the package's own."""
+    first = name.removeprefix("safe_wrappers").lstrip(".").partition(".")[0]
+    return first if first in PLACES else "__init__"
 
 
 def test_every_folder_and_module_of_the_library_is_on_one_floor():
-    inside = (ROOT / "safe_wrappers").iterdir()
-    names = {p.stem for p in inside if p.suffix == ".py" or (p.is_dir() and any(p.glob("*.py")))}
-    placed = [layer or "__init__" for floor in FLOORS for layer in floor]
-    assert sorted(placed) == sorted(names | {"envs", "train"})
+    assert sorted(one for floor in FLOORS for one in floor) == sorted(PLACES)
+
+
+@pytest.mark.parametrize("module", PATHS)
+def test_no_arrow_points_back_up_and_heavy_libraries_stay_in_their_layers(module):
+    own = module.partition(".")[0]
+    floor = next(number for number, names in enumerate(FLOORS) if own in names)
+    used = {place(name) for name in IMPORTS[module] if name.partition(".")[0] == "safe_wrappers"}
+    assert used <= {own}.union(*FLOORS[:floor])
+    roots = {name.partition(".")[0] for name in IMPORTS[module]}
+    assert not roots & FORBIDDEN.get(own, LEARNERS) - IN_A_FUNCTION.get(PATHS[module].name, set())
 
 
 # The appendix's systems: every row's formulas are used by what it says --------------------------------------------
 
 PAGE = (ROOT / "docs" / "systems.md").read_text()
 ROWS = [re.split(r"\s*\|\s*", line.strip("| \n")) for line in PAGE.splitlines() if re.match(r"\| S\d", line)]
-
-
-def modules_by_import():
-    """Module -> the modules of the package that it imports, without the package's name."""
-    package, graph = ROOT / "safe_wrappers", {}
-    for path in package.rglob("*.py"):
-        parts = path.relative_to(package).with_suffix("").parts
-        found = imports(path, ".".join(["safe_wrappers", *parts[:-1]]))
-        found |= {name.rpartition(".")[0] for name in found}  # of `from module import name`
-        graph[".".join(parts)] = {one.removeprefix("safe_wrappers.") for one in found}
-    return graph
-
-
-GRAPH = modules_by_import()
+GRAPH = {
+    module: {name.removeprefix("safe_wrappers.") for one in found for name in (one, one.rpartition(".")[0])}
+    for module, found in IMPORTS.items()
+}
+"""Module -> what it imports, and of `from module import name` the module."""
 
 
 def reached(start):
@@ -134,6 +102,6 @@ def test_the_formulas_of_every_system_are_used_by_what_the_table_says():
 
 
 def test_no_module_of_control_is_on_the_shelf():
-    used = set().union(*(reached(name) for name in GRAPH if not name.startswith("control.")))
     files = {name for name in GRAPH if name.startswith("control.") and not name.endswith("__init__")}
+    used = set().union(*(reached(name) for name in GRAPH if not name.startswith("control.")))
     assert files <= used, files - used

@@ -277,7 +277,8 @@ class SafeActionSearch:
         return Decision(control, stage, changed=bool((control != proposal).any()))
 
     def _unprojected(self, status: Status, least: Array, last: Array) -> Decision:
-        control, infeasible = self._fallback_control(least, last), status is Status.INFEASIBLE
+        infeasible = status is Status.INFEASIBLE
+        control = self._fallback_control(least if infeasible else None, last)  # a failed solve has no answer
         return Decision(control, Stage.FALLBACK, fallback=True, infeasible=infeasible)
 
     def _fallback_control(self, least: Array | None, last: Array) -> Array:

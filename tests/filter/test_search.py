@@ -396,8 +396,8 @@ CASES = {
     "also where a prediction refuses the proposal": Case(
         [Rows(*CONTRADICTION), Predicting(lambda u: 0.1 - u[0])], STOP, (0.25, 0.5), True
     ),
-    "rows that are no numbers are a failure and no contradiction": Case([NAN_ROW], STOP, (1.0, 0.5)),
-    "also with a prediction": Case([NAN_ROW, Predicting(only())], STOP, (1.0, 0.5)),
+    "rows that are no numbers are a failure and no contradiction": Case([NAN_ROW], STOP, (0.0, 0.0)),
+    "also with a prediction": Case([NAN_ROW, Predicting(only())], STOP, (0.0, 0.0)),
     "a fallback that is admitted": Case([Predicting(only((0, 0)))], STOP, (0.0, 0.0), fallback="zero"),
     "one that is not": Case([Predicting(only((0.3, 0.3)))], STOP, (0.0, 0.0), True, fallback="zero"),
     "in shares of the scales the proposal violates least": Case(opposed(100.0), LEAST, (1.0, 0.5), True),

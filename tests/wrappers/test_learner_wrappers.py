@@ -1,33 +1,31 @@
-"""Wrappers of a learner: repeated actions, penalties, what the filter shows, rewards of several objectives."""
-
-import sys
-from pathlib import Path
+"""Wrappers of a learner: repeated actions, penalties, what the filter shows, and a way out where it is stuck."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from worlds import Cart, SpeedRow, cart_plant
+from worlds import Cart, SpeedRow, filtered_cart
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
+from safe_wrappers.errors import ConfigurationError
 
-sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
-
-
-def stack():
-    return sw.RecordInterventions(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=50)))
+PUSH = np.array([1.0, 0.0], dtype=np.float32)
+BEFORE_A_HAZARD = {"layout": {"agent": [0, 0, 0], "hazards": [[0.5, 0.0]], "goal": [1.3, 0.0]}}
 
 
-def test_rewards_and_costs_are_summed_up_and_the_filter_checks_every_control_step():
-    repeated, single = sw.ActionRepeat(stack(), 4), stack()
-    layout = {"agent": [0, 0, 0], "hazards": [[0.4, 0.02]], "goal": [1.4, 0]}
-    for env in (repeated, single):
-        env.reset(seed=0, options={"layout": layout})
-    changed = 0
+# Repeated actions -------------------------------------------------------------------------------------------------
+
+
+def test_rewards_are_summed_up_and_the_filter_checks_every_control_step():
+    def stack():
+        env = sw.RecordInterventions(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=50)))
+        env.reset(seed=0, options=BEFORE_A_HAZARD)
+        return env
+
+    single, repeated, changed = stack(), sw.ActionRepeat(stack(), 4), 0
     for decision in range(13):
-        action = np.array([1.0, 0.0], dtype=np.float32)
-        observation, reward, _, truncated, info = repeated.step(action)
-        steps = [single.step(action) for _ in range(4 if decision < 12 else 2)]
+        observation, reward, _, truncated, info = repeated.step(PUSH)
+        steps = [single.step(PUSH) for _ in range(4 if decision < 12 else 2)]
         np.testing.assert_array_equal(observation, steps[-1][0])
         assert reward == sum(step[1] for step in steps)
         assert info[keys.CBF_INTERVENED] == any(step[4][keys.CBF_INTERVENED] for step in steps)
@@ -39,63 +37,32 @@ def test_rewards_and_costs_are_summed_up_and_the_filter_checks_every_control_ste
     assert info[keys.EPISODE_SUMMARY]["length"] == 50
 
 
+# Penalties --------------------------------------------------------------------------------------------------------
+
 LIMIT = 0.25
 """The cart may not be faster; from rest at full throttle it gets there in 2.5 steps of 0.1 s."""
 
 
-class PaidCart(Cart):
-    """A cart that is paid its position, ten times over, less what its push costs."""
-
-    def step(self, action):
-        observation, _, terminated, truncated, info = super().step(action)
-        reward = 10.0 * self.state[0] - float(np.asarray(action)[0]) ** 2
-        return observation, reward, terminated, truncated, info
-
-
-def filtered(env=None):
-    return sw.CBFActionFilter(env or PaidCart(), [SpeedRow(LIMIT)], plant=cart_plant())
-
-
-def drive(env, steps=40, seed=0):
-    """Random pushes from rest: each push, the speed before it, and what the step returned."""
-    rng = np.random.default_rng(seed)
-    speed, seen = env.reset(seed=seed)[0][1], []
-    for push in rng.uniform(-0.2, 1.0, (steps, 1)).astype(np.float32):
-        step = env.step(push)
-        seen.append((push, speed, *step))
-        speed = step[0][1]
-    return seen
+def filtered(paid=lambda _: 1.5):
+    return filtered_cart([SpeedRow(LIMIT)], env=gym.wrappers.TransformReward(Cart(), paid))
 
 
 @pytest.mark.parametrize("penalty", [0.5, np.float32(3)])
 def test_a_changed_step_costs_the_penalty_and_no_other_does(penalty):
-    penalised, plain = drive(sw.AdaptionPenalty(filtered(), penalty)), drive(filtered())
-    changed = 0
-    for (push, speed, observation, reward, *_, info), (_, _, same, task, *_) in zip(
-        penalised, plain, strict=True
-    ):
+    env, changed = sw.AdaptionPenalty(filtered(), penalty), 0
+    (_, speed), info = env.reset(seed=0)
+    assert info[keys.ADAPTION_PENALTY] == 0.0
+    for push in np.random.default_rng(0).uniform(-0.2, 1.0, (40, 1)).astype(np.float32):
         # The filter in closed form: no push above the one that reaches the limit within this step.
-        correction = float(push[0]) - min(float(push[0]), (LIMIT - speed) / 0.1)
-        changed += correction > 0
-        assert info[keys.ADAPTION_PENALTY] == (penalty if correction > 0 else 0.0)
-        assert reward == task - info[keys.ADAPTION_PENALTY]
-        assert type(info[keys.ADAPTION_PENALTY]) is float
-        np.testing.assert_array_equal(observation, same)
+        correction = float(push[0]) > (LIMIT - speed) / 0.1
+        (_, speed), reward, *_, info = env.step(push)
+        assert info[keys.ADAPTION_PENALTY] == (penalty if correction else 0.0)
+        assert type(info[keys.ADAPTION_PENALTY]) is float and reward == 1.5 - info[keys.ADAPTION_PENALTY]
+        changed += correction
     assert 5 < changed < 35
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_non_finite_action_costs_the_penalty(value):
-    env = sw.AdaptionPenalty(filtered(), penalty=0.5)
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="not finite"):
-        _, reward, _, _, info = env.step(np.array([value], np.float32))
-    assert info[keys.CBF_INTERVENED] and info[keys.CBF_NONFINITE]
-    assert info[keys.ADAPTION_PENALTY] == 0.5
-    assert np.isfinite(reward)
-
-
-LOOKED_AT = ("SafePointGoal1-v0", "SafeCarGoal2-v0", "InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5")
+# What the filter shows --------------------------------------------------------------------------------------------
 
 
 def features_of(env, observation):
@@ -106,8 +73,7 @@ def expected_discs(env, count):
     """The nearest hazards in the robot's frame by complex numbers, from what the env publishes."""
     task = env.unwrapped
     heading = np.exp(1j * task.agent_heading)
-    centres = task.hazard_positions @ [1, 1j]
-    offsets = (centres - task.agent_position @ [1, 1j]) / heading
+    offsets = (task.hazard_positions - task.agent_position) @ [1, 1j] / heading
     velocity = (task.data.qvel[0] + 1j * task.data.qvel[1]) / heading
     rows = []
     for offset in offsets[np.argsort(np.abs(offsets))][:count]:
@@ -122,11 +88,10 @@ def test_of_hazards_the_nearest_are_shown_in_the_robots_frame():
     env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")), neighbours=3)
     observation, _ = env.reset(seed=4)
     env.action_space.seed(4)
-    for _ in range(200):
+    for _ in range(100):
         shown = features_of(env, observation)
         np.testing.assert_allclose(shown[2:14].reshape(3, 4), expected_discs(env, 3), atol=1e-6)
-        action = env.action_space.sample()
-        observation, _, _, _, info = env.step(action)
+        observation, _, _, _, info = env.step(env.action_space.sample())
         share = (info[keys.EXECUTED_ACTION] - info[keys.PROPOSED_ACTION]) / 2.0
         np.testing.assert_allclose(features_of(env, observation)[-2:], share, atol=1e-7)
 
@@ -134,30 +99,26 @@ def test_of_hazards_the_nearest_are_shown_in_the_robots_frame():
 def test_a_detour_is_shown_with_the_time_that_is_left_of_it():
     env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")))
     layout = {"agent": [0, 0, 0], "hazards": [[0.6, 0.02]], "goal": [1.4, 0]}
-    observation, _ = env.reset(seed=0, options={"layout": layout})
-    shown = [features_of(env, observation)[1]]
-    for _ in range(60):
-        observation = env.step(np.array([1.0, 0.0], dtype=np.float32))[0]
-        shown.append(features_of(env, observation)[1])
+    observations = [env.reset(seed=0, options={"layout": layout})[0]]
+    observations += [env.step(PUSH)[0] for _ in range(60)]
+    shown = [features_of(env, observation)[1] for observation in observations]
     began = next(i for i, side in enumerate(shown) if side)
     assert shown[:began] == [0.0] * began
     assert shown[began] == pytest.approx(-49 / 50, abs=1e-6)  # to the right of a disc that is on the left
 
 
 @pytest.mark.parametrize("acts", [True, False])
-@pytest.mark.parametrize("name", LOOKED_AT)
+@pytest.mark.parametrize(
+    "name", ["SafePointGoal1-v0", "SafeCarGoal2-v0", "InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5"]
+)
 def test_bounded_of_one_shape_and_without_any_effect(name, acts):
     """Beside the same env without the wrapper: the same actions are executed, with the same results."""
-    plain, seen = gym.make(name), gym.make(name)
-    constraints = sw.protect(gym.make(name)).constraints
-    if acts:
-        plain = sw.protect(plain)
-        seen = sw.FilterObservation(sw.protect(seen))
-    else:
-        seen = sw.FilterObservation(seen, constraints)
-    observation, _ = seen.reset(seed=3)
-    plain.reset(seed=3)
+    plain = sw.protect(gym.make(name)) if acts else gym.make(name)
+    constraints = None if acts else sw.protect(gym.make(name)).constraints
+    seen = sw.FilterObservation(sw.protect(gym.make(name)) if acts else gym.make(name), constraints)
     seen.action_space.seed(3)
+    observation = seen.reset(seed=3)[0]
+    plain.reset(seed=3)
     for _ in range(60):
         assert seen.observation_space.contains(observation)
         assert (np.abs(features_of(seen, observation)) <= 1.0).all()
@@ -166,10 +127,9 @@ def test_bounded_of_one_shape_and_without_any_effect(name, acts):
         same, same_reward, *_, same_info = plain.step(action)
         np.testing.assert_array_equal(observation[: len(same)], same.astype(observation.dtype))
         assert reward == same_reward
-        if acts:
-            np.testing.assert_array_equal(info[keys.EXECUTED_ACTION], same_info[keys.EXECUTED_ACTION])
+        assert not acts or info[keys.EXECUTED_ACTION].tobytes() == same_info[keys.EXECUTED_ACTION].tobytes()
         if terminated or truncated:
-            observation, _ = seen.reset(seed=5)
+            observation = seen.reset(seed=5)[0]
             plain.reset(seed=5)
 
 
@@ -177,57 +137,127 @@ def test_an_unfiltered_learner_sees_what_the_filtered_one_sees():
     acting = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")))
     watching = sw.FilterObservation(gym.make("SafePointGoal1-v0"), acting.get_wrapper_attr("constraints"))
     one, other = acting.reset(seed=1)[0], watching.reset(seed=1)[0]
-    steps = 0
-    while True:
+    changed, steps = False, 0
+    while not changed:
         np.testing.assert_array_equal(one, other)
         action = np.array([1.0, 0.3], dtype=np.float32)
-        one, *_, info = acting.step(action)
-        other = watching.step(action)[0]
-        if info[keys.CBF_INTERVENED]:
-            break
-        steps += 1
+        (one, *_, info), (other, *_) = acting.step(action), watching.step(action)
+        changed, steps = info[keys.CBF_INTERVENED], steps + 1
     assert steps > 10
-
-
-def test_the_room_of_a_clearance():
-    walls = [sw.constraints.Plane([-0.9], [1.0]), sw.constraints.Plane([0.9], [-1.0])]
-    limit = sw.constraints.Clearance(walls, bodies=["cart"], braking=8.0)
-    env = sw.FilterObservation(gym.make("InvertedPendulum-v5"), [limit])
-    observation, _ = env.reset(seed=0)
-    for _ in range(8):
-        clearance = 0.9 - abs(env.unwrapped.data.qpos[0])
-        shown = features_of(env, observation)
-        assert shown[0] <= clearance / (1 + clearance) + 1e-6
-        observation = env.step(np.array([3.0], dtype=np.float32))[0]
 
 
 class Pictured(gym.ObservationWrapper):
     """An observation of another kind."""
 
-    def __init__(self, env, space, make):
+    def __init__(self, env, space):
         super().__init__(env)
-        self.observation_space, self.observation = space, make
+        self.observation_space = space
+
+    def observation(self, observation):
+        return self.observation_space.sample()
 
 
-@pytest.mark.parametrize("key", ["pixels", None])
-def test_dicts_get_a_key_and_images_become_dicts(key):
-    image = gym.spaces.Box(0, 255, (4, 4, 3), np.uint8)
-    space = image if key is None else gym.spaces.Dict({key: image})
-    picture = np.zeros((4, 4, 3), np.uint8)
-    task = Pictured(Cart(), space, lambda _: picture if key is None else {key: picture})
-    env = sw.FilterObservation(sw.CBFActionFilter(task, [SpeedRow(0.25)], plant=cart_plant()))
+IMAGE = gym.spaces.Box(0, 255, (4, 4, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("space", "key"), [(IMAGE, "observation"), (gym.spaces.Dict(pixels=IMAGE), "pixels")]
+)
+def test_dicts_get_a_key_and_images_become_dicts(space, key):
+    env = sw.FilterObservation(filtered_cart([SpeedRow(LIMIT)], env=Pictured(Cart(), space)))
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
-    assert set(observation) == {key or "observation", "filter"}
-    assert observation["filter"].dtype == np.float32
+    assert set(observation) == {key, "filter"} and observation["filter"].dtype == np.float32
+
+
+def test_a_plant_beside_a_filter_is_refused():
+    with pytest.raises(ConfigurationError, match="without one give it"):
+        sw.FilterObservation(sw.protect(gym.make("Reacher-v5")), plant=sw.MujocoPlant())
+
+
+class Broken(gym.Wrapper):
+    """Its state is no number after a step."""
+
+    def step(self, action):
+        answer = self.env.step(action)
+        self.unwrapped.data.qvel[:] = np.nan
+        return answer
 
 
 def test_what_was_not_judged_is_not_a_number():
-    env = sw.FilterObservation(sw.protect(gym.make("Reacher-v5")))
+    env = sw.FilterObservation(sw.protect(Broken(gym.make("Reacher-v5"))))
     env.reset(seed=0)
-    env.unwrapped.data.qvel[:] = np.nan
-    observer = env.get_wrapper_attr("filter")
-    observer.observe()
-    shown = env._with_features(np.zeros(10), np.zeros(2))[10:]
-    assert np.isnan(shown[0])
-    assert shown[1:].tolist() == [0.0, 0.0]
+    judged, *correction = features_of(env, env.step(np.zeros(2, np.float32))[0])
+    assert np.isnan(judged) and correction == [0.0, 0.0]
+
+
+# Stuck ------------------------------------------------------------------------------------------------------------
+
+
+def pushing(escape_s, steps=400, wrap=lambda env: env):
+    """The point robot pushes against a hazard without a detour; infos, rewards and the env."""
+    env = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
+    env = wrap(sw.StuckEscape(env, after_s=1.0, progress=0.05, escape_s=escape_s))
+    env.reset(seed=0, options=BEFORE_A_HAZARD)
+    answers = [env.step(PUSH) for _ in range(steps)]
+    return [answer[4] for answer in answers], [answer[1] for answer in answers], env
+
+
+def test_stuck_is_what_its_definition_says_and_reporting_alone_changes_nothing():
+    infos, rewards, _ = pushing(escape_s=0.0)
+    plain = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
+    plain.reset(seed=0, options=BEFORE_A_HAZARD)
+    window, stuck = 50, 0
+    for k, info in enumerate(infos):
+        last = slice(k + 1 - window, k + 1)
+        full = k + 1 >= window
+        changed = full and sum(i[keys.CBF_INTERVENED] for i in infos[last]) > window / 2
+        assert info[keys.CBF_STUCK] == bool(changed and sum(rewards[last]) <= 0.05)
+        assert not info[keys.CBF_ESCAPING]
+        same = plain.step(PUSH)[4]
+        assert all(np.array_equal(info[key], same[key]) for key in same)
+        stuck += info[keys.CBF_STUCK]
+    assert 100 < stuck < 350
+
+
+def test_a_drawn_action_is_held_filtered_and_not_counted_as_the_filters_change():
+    infos, _, _ = pushing(escape_s=0.5)
+    escaping = [i[keys.CBF_ESCAPING] for i in infos]
+    began = escaping.index(True)
+    assert infos[began - 1][keys.CBF_STUCK]
+    assert escaping[began : began + 26] == [True] * 25 + [False]
+    drawn = infos[began][keys.PROPOSED_ACTION]
+    assert not np.array_equal(drawn, PUSH)
+    for info in infos[began : began + 25]:
+        np.testing.assert_array_equal(info[keys.PROPOSED_ACTION], drawn)
+        away = np.linalg.norm(info[keys.EXECUTED_ACTION] - drawn)
+        assert info[keys.CBF_CORRECTION] == pytest.approx(away, abs=1e-12)
+        assert info[keys.CBF_INTERVENED] == (away > 0.0)
+    assert sum(i[keys.CBF_ESCAPING] and not i[keys.CBF_INTERVENED] for i in infos) > 10
+    assert not any(i["cost_substep"] for i in infos)
+    alone = pushing(escape_s=0.0)[0]
+    assert sum(i[keys.CBF_STUCK] for i in infos) < sum(i[keys.CBF_STUCK] for i in alone)
+
+
+def test_a_learner_is_told_that_its_action_was_replaced():
+    infos, _, _ = pushing(escape_s=0.5, steps=200, wrap=lambda env: sw.AdaptionPenalty(env, penalty=0.1))
+    escaping = [i for i in infos if i[keys.CBF_ESCAPING]]
+    assert any(not info[keys.CBF_INTERVENED] for info in escaping)
+    assert {info[keys.ADAPTION_PENALTY] for info in escaping} == {0.1}
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_policy_that_is_not_finite_while_it_acts_is_counted(bad):
+    _, _, env = pushing(escape_s=2.0, steps=100)
+    info = env.step(np.array([bad, 0.5], dtype=np.float32))[4]
+    assert info[keys.CBF_ESCAPING] and info[keys.CBF_NONFINITE]
+    assert np.isfinite(info[keys.EXECUTED_ACTION]).all()
+
+
+@pytest.mark.parametrize("paid", [0.0, 1.0])
+def test_a_policy_that_makes_progress_is_not_stuck(paid):
+    # The filter holds the cart's speed down at every step; stuck it is only where that pays nothing.
+    env = sw.StuckEscape(filtered(lambda _: paid), after_s=0.5, escape_s=0)
+    env.reset(seed=0)
+    infos = [env.step(np.ones(1, dtype=np.float32))[4] for _ in range(30)]
+    assert infos[-1][keys.CBF_INTERVENED] and infos[-1][keys.CBF_STUCK] == (paid == 0.0)

@@ -1,0 +1,272 @@
+"""ContactMonitor and BalanceMonitor: against stepping by hand, momenta and statics; and what they cannot see."""
+
+import copy
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from scenes import Scene
+from scipy.spatial import ConvexHull
+
+import safe_wrappers as sw
+from safe_wrappers import info as keys
+from safe_wrappers.control.contact import complementarity_residuals
+from safe_wrappers.wrappers.monitors import PRESSING
+
+CONTACT = keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL
+BALANCE = keys.BALANCE_FRICTION_USED, keys.BALANCE_ZMP_MARGIN
+MOMENTA = keys.BALANCE_LINEAR_MOMENTUM, keys.BALANCE_ANGULAR_MOMENTUM
+
+
+def actions(env, count, share=1.0):
+    rng, space = np.random.default_rng(0), env.action_space
+    return (share * rng.uniform(space.low, space.high, (count, *space.shape))).astype(space.dtype)
+
+
+# All of it by hand ------------------------------------------------------------------------------------------------
+
+
+def contacts_of(raw, data):
+    """Of each contact its index, its bodies, and its force in its own frame, N, by MuJoCo's own function."""
+    wrench = np.zeros(6)
+    for k in range(data.ncon):
+        mujoco.mj_contactForce(raw.model, data, k, wrench)
+        yield k, raw.model.geom_bodyid[data.contact.geom[k]].tolist(), wrench[:3].copy()
+
+
+def substeps(raw, data):
+    """The contacts of each substep of one Euler step from some data on."""
+    data.ctrl[:] = raw.data.ctrl
+    for _ in range(raw.frame_skip):
+        mujoco.mj_step(raw.model, data)
+        yield list(contacts_of(raw, data))
+
+
+def strongest(raw, data, contacts, bodies=None, against=None):
+    """The figures of one evaluation, and the names of the two bodies of the peak."""
+    pairs, depth, residual = {frozenset(): 0.0}, 0.0, 0.0
+    for k, (one, two), force in contacts:
+        names = raw.model.body(one).name, raw.model.body(two).name
+        if any(a in (bodies or names) and b in (against or names) for a, b in (names, names[::-1])):
+            pairs[frozenset(names)] = pairs.get(frozenset(names), 0.0) + force[0]
+            penetration, product = complementarity_residuals(data.contact.dist[k], force[0])
+            depth, residual = max(depth, penetration), max(residual, product)
+    peak = max(pairs, key=pairs.get)
+    return (pairs[peak], depth, residual), peak
+
+
+def balance_by_hand(raw, data):
+    """Used friction, and the margin by the textbook's formula and scipy's hull; the ground is level."""
+    weight = float(raw.model.body_mass.sum()) * 9.81
+    used, margins = 0.0, []
+    for found in substeps(raw, data):
+        points, forces = [], []
+        for k, bodies, force in found:
+            if 0 not in bodies or data.contact.efc_address[k] < 0:
+                continue
+            points.append(data.contact.pos[k].copy())
+            forces.append((1.0 if bodies[0] == 0 else -1.0) * data.contact.frame[k].reshape(3, 3).T @ force)
+            if force[0] >= PRESSING * weight:
+                used = max(used, np.hypot(*force[1:]) / (data.contact.friction[k, 0] * force[0]))
+        if len(points) < 3 or sum(f[2] for f in forces) <= 0.0:
+            continue
+        p, f = np.array(points), np.array(forces)
+        height = p[:, 2] - p[:, 2].mean()
+        if np.abs(height).max() > 0.01:
+            continue
+        zmp = (p[:, :2] * f[:, 2:] - height[:, None] * f[:, :2]).sum(axis=0) / f[:, 2].sum()
+        hull = ConvexHull(p[:, :2]).equations
+        margins.append(-(hull[:, :2] @ zmp + hull[:, 2]).max())
+    return [used, min(margins, default=np.nan)]
+
+
+def watched(env, count, share=1.0):
+    """Of each step its info and the data from which it began; halfway the model, and the contacts' rows, change."""
+    raw = env.unwrapped
+    raw.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # one evaluation per substep
+    env.reset(seed=0)
+    for step, action in enumerate(actions(env, count, share)):
+        if step == count // 2:
+            raw.model = copy.copy(raw.model)
+            raw.model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        start = copy.copy(raw.data)
+        yield env.step(action)[4], start
+
+
+@pytest.mark.parametrize(
+    ("env_id", "bodies", "against"),
+    [
+        ("HalfCheetah-v5", None, None),
+        ("HalfCheetah-v5", ["ffoot", "bfoot"], ["world"]),
+        ("SafeCarGoal2-v0", None, None),
+    ],
+)
+def test_contacts_are_those_of_stepping_by_hand(env_id, bodies, against):
+    env = sw.ContactMonitor(gym.make(env_id), bodies, against)
+    landed = 0
+    for info, start in watched(env, 100):
+        raw = env.unwrapped
+        each = [strongest(raw, start, found, bodies, against) for found in substeps(raw, start)]
+        expected = np.max([figures for figures, _ in each], axis=0)
+        np.testing.assert_allclose([info[k] for k in CONTACT], expected, rtol=1e-12)
+        assert set(env.peak_bodies or ()) == max(each)[1]
+        assert info[keys.CONTACT_PARTIAL] is False
+        landed += expected[0] > 0.0
+    assert landed > 20
+
+
+@pytest.mark.parametrize(("env_id", "strength"), [("Ant-v5", 0.08), ("Humanoid-v5", 0.3)])
+def test_balance_is_that_of_stepping_by_hand(env_id, strength):
+    env = sw.BalanceMonitor(gym.make(env_id, terminate_when_unhealthy=False))
+    found = []
+    for info, start in watched(env, 120, strength):
+        found.append([info[k] for k in BALANCE])
+        np.testing.assert_allclose(found[-1], balance_by_hand(env.unwrapped, start), rtol=1e-8, atol=1e-9)
+        assert info[keys.BALANCE_PARTIAL] is False
+    used, margins = np.array(found).T
+    assert (~np.isnan(margins)).sum() > 10 and np.nanmin(margins) < 0.02 < np.nanmax(margins)
+    assert used.max() > 0.9 and (used > 0.0).sum() > 60
+
+
+# Momentum, statics and sliding ------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of the rover's tyres
+@pytest.mark.parametrize("env_id", ["Ant-v5", "Humanoid-v5", "HalfCheetah-v5", "SafeRover-v0"])
+def test_momentum_is_what_mujoco_says_of_the_state_after_the_step(env_id):
+    env = sw.BalanceMonitor(gym.make(env_id))
+    raw = env.unwrapped
+    env.reset(seed=0)
+    data, largest = mujoco.MjData(raw.model), np.zeros(2)
+    for action in actions(env, 20):
+        info = env.step(action)[4]
+        data.qpos[:], data.qvel[:] = raw.data.qpos, raw.data.qvel
+        mujoco.mj_forward(raw.model, data)
+        mujoco.mj_subtreeVel(raw.model, data)
+        linear = data.subtree_linvel[0] * raw.model.body_subtreemass[0]
+        for key, expected in zip(MOMENTA, (linear, data.subtree_angmom[0]), strict=True):
+            np.testing.assert_allclose(info[key], expected, rtol=1e-9, atol=1e-9)
+        largest = np.maximum(largest, [np.linalg.norm(info[k]) for k in MOMENTA])
+    assert (largest > 0.1).all()
+
+
+class Crate(gym.Env):
+    """A box of 10 kg on the floor; the action is a force on it, (3,), N, at a height over its middle, m."""
+
+    action_space = gym.spaces.Box(-200.0, 200.0, (4,), np.float64)
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def __init__(self, friction, cone="elliptic"):
+        self.model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="{cone}"/><worldbody>
+          <geom type="plane" size="5 5 .1" friction="{friction} .005 .0001" condim="1"/>
+          <body name="crate" pos="0 0 .3"><freejoint/>
+            <geom type="box" size=".2 .1 .3" mass="10" friction="{friction} .005 .0001" condim="3"/></body>
+          <body pos="2 0 .05"><freejoint/><geom type="box" size=".05 .05 .05" mass="90"/></body>
+        </worldbody></mujoco>""")
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return np.zeros(1), {}
+
+    def step(self, action):
+        force, height = np.array(action[:3]), action[3]
+        self.data.xfrc_applied[self.model.body("crate").id] = [*force, *np.cross([0.0, 0.0, height], force)]
+        mujoco.mj_step(self.model, self.data, 10)
+        return np.zeros(1), 0.0, False, False, {}
+
+
+def settled(action, *arguments):
+    """A watched crate after a held push, and its last info."""
+    env = sw.BalanceMonitor(Crate(*arguments), bodies=["crate"])
+    env.reset(seed=0)
+    return env, [env.step(np.array(action))[4] for _ in range(60)][-1]
+
+
+@pytest.mark.parametrize(("along", "half"), [(0, 0.2), (1, 0.1)])
+@pytest.mark.parametrize("push", [0.0, 10.0, 20.0, -20.0])
+def test_a_pushed_crate_presses_where_statics_says(along, half, push):
+    action = [0.0, 0.0, 0.0, 0.1]  # 0.4 m over the floor
+    action[along] = push
+    expected = min(half - abs(push) * 0.4 / (10.0 * 9.81), 0.1)
+    assert settled(action, 3.0)[1][keys.BALANCE_ZMP_MARGIN] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("cone", "turned", "used"),
+    [("elliptic", 0.0, 1.0), ("elliptic", 0.6, 1.0), ("pyramidal", 0.25 * np.pi, 0.5**0.5)],
+)
+def test_what_slides_uses_all_friction_and_a_pyramid_has_less_between_its_edges(cone, turned, used):
+    env, _ = settled([0.0] * 4, 0.4, cone)
+    env.unwrapped.data.qvel[:2] = 2.0 * np.cos(turned), 2.0 * np.sin(turned)
+    assert env.step(np.zeros(4))[4][keys.BALANCE_FRICTION_USED] == pytest.approx(used, rel=0.02)
+
+
+# What they cannot see ---------------------------------------------------------------------------------------------
+
+
+class Meddling(gym.Wrapper):
+    """Writes to the env's data after some steps: adds to its first velocity, and sets fields of its contacts."""
+
+    def __init__(self, env, at, velocity=1e-3, **contact):
+        super().__init__(env)
+        self.at, self.velocity, self.contact, self.steps = at, velocity, contact, 0
+
+    def step(self, action):
+        out = super().step(action)
+        self.steps += 1
+        if self.steps in self.at:
+            self.unwrapped.data.qvel[0] += self.velocity
+            for field, value in self.contact.items():
+                getattr(self.unwrapped.data.contact, field)[:] = value
+        return out
+
+
+def meddled(kind, at, count, **options):
+    env = kind(Meddling(gym.make("HalfCheetah-v5"), at, **options))
+    env.reset(seed=0)
+    for _ in range(count):
+        yield env, env.step(env.action_space.low)[4]
+
+
+def test_a_step_that_cannot_be_replayed_is_said_to_be_and_the_next_is_whole_again():
+    partial = []
+    with pytest.warns(UserWarning, match="contact/partial") as caught:
+        for step, (env, info) in enumerate(meddled(sw.ContactMonitor, (25, 30), 40), start=1):
+            if info[keys.CONTACT_PARTIAL]:
+                partial.append(step)
+                raw = env.unwrapped  # what is left behind is read
+                expected, pair = strongest(raw, raw.data, contacts_of(raw, raw.data))
+                np.testing.assert_allclose([info[k] for k in CONTACT], expected, rtol=1e-9)
+                assert set(env.peak_bodies or ()) == pair
+    assert partial == [25, 30]
+    assert sum("contact/partial" in str(w.message) for w in caught) == 1  # once
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("place", ["pos", "velocity"])
+def test_no_figure_of_balance_is_made_of_what_is_no_number(place, bad):
+    infos = [info for _, info in meddled(sw.BalanceMonitor, (25,), 27, **{place: bad})]
+    for info in infos[24:26]:  # and MuJoCo's reset in the step after it
+        assert np.isfinite([info[BALANCE[0]], *info[MOMENTA[0]], *info[MOMENTA[1]]]).all()
+    assert [infos[i][keys.BALANCE_PARTIAL] for i in (23, 24, 26)] == [False, True, False]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_contacts_that_are_no_numbers_are_reported_as_none():
+    *_, (_, info) = meddled(sw.ContactMonitor, (25,), 25, dist=np.nan)
+    assert np.isnan([info[k] for k in CONTACT]).all()
+
+
+def test_activations_under_runge_kutta_are_named_as_a_reason():
+    scene = Scene(
+        """<mujoco><option integrator="RK4"/><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body>
+        </worldbody><actuator><general joint="x" dyntype="filter" dynprm=".1" gainprm="5"/></actuator></mujoco>"""
+    )
+    env = sw.ContactMonitor(scene)
+    assert env.reset(seed=0)[1] == dict.fromkeys(CONTACT, 0.0) | {keys.CONTACT_PARTIAL: False}
+    with pytest.warns(UserWarning, match="actuators with activations under Runge-Kutta"):
+        assert env.step(np.ones(1))[4][keys.CONTACT_PARTIAL]
