@@ -260,7 +260,7 @@ def test_waves_in_a_queue_are_as_old_as_they_are():
 
 
 class Liar(gym.Env):
-    """A port that shows no effort, and first resists with 5 N."""
+    """Publishes a `Port` that shows no effort, and first resists with 5 N."""
 
     dt, port_flow, port_effort_observed, port_feedthrough = TICK, [0], [0], 0.0
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
