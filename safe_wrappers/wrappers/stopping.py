@@ -151,8 +151,7 @@ class BoundBudget:
             self.clearance, self.speed = self.bound.spec.approach()
         else:
             value = np.asarray(self.bound.value(), dtype=np.float64)
-            spec = self.bound.spec
-            self.clearance = value[value != np.inf] - spec.margin - spec.state_error
+            self.clearance = value[value != np.inf] - self.bound.spec.margin
             self.speed = np.full(self.clearance.shape, self._budget.closing_speed)
 
     @property

@@ -162,7 +162,6 @@ class TeleopChannel(CommandGate):
     ) -> None:
         CommandGate.__init__(self, env)
         plant = own_plant(plant)
-        self.uplink, self.downlink = _link("uplink", uplink), _link("downlink", downlink)
         self._port = Port(env) if env.has_wrapper_attr("port_flow") else None
         self._waves: WaveCoding | None = None
         if impedance is not None:
@@ -173,8 +172,8 @@ class TeleopChannel(CommandGate):
                 )
             refuse_changed_actions(env)
             self._waves = WaveCoding(self._port, self.control_dt, positive("impedance", impedance, "N s/m"))
-        self._up = Line(self.uplink, "TeleopChannel up 0", self._same_s)
-        self._down = Line(self.downlink, "TeleopChannel down 0", self._same_s)
+        self._up = Line(_link("uplink", uplink), "TeleopChannel up 0", self._same_s)
+        self._down = Line(_link("downlink", downlink), "TeleopChannel down 0", self._same_s)
         self._operator_s = non_negative("video_s", video_s, "s") + non_negative("human_s", human_s, "s")
         self._longest_s = positive("longest_s", longest_s, "s")
         self._budget: BoundBudget | None = None

@@ -62,8 +62,8 @@ def seams(draw):
 @given(seams())
 def test_the_shortest_blend_that_keeps_the_limit_by_brute_force(drawn):
     sent, prior, new, fewest, step = drawn
-    slow = Slow(1.0, fewest, step, sent=sent.tolist())
-    wanted = slow.shortest(prior.tolist(), new.tolist())
+    slow = Slow(1.0, fewest, step, sent=list(sent))
+    wanted = slow.shortest(list(prior), list(new))
     assume(not slow.close_calls)
     plan, steps = join(sent, prior, new, step, fewest)
     assert steps == wanted[0]

@@ -5,7 +5,8 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from chunk_worlds import Line
+from braked_cart import BrakedCart, cart_plant
+from worlds import Raw
 from wrapper_examples import EXAMPLES, example, inside, made
 
 import safe_wrappers as sw
@@ -65,6 +66,14 @@ def bare(env_id):
     return lambda: gym.make(env_id)
 
 
+def rescaled(env_id):
+    return lambda: gym.wrappers.RescaleAction(gym.make(env_id), -1.0, 1.0)
+
+
+def fixed(env):
+    return 1.0, 0.0
+
+
 CHANGES = r"inside the filter changes the actions .* put it outside"
 NO_VECTOR = "expected a continuous Box action space of shape"
 NO_CONTACTS = "no body of this model can touch"
@@ -114,7 +123,8 @@ REFUSED = [
     bad("ChunkHandover", "Give rate_limit, blend_time or limits", rate_limit=None),
     bad("ChunkHandover", "Give rate_limit, blend_time or limits", rate_limit=None, limits={}),
     bad("ChunkHandover", "no fallback 'sleep'; choose brake, hold, zero", UnknownNameError, fallback="sleep"),
-    bad("ChunkHandover", "(?i)mujoco", UnsupportedEnvError, on=Line, rate_limit=1.0),
+    bad("ChunkHandover", "(?i)mujoco", UnsupportedEnvError, on=BrakedCart, rate_limit=1.0),
+    bad("ChunkHandover", '"brake" needs a MujocoPlant', on=BrakedCart, rate_limit=1.0, plant=cart_plant(0.1)),
     bad("ChunkHandover", "plant is a MujocoPlant", plant=3),
     bad("ChunkHandover", "limits.velocity must be a finite number > 0", limits={"velocity": 0.0}),
     bad("ChunkHandover", "limits.jerk", limits={"jerk": [1.0, -2.0]}),
@@ -141,6 +151,8 @@ REFUSED = [
     bad("FilterObservation", "neighbours", neighbours=-1),
     bad("LeaseExpiry", "min_lease_s.*CBFActionFilter", min_lease_s=0.1),
     bad("LeaseExpiry", "min_lease_s", min_lease_s=-0.1),
+    bad("LeaseExpiry", CHANGES, on=rescaled("InvertedPendulum-v5")),
+    bad("LeaseExpiry", "Raw has no value", budget={"clearance": Raw([[1.0]], [1.0]), "closing_speed": 1.0}),
     bad("OcclusionPenalty", "tolerance.*> 0 in m, got 0", tolerance=0.0),
     bad("OcclusionPenalty", "weight", weight=-0.1),
     bad("OcclusionPenalty", "sigmas", sigmas=0.0),
@@ -172,6 +184,8 @@ REFUSED = [
     bad("TeleopChannel", "loss", downlink={"loss": 2.0}),
     bad("TeleopChannel", "impedance", on=bare("TeleopContact-v0"), impedance=0.0),
     bad("TeleopChannel", "need a port", impedance=10.0),
+    bad("TeleopChannel", CHANGES, on=rescaled("TeleopContact-v0"), impedance=10.0),
+    bad("TeleopChannel", CHANGES, on=rescaled("Pendulum-v1"), budget=sw.StoppingBudget(fixed, 1.0, 1.0)),
     bad("TeleopChannel", "human_s", human_s=-0.1),
     bad("TeleopChannel", "video_s", video_s=-0.1),
     bad("TeleopChannel", "longest_s", longest_s=0.0),
@@ -201,10 +215,6 @@ def test_a_wrapper_refuses_what_it_cannot_work_with(name, words, error, on, argu
     assert type(raised.value) is error
 
 
-def fixed(env):
-    return 1.0, 0.0
-
-
 @pytest.mark.parametrize(
     ("setting", "arguments", "words"),
     [
@@ -228,13 +238,13 @@ def fixed(env):
         (sw.teleop.Link, {"jitter_s": -1.0}, "jitter_s"),
         (sw.teleop.Link, {"loss": 1.1}, "loss"),
         (sw.teleop.Link, {"loss": -0.1}, "loss"),
-        (RepeatedCommands, {"env": Line(), "share": -0.1}, "share"),
-        (RepeatedCommands, {"env": Line(), "share": 1.1}, "share"),
-        (RepeatedCommands, {"env": Line(), "share": None}, "share"),
-        (Outages, {"env": Line(), "mean_between_s": 0.0, "mean_length_s": 1.0}, "mean_between_s"),
-        (Outages, {"env": Line(), "mean_between_s": 1.0, "mean_length_s": -1.0}, "mean_length_s"),
-        (Outages, {"env": Line(), "mean_between_s": 1.0, "mean_length_s": math.inf}, "mean_length_s"),
-        (Outages, {"env": Line(), "mean_between_s": "never", "mean_length_s": 1.0}, "mean_between_s"),
+        (RepeatedCommands, {"env": BrakedCart(), "share": -0.1}, "share"),
+        (RepeatedCommands, {"env": BrakedCart(), "share": 1.1}, "share"),
+        (RepeatedCommands, {"env": BrakedCart(), "share": None}, "share"),
+        (Outages, {"env": BrakedCart(), "mean_between_s": 0.0, "mean_length_s": 1.0}, "mean_between_s"),
+        (Outages, {"env": BrakedCart(), "mean_between_s": 1.0, "mean_length_s": -1.0}, "mean_length_s"),
+        (Outages, {"env": BrakedCart(), "mean_between_s": 1.0, "mean_length_s": math.inf}, "mean_length_s"),
+        (Outages, {"env": BrakedCart(), "mean_between_s": "never", "mean_length_s": 1.0}, "mean_between_s"),
     ],
 )  # fmt: skip
 def test_settings_and_faults_refuse_what_makes_no_sense(setting, arguments, words):
