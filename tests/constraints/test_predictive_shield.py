@@ -109,6 +109,30 @@ def test_nothing_is_proved_on_a_plant_that_was_not_checked():
         assert env.constraints[0].promise == promise
 
 
+class Gust(gym.Wrapper):
+    """Blows one env on, and none of its copies."""
+
+    blown = None
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        if self is Gust.blown:
+            self.unwrapped.x += 0.1
+            observation = observation + np.array([0.1, 0.0])
+        return observation, *rest
+
+
+def test_nothing_is_proved_any_more_from_the_first_step_on_that_was_not_foreseen():
+    env = sw.CBFActionFilter(Gust(Cart()), [shield()])
+    env.reset(seed=0)
+    assert not env.step(np.zeros(1))[4]["cbf/mismatch"] and env.constraints[0].promise == "proved"
+    Gust.blown = env.env
+    with pytest.warns(UserWarning, match="cbf/mismatch"):
+        assert env.step(np.zeros(1))[4]["cbf/mismatch"]
+    env.step(np.zeros(1))
+    assert env.constraints[0].promise == "best effort"
+
+
 def test_without_one_the_horizon_is_all_that_is_looked_at():
     assert shield(terminal=None).promise == "best effort"
     # It can brake from 3 m/s within 4.5 m. Ten steps later nothing is visible yet.

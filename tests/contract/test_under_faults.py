@@ -1,9 +1,7 @@
 """Every exported wrapper under faults in the middle of an episode: refused, flagged, harmless or an error.
 
 Whatever comes of a fault: no number that is not finite reaches the env, no action outside the action space through a
-wrapper that decides, and the next episode is bit for bit that of a wrapper that never saw the fault. What is wrong
-about an action in other ways is in test_wrapper_contract.py and test_stateful.py, a step before the first reset in
-test_stateful.py, the answers of solvers in tests/control.
+wrapper that decides, and the next episode is bit for bit that of a wrapper that never saw the fault.
 """
 
 import copy
@@ -24,8 +22,8 @@ from wrapper_examples import CHUNKED, EXAMPLES, EXPORTED, FILTERS, INSIDE, ONLY_
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import SafeWrappersError
-from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
+pytestmark = pytest.mark.filterwarnings("ignore")
 BEFORE, LONG = 7, 25
 """Steps before the fault, and of an episode."""
 OURS = (SafeWrappersError, gym.error.ResetNeeded)
@@ -33,15 +31,14 @@ FILTERED = (*FILTERS, *INSIDE, "ActionShield")
 """They are filters, or have one inside."""
 READ_A_PLANT = (*FILTERED, "FilterObservation", "LeaseExpiry")
 """They ask one for its state at every step, or before it."""
-FLAGS = (
-    "cbf/infeasible", "cbf/fallback", "cbf/nonfinite", "cbf/unsafe", "cbf/intervened", "handover/refused",
-    "handover/starved", "handover/limited", "lease/refused", "lease/braking", "teleop/revoked",
-    "teleop/lost", "action/clipped",
-    "contact/partial", "balance/partial", "occlusion/expired",
-)  # fmt: skip
+COUNTS = "handover/starved", "handover/limited", "teleop/lost", "action/clipped"
+FLAGS = [
+    name
+    for name, key in keys.KEYS.items()
+    if name in COUNTS or ("/" in name and key.dtype == "bool" and name != "occlusion/visible")
+]
 LESS_KNOWN = {"lease/remaining_s": -1, "teleop/round_trip_s": 1, "cbf/correction": 1}
 """Figures that say that something is not as usual, and in which direction."""
-assert {*FLAGS, *LESS_KNOWN} <= set(keys.KEYS)
 GATES = {}
 """By the id of a `Bottom`: events that a step is inside, and that it may go on. A copy has none."""
 
@@ -67,7 +64,7 @@ class Bottom(gym.Wrapper):
         observation, *rest = self.env.step(action)
         if self.leaves is not None:
             self.unwrapped.data.qpos[0] = self.unwrapped.data.qvel[0] = self.leaves
-            observation, self.leaves = filled(observation, self.leaves), None
+            observation, self.leaves = np.full_like(observation, self.leaves), None
         return observation, *rest
 
     def reset(self, **options):
@@ -76,60 +73,45 @@ class Bottom(gym.Wrapper):
         return self.env.reset(**options)
 
 
-def filled(observation, value):
-    if isinstance(observation, dict):
-        return {key: filled(one, value) for key, one in observation.items()}
-    return np.full_like(observation, value)
-
-
 class Session:
     """A wrapper of the contract around a `Bottom`."""
 
     def __init__(self, name):
         self.name, found = name, []
+        self.env = build(name, next(iter(EXAMPLES[name])), lambda env: found.append(Bottom(env)) or found[-1])
+        self.bottom, self.actions = found[0], actions(self.env, LONG)
 
-        def around(env):
-            found.append(Bottom(env))
-            return found[-1]
-
-        with warnings.catch_warnings(action="ignore"):
-            self.env = build(name, next(iter(EXAMPLES[name])), around)
-        (self.bottom,) = found
-        self.actions = actions(self.env, LONG)
-
-    def begin(self, steps=BEFORE):
-        with warnings.catch_warnings(action="ignore"):
-            self.env.reset(seed=0)
-            for action in self.actions[:steps]:
-                self.env.step(action)
+    def begin(self):
+        self.env.reset(seed=0)
+        for action in self.actions[:BEFORE]:
+            self.env.step(action)
         return self
 
-    def step(self, action, env=None):
+    def step(self, action=None, env=None):
         """What a step returns, or raises, what is warned of, and what reaches the env."""
         before, returned, error = len(self.bottom.given), None, None
         with warnings.catch_warnings(record=True, action="always") as warned:
             try:
-                returned = (env or self.env).step(action)
+                returned = (env or self.env).step(self.actions[BEFORE] if action is None else action)
             except Exception as raised:
                 error = raised
-        said = [str(one.message) for one in warned]
-        return returned, error, said, self.bottom.given[before:]
+        return returned, error, [str(one.message) for one in warned], self.bottom.given[before:]
 
     def episode(self, env=None):
-        with warnings.catch_warnings(action="ignore"):
-            return trace(env or self.env, steps=LONG)
+        return trace(env or self.env, steps=LONG)
 
 
 @functools.cache
 def undisturbed(name):
     """An episode, and the first step that a fault would hit, of a session without one."""
     session = Session(name)
-    return session.episode(), session.begin().step(session.actions[BEFORE])
+    return session.episode(), session.begin().step()
 
 
 @pytest.fixture(scope="module", params=EXPORTED)
 def session(request):
-    made = Session(request.param)
+    with warnings.catch_warnings(action="ignore"):
+        made = Session(request.param)
     yield made
     made.env.close()
 
@@ -146,8 +128,7 @@ def as_if_nothing_had_been(session):
 def check(session, answer, allowed=()):
     """That a fault was refused, flagged, harmless or an error that is allowed."""
     returned, error, said, reached = answer
-    usual = undisturbed(session.name)[1]
-    _, usual_said, usual_reached = usual[1:]
+    usual, _, usual_said, usual_reached = undisturbed(session.name)[1]
     space = session.bottom.action_space
     for given in reached:
         assert given.dtype.kind in "fiu" and np.isfinite(given).all()
@@ -155,28 +136,25 @@ def check(session, answer, allowed=()):
     if error is not None:
         assert isinstance(error, allowed) or (isinstance(error, OURS) and not reached), repr(error)
         return
-    if plain(returned) == plain(usual[0]):
-        return
-    info, expected = returned[4], usual[0][4]
+    info, expected = returned[4], usual[4]
     flagged = any(np.any(info.get(key, False)) and not np.any(expected.get(key, False)) for key in FLAGS)
     flagged |= any(
         np.any(sign * (np.asarray(info[key]) - np.asarray(expected[key])) > 0.0)
         for key, sign in LESS_KNOWN.items()
         if key in info and key in expected
     )
-    flagged |= any(text not in usual_said for text in said)
+    flagged |= not set(said) <= set(usual_said)
     passed = session.name in ONLY_LOOKING and len(reached) == len(usual_reached)
-    assert flagged or passed, "something else happened than without the fault, and nothing says so"
-
-
-def wrong(space, value):
-    return np.full(space.shape, value, np.float64)
+    harmless = plain(returned) == plain(usual)
+    assert flagged or passed or harmless, (
+        "something else happened than without the fault, and nothing says so"
+    )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30], ids=str)
 def test_a_wrong_action(session, value):
-    space = session.env.action_space
-    check(session, session.step(wrong(space, value) if space.shape else value))
+    shape = session.env.action_space.shape
+    check(session, session.step(np.full(shape, value, np.float64) if shape else value))
 
 
 @pytest.mark.parametrize("shape", [(0,), (1, 7), (50,)], ids=str)
@@ -191,37 +169,30 @@ def test_an_action_of_a_wrong_shape(session, shape):
 def test_a_state_that_is_no_number(session, value):
     """A step ends in it and returns it: then, or at the next step, it is said, unless nothing reads the state."""
     session.bottom.leaves = value
-    returned, error, _, reached = session.step(session.actions[BEFORE])
+    first, error, _, reached = session.step()
     if error is not None:
         assert isinstance(error, (*OURS, ValueError)), repr(error)
         return
-    second = session.step(session.actions[BEFORE + 1])
-    assert all(np.isfinite(given).all() for given in (*reached, *second[3]))
-    told = [flag for flag in FLAGS if flag != "cbf/intervened"]
-    said = any(
-        np.any(info.get(flag, False)) for info in (returned[4], (second[0] or returned)[4]) for flag in told
+    second, refusal, _, then = session.step(session.actions[BEFORE + 1])
+    assert all(np.isfinite(given).all() for given in (*reached, *then))
+    infos = [answer[4] for answer in (first, second) if answer is not None]
+    told = any(
+        np.any(info.get(flag, False)) for info in infos for flag in FLAGS if flag != keys.CBF_INTERVENED
     )
-    assert said or isinstance(second[1], OURS) or session.name in (*ONLY_LOOKING, *CHUNKED, "TeleopChannel")
+    assert told or isinstance(refusal, OURS) or session.name in (*ONLY_LOOKING, *CHUNKED, "TeleopChannel")
 
 
 @pytest.mark.parametrize("kind", ["raises", "has no answer"])
 def test_a_solver_that_fails(session, kind):
-    def failing(*arguments, **options):
+    def failing(hessian, linear, normals, upper, *arguments, **options):
         if kind == "raises":
             raise BrokenError("the solver broke")
-        hessian, _, _, upper = arguments[:4]
-        return (
-            np.full(len(hessian), np.nan),
-            np.nan,
-            -1,
-            {"lam": np.full(len(upper), np.nan), "iterations": 0},
-        )
+        multipliers = {"lam": np.full(len(upper), np.nan), "iterations": 0}
+        return np.full(len(hessian), np.nan), np.nan, -1, multipliers
 
-    with (
-        mock.patch.object(daqp, "solve", failing),
-        mock.patch.object(clarabel, "DefaultSolver", mock.Mock(side_effect=BrokenError("broken, too"))),
-    ):
-        answer = session.step(session.actions[BEFORE])
+    other = mock.Mock(side_effect=BrokenError("broken, too"))
+    with mock.patch.object(daqp, "solve", failing), mock.patch.object(clarabel, "DefaultSolver", other):
+        answer = session.step()
     check(session, answer, allowed=(BrokenError,))
     assert answer[1] is None or not answer[3], "no step is made where the filter has no answer"
 
@@ -232,7 +203,7 @@ def test_a_plant_that_raises(session):
         mock.patch.object(sw.MujocoPlant, "observe", broken),
         mock.patch.object(sw.SimulatorPlant, "observe", broken),
     ):
-        answer = session.step(session.actions[BEFORE])
+        answer = session.step()
     assert broken.called == (session.name in READ_A_PLANT)
     check(session, answer, allowed=(BrokenError,))
     assert not broken.called or isinstance(answer[1], BrokenError)
@@ -242,13 +213,12 @@ def test_a_plant_that_raises(session):
 @pytest.mark.parametrize("where", ["step", "reset"])
 def test_an_env_that_raises(session, where):
     session.bottom.breaks = where
-    with pytest.raises(BrokenError), warnings.catch_warnings(action="ignore"):
+    with pytest.raises(BrokenError):
         session.env.reset(seed=1) if where == "reset" else session.env.step(session.actions[BEFORE])
     if where == "reset" and session.name not in ONLY_LOOKING:
-        session.bottom.breaks = (
-            ""  # commands of the episode before are not executed in what a failed reset has left
-        )
-        _, error, _, reached = session.step(session.actions[BEFORE])
+        session.bottom.breaks = ""
+        # Commands of the episode before are not executed in what a failed reset has left.
+        _, error, _, reached = session.step()
         assert isinstance(error, gym.error.ResetNeeded) and not reached
 
 
@@ -258,35 +228,28 @@ def test_a_clock_that_is_set(session, by_s):
     if hasattr(session.env, "set_observation_time"):
         session.env.set_observation_time(session.env.now_s + by_s)
     session.bottom.unwrapped.data.time += by_s
-    check(session, session.step(session.actions[BEFORE]), allowed=OURS)
+    check(session, session.step(), allowed=OURS)
 
 
 @pytest.mark.parametrize("session", FILTERED, indirect=True)
-@pytest.mark.parametrize("call", ["step", "reset"])
+@pytest.mark.parametrize(
+    "call", [Session.step, lambda session: session.env.reset(seed=0)], ids=["step", "reset"]
+)
 def test_a_second_thread_waits_for_the_step_that_was_judged(session, call):
-    assert filter_inside(session.env) is not None
-    gate = GATES[id(session.bottom)] = threading.Event(), threading.Event()
-    again = {
-        "step": lambda: session.env.step(session.actions[BEFORE]),
-        "reset": lambda: session.env.reset(seed=0),
-    }[call]
-    first, second = (
-        threading.Thread(target=session.step, args=(session.actions[BEFORE],)),
-        threading.Thread(target=again),
-    )
+    inside, go_on = GATES[id(session.bottom)] = threading.Event(), threading.Event()
+    first, second = (threading.Thread(target=one, args=(session,)) for one in (Session.step, call))
     first.start()
     try:
-        assert gate[0].wait(20.0)
+        assert inside.wait(20.0)
         steps = len(session.bottom.given)
         second.start()
         second.join(0.2)
         assert second.is_alive() and len(session.bottom.given) == steps
     finally:
-        gate[1].set()
+        go_on.set()
         first.join(20.0)
         second.join(20.0)
     assert not second.is_alive()
-    session.episode(session.env)
 
 
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

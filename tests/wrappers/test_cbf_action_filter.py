@@ -80,14 +80,6 @@ def test_a_wrong_action_is_warned_of_once(action, words):
     assert len(caught) == 1
 
 
-@pytest.mark.parametrize("own", [0.0, 0.1])
-@pytest.mark.parametrize("margin", [0.0, 0.2])
-def test_margin_is_added_to_the_constraints_own(own, margin):
-    filtered = filtered_cart([wall(1.0, margin=own)], margin=margin)
-    full_throttle(filtered, 100)
-    assert filtered.unwrapped.farthest == pytest.approx(1.0 - margin - own, abs=1e-3)
-
-
 # Unsafe starts ----------------------------------------------------------------------------------------------------
 
 
@@ -98,8 +90,9 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
         with warnings.catch_warnings(record=True, action="always") as caught:
             _, info = filtered.reset(seed=0, options={"state": [0.0, 1.5]})
             assert info["cbf/unsafe"] and info["cbf/margin"] == pytest.approx(-1.25)
+            assert [w.category for w in caught] == [sw.UnsafeStateWarning]
             infos = [filtered.step(np.ones(1, np.float32))[4] for _ in range(40)]
-        assert [w.category for w in caught] == [sw.UnsafeStateWarning]
+        assert len(caught) == 1
         unsafe = [i["cbf/unsafe"] for i in infos]
         assert unsafe[0] and not unsafe[-1]
         assert infos[1]["cbf/margin"] > infos[0]["cbf/margin"]
@@ -219,6 +212,11 @@ def test_refused_names_exactly_those_that_refuse_alone(env_id):
         assert info["cbf/refused"].tolist() == refused
         assert any(refused) == (info["cbf/intervened"] or info["cbf/infeasible"])
         found.append(refused)
+    kinds = [type(limit).__name__ for limit in LIMITS[env_id]]
+    numbered = [f"{kind} {kinds[: i + 1].count(kind)}" for i, kind in enumerate(kinds)]
+    assert together.constraint_names == [
+        n if kinds.count(k) > 1 else k for k, n in zip(kinds, numbered, strict=True)
+    ]
     found = np.array(found)
     assert found.any(axis=0).sum() >= 3 and (found.sum(axis=1) > 1).any()
 
@@ -275,25 +273,6 @@ def test_where_nothing_is_admitted_the_brake_fails_least_and_an_intervention_is_
 # Threads ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_step_is_compared_with_its_forecast_before_another_threads_step_begins():
-    env = made("Reacher-v5", [SPEED])
-    deviation, calls, others = env.plant.deviation, [], []
-
-    def look():
-        if not others:
-            others.append(threading.Thread(target=env.step, args=(env.action_space.low,)))
-            others[0].start()
-            others[0].join(0.2)
-            calls.append(env.filter_calls)
-        return deviation()
-
-    with mock.patch.object(env.plant, "deviation", look):
-        info = env.step(env.action_space.high)[4]
-        others[0].join(20.0)
-    assert calls == [1] and env.filter_calls == 2
-    assert not info["cbf/mismatch"]
-
-
 def test_an_env_may_reset_its_filter_within_a_step():
     env = made("Reacher-v5", [SPEED])
     step = env.unwrapped.step
@@ -322,14 +301,7 @@ def test_a_plant_with_inertia_stops_in_front_of_the_wall_whatever_is_in_flight(d
     assert not late or driven(0.0)[0].unwrapped.farthest > 3.0 + 1e-3  # without telling it
 
 
-def slow_arm(alpha):
-    """At rest the row of 4 - v^2 allows everything; one held step reaches twice the limit."""
-    limit = sw.constraints.Barrier(lambda x: 4.0 - x[4] ** 2, alpha=alpha)
-    return sw.CBFActionFilter(gym.make("Reacher-v5"), [limit]), lambda raw: 4.0 - raw.data.qvel[0] ** 2
-
-
 def slow_pendulum(alpha, torque):
-    """Gravity is stronger than the 2 N m of the published task, and weaker than 20 N m."""
     env = gym.make("Pendulum-v1")
     env.unwrapped.max_torque = torque
     env.unwrapped.action_space = gym.spaces.Box(-torque, torque, (1,), np.float32)
@@ -339,39 +311,36 @@ def slow_pendulum(alpha, torque):
         state=lambda raw: raw.state,
         control_dt=0.05,
     )
-    limit = sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2, alpha=alpha)
-    return sw.CBFActionFilter(env, [limit], plant=plant), lambda raw: 16.0 - raw.state[1] ** 2
+    return sw.CBFActionFilter(
+        env, [sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2, alpha=alpha)], plant=plant
+    )
 
 
 @pytest.mark.parametrize("alpha", [5.0, 20.0])
 @pytest.mark.parametrize("driver", ["full", "bang", "alternating"])
 @pytest.mark.parametrize(
-    ("build", "holds"),
+    ("torque", "holds"),
     [
-        (slow_arm, True),
-        (lambda alpha: slow_pendulum(alpha, 20.0), True),
-        (lambda alpha: slow_pendulum(alpha, 2.0), False),
+        (
+            60.0,
+            True,
+        ),  # one held step reaches twice the limit, and at rest the row of 16 - v^2 allows everything
+        (20.0, True),
+        (2.0, False),  # of the published task: gravity is stronger
     ],
-    ids=["arm", "strong pendulum", "weak pendulum"],
 )
-def test_a_barrier_is_never_broken_in_silence_and_held_where_the_motor_can(build, holds, driver, alpha):
-    filtered, h = build(alpha)
-    rng, space = np.random.default_rng(0), filtered.action_space
-    drivers = {
-        "full": lambda k: space.high,
-        "bang": lambda k: np.where(rng.random(space.shape) < 0.5, space.low, space.high),
-        "alternating": lambda k: space.high * (-1.0) ** (k // 15),
-    }
+def test_a_barrier_is_never_broken_in_silence_and_held_where_the_motor_can(torque, holds, driver, alpha):
+    filtered, rng, broken = slow_pendulum(alpha, torque), np.random.default_rng(0), 0
     filtered.reset(seed=0)
-    broken = 0
-    for k in range(200):
-        *_, truncated, info = filtered.step(drivers[driver](k).astype(np.float32))
-        violated = h(filtered.unwrapped) < -1e-6
+    for k in range(400):
+        sign = {"full": 1.0, "bang": rng.choice([-1.0, 1.0]), "alternating": (-1.0) ** (k // 15)}[driver]
+        *_, truncated, info = filtered.step(np.array([sign * torque], np.float32))
+        violated = abs(filtered.unwrapped.state[1]) > 4.0 + 1e-6
         broken += violated
         assert not violated or info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]
         if truncated:
             filtered.reset()
-    assert (broken == 0) == holds or driver == "alternating"
+    assert (broken == 0) == holds
 
 
 @pytest.mark.parametrize("fallback", ["hold", "zero", lambda plant: np.array([1.0, 1.0])])
@@ -388,24 +357,6 @@ def test_a_proved_constraint_stays_proved_with_any_fallback(fallback):
         assert env.step(action)[4]["cost_substep"] == 0.0
 
 
-@pytest.mark.parametrize("unit", [1e-7, 1e-4, 1e7])
-@pytest.mark.parametrize("drawn", range(3))
-def test_the_unit_of_the_control_does_not_matter(unit, drawn):
-    pushes = np.random.default_rng(drawn).uniform(-0.5, 1.5, 20).clip(-1.0, 1.0).repeat(5)
-
-    def driven(unit):
-        slow = sw.constraints.Barrier(lambda x: 0.09 - x[1] ** 2, alpha=5.0)
-        filtered = filtered_cart([wall(0.6), slow], env=Cart(unit=unit))
-        filtered.reset(seed=0)
-        infos = [filtered.step(np.array([push * unit]))[4] for push in pushes]
-        said = [[i["cbf/margin"], i["cbf/intervened"], i["cbf/fallback"], i["cbf/infeasible"]] for i in infos]
-        return np.column_stack([said, [i["executed_action"] / unit for i in infos]])
-
-    one = driven(1.0)
-    assert one[:, 1].mean() > 0.2 and not one[:, 2].any() and -1e-9 < one[:, 0].min() < 0.01
-    np.testing.assert_allclose(driven(unit), one, atol=1e-6)
-
-
 # Broken readings --------------------------------------------------------------------------------------------------
 
 
@@ -419,9 +370,6 @@ class Standing(gym.Wrapper):
         return self.observation_space.sample(), 0.0, False, False, {}
 
 
-HAZARDS = sw.constraints.Discs("hazards", 0.2)
-
-
 def broken_hazard(env):
     env.hazards = np.array([[0.5, 0.0], [np.nan, 0.0]])
 
@@ -430,12 +378,13 @@ def broken_speed(env):
     env.unwrapped.data.qvel[0] = np.inf
 
 
+NEAR = sw.constraints.HeadingDriveClearance([sw.constraints.Discs("hazards", 0.2)])
+
+
 @pytest.mark.parametrize(
     ("env_id", "limit", "delay_s", "broken"),
     [
-        ("SafePointGoal1-v0", sw.constraints.HeadingDriveClearance([HAZARDS]), 0.0, broken_hazard),
-        ("SafePointGoal1-v0", sw.constraints.Clearance([HAZARDS], 1.0, bodies=["agent"]), 0.0, broken_hazard),
-        ("Reacher-v5", SPEED, 0.0, broken_speed),
+        ("SafePointGoal1-v0", NEAR, 0.0, broken_hazard),
         ("Reacher-v5", SPEED, 0.02, broken_speed),  # not hidden by the prediction
     ],
 )

@@ -1,7 +1,5 @@
 """The faults: what arrives, when, with which stamp; that they are seeded; that leases and chunks hold with them."""
 
-import math
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -75,10 +73,11 @@ class Script:
     def reset(self, env, seed):
         pass
 
-    def random(self, scale=None):
+    def random(self):
         return self.left.pop(0)
 
-    exponential = random
+    def exponential(self, scale):
+        return scale * self.left.pop(0)
 
 
 def scripted(fault, numbers):
@@ -101,9 +100,9 @@ def test_repeated_commands_keep_their_stamp(numbers, share):
 
 @given(st.lists(st.floats(0.0, 1.0), max_size=12))
 def test_outages_lose_everything(spells):
-    # Well, ill, well, ... until the sums of these lengths; then as it is.
-    heard, active = listened(lambda ear: scripted(Outages(ear, 1.0, 1.0), [*spells, 9.0]), 20)
-    ends = np.cumsum(spells)
+    # Well, ill, well, ... for so many times the means; then as it is.
+    heard, active = listened(lambda ear: scripted(Outages(ear, 0.8, 0.5), [*spells, 99.0]), 20)
+    ends = np.cumsum([(0.5 if i % 2 else 0.8) * spell for i, spell in enumerate(spells)])
     for t in range(20):
         ill = (ends <= t * DT).sum() % 2 == 1
         assert heard[t] == ((None, None) if ill else (t * DT, t)) and active[t] == ill
@@ -177,23 +176,6 @@ def test_two_of_one_kind_do_not_strike_together():
     assert np.mean(both) == pytest.approx(0.75, abs=0.04)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
-def test_the_share(share):
-    heard, active = listened(lambda ear: RepeatedCommands(ear, share), 4000)
-    assert np.mean(active) == pytest.approx(share, abs=5.0 * math.sqrt(share * (1.0 - share) / 4000) + 1e-12)
-    assert active == [made != t for t, (_, made) in enumerate(heard)]
-
-
-def test_spells_are_as_long_and_as_far_apart_as_declared():
-    _, active = listened(lambda ear: Outages(ear, 3.0, 1.5), 20_000)
-    ill = np.array(active)
-    assert ill.mean() == pytest.approx(1.5 / 4.5, abs=0.04)
-    starts = np.flatnonzero(~ill[:-1] & ill[1:])
-    assert len(starts) == pytest.approx(2000.0 / 4.5, rel=0.15)
-    lengths = np.diff(np.flatnonzero(np.diff(ill.astype(int)) != 0))
-    assert lengths.max() > 40  # exponential: some last three times the mean
-
-
 # With a lease, and with chunks ------------------------------------------------------------------------------------
 
 
@@ -233,13 +215,6 @@ def test_nothing_is_hit_whatever_goes_wrong(kinds):
     hits, moved, braked = np.sum([driven(seed, kinds, True) for seed in range(25)], axis=0)
     assert hits == 0 < min(moved, braked)
     assert sum(driven(seed, kinds, False)[0] for seed in range(25)) > (3 if "Outages" in kinds else -1)
-
-
-def test_repeats_are_caught_though_commands_keep_coming():
-    env = RepeatedCommands(leased(BrakedCart(wall=1e6), max_lease_s=0.3), 0.97)
-    env.reset(seed=1)
-    braking = [env.step(np.array([1.0, 0.0], np.float32))[4]["lease/braking"] for _ in range(100)]
-    assert sum(braking) > 40 and not all(braking)
 
 
 @every_fault

@@ -71,26 +71,6 @@ def test_a_state_that_is_not_a_number_lets_the_last_action_go_on():
     assert info["executed_action"] == [2.0] and info["cbf/fallback"]
 
 
-def test_numbers_of_actions_begin_where_the_space_s_do():
-    class Shifted(Grid):
-        def __init__(self):
-            super().__init__()
-            self.action_space = gym.spaces.Discrete(4, start=10)
-
-        def step(self, action):
-            return super().step(action - 10)
-
-    shield = sw.constraints.PredictiveShield("cost", 2, backup=[10, 11, 12, 13])
-    env = sw.ActionShield(Shifted(), [shield])
-    env.reset(seed=0)
-    env.step(11)
-    np.testing.assert_array_equal(env.action_masks(), ~pits((1, 0)))
-    info = env.step(12)[4]
-    assert info["cbf/intervened"] and info["executed_action"][0] in (11.0, 13.0)
-    with pytest.raises(sw.errors.ActionError, match="expected an action of"):
-        env.step(9)
-
-
 def test_maskable_ppo_reads_the_masks_through_a_vec_env():
     masking = pytest.importorskip("sb3_contrib.common.maskable.utils")
     from stable_baselines3.common.env_util import make_vec_env

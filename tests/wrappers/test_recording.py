@@ -124,7 +124,7 @@ def test_a_zero_is_of_what_the_task_or_the_stack_reports_and_else_missing(task, 
     }
     assert not summary.keys() & (every - reported)
     assert all(summary[name] == 0 for name in reported)
-    assert (env.filter_time_us is not None) == ("infeasible" in reported)
+    assert 0.0 < env.filter_time_us < 1e6 if "infeasible" in reported else env.filter_time_us is None
 
 
 NAN = float("nan")
@@ -151,22 +151,6 @@ def test_what_is_not_judged_equals_itself_also_in_another_process():
     assert again is keys.NOT_JUDGED and again == keys.NOT_JUDGED and float("nan") == keys.NOT_JUDGED
     assert keys.NOT_JUDGED != 0.0 and keys.NOT_JUDGED != "nan" and np.isnan(keys.NOT_JUDGED)
     assert len({keys.NOT_JUDGED, again}) == 1
-
-
-@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
-def test_vector_env_counts_episodes_apart_in_every_autoreset_mode(mode):
-    envs = gym.vector.SyncVectorEnv([recorded] * 2, autoreset_mode=mode)
-    envs.reset(seed=0)
-    ends = 0
-    for _ in range(12):
-        _, _, _, truncated, info = envs.step(np.zeros((2, 1), np.float32))
-        if truncated.any():
-            ends += 1
-            summary = info.get("final_info", info)[keys.EPISODE_SUMMARY]
-            assert summary["length"].tolist() == [4, 4] and summary["violations"].tolist() == [2, 2]
-            if mode is gym.vector.AutoresetMode.DISABLED:
-                envs.reset(options={"reset_mask": truncated})
-    assert ends >= 2
 
 
 # Costs of a task that has none ------------------------------------------------------------------------------------

@@ -9,11 +9,11 @@ import safe_wrappers as sw
 
 
 class Cart(gym.Env):
-    """x'' = u / unit, integrated exactly; keeps what it was given and its largest position between samples."""
+    """x'' = u, integrated exactly; keeps what it was given and its largest position between samples."""
 
-    def __init__(self, dt=0.1, latency_steps=0, unit=1.0):
-        self.dt, self.unit = dt, unit
-        self.action_space = gym.spaces.Box(-unit, unit, (1,), np.float32 if unit == 1.0 else np.float64)
+    def __init__(self, dt=0.1, latency_steps=0):
+        self.dt = dt
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
         self.latency_steps, self.given = latency_steps, []
 
@@ -26,7 +26,7 @@ class Cart(gym.Env):
 
     def step(self, action):
         self.given.append(action)
-        self.queue.append(float(np.asarray(action)[0]) / self.unit)
+        self.queue.append(float(np.asarray(action)[0]))
         a = self.queue.pop(0)
         x, v = self.state
         times = np.linspace(0.0, self.dt, 21)
@@ -40,10 +40,10 @@ def read(env):
     return env.state
 
 
-def cart_plant(dt=0.1, delay_s=0.0, unit=1.0):
+def cart_plant(dt=0.1, delay_s=0.0):
     return sw.AnalyticPlant(
         f=lambda x: np.array([x[1], 0.0]),
-        g=lambda x: np.array([[0.0], [1.0 / unit]]),
+        g=lambda x: np.array([[0.0], [1.0]]),
         state=read,
         control_dt=dt,
         delay_s=delay_s,
@@ -57,8 +57,7 @@ def wall(at, **more):
 
 
 def filtered_cart(constraints, *, dt=0.1, env=None, delay_s=0.0, **options):
-    env = env or Cart(dt)
-    return sw.CBFActionFilter(env, constraints, plant=cart_plant(dt, delay_s, env.unwrapped.unit), **options)
+    return sw.CBFActionFilter(env or Cart(dt), constraints, plant=cart_plant(dt, delay_s), **options)
 
 
 def full_throttle(filtered, steps, state=(0.0, 0.0)):
