@@ -187,6 +187,12 @@ def test_no_two_neighbours_are_farther_apart_than_the_limit_allows(scenario, par
     assert max(info["handover/peak_jerk"] for info, *_ in steps) <= scenario.limit
 
 
+@given(st.floats(0.05, 9.0), st.floats(0.001, 0.1))
+def test_the_rate_of_a_command_that_is_held_back_is_not_above_the_limit_by_rounding(limit, dt):
+    infos, _ = handed(Line(dt=dt), [np.zeros((1, 1)), np.ones((1, 1))], rate_limit=limit)
+    assert infos[1]["handover/limited"] and infos[1]["handover/peak_jerk"] <= limit
+
+
 def test_what_is_held_back_is_counted_where_the_dtype_hardly_resolves_the_limit():
     swing = np.float32(1e5 + 0.02 * (-1.0) ** np.arange(8)[:, None])
     chunks = [np.full((8, 1), 1e5, np.float32), *[swing] * 5]
