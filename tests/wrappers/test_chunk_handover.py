@@ -357,16 +357,17 @@ def test_a_position_commands_torque_is_that_of_the_equations_of_motion(name, lim
 # Slow chunks ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("entries", "steps", "delay"), [(2, 3, 0), (5, 4, 3), (9, 33, 0)])
+@pytest.mark.parametrize(("entries", "steps", "delay"), [(4, 2, 0), (5, 4, 3), (9, 33, 0)])
 def test_commands_between_entries_are_the_spline_through_them(entries, steps, delay):
     chunk = np.random.default_rng(0).uniform(-1, 1, (entries, 3))
     times, size = np.arange(entries) * steps, (entries - 1) * steps + 1
     options = {"inference_delay": delay, "steps_per_entry": steps, "rate_limit": 1e9}
-    _, sent = handed(Line(3, 9.0), [chunk], size - delay, **options)
+    infos, sent = handed(Line(3, 9.0), [chunk, np.full_like(chunk, np.nan)], size - delay, **options)
     spline = CubicHermiteSpline(times, chunk, np.gradient(chunk, steps, axis=0))
-    assert sent[delay:] == pytest.approx(spline(np.arange(delay, size - delay)), abs=1e-12)
-    exact = [k for k in range(entries) if delay <= times[k] < size - delay]
+    assert sent[delay:size] == pytest.approx(spline(np.arange(delay, size)), abs=1e-12)
+    exact = times >= delay
     assert np.array_equal(sent[times[exact]], chunk[exact])
+    assert infos[1]["handover/starved"] == size - 2 * delay  # then it has ended
 
 
 @pytest.mark.parametrize(("factor", "refused"), [(1.001, False), (0.999, True)])
