@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from worlds import Cart, Raw, SpeedRow, filtered_cart, full_throttle, wall
 
 import safe_wrappers as sw
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import brake
 
@@ -61,6 +62,7 @@ def test_what_is_executed_and_reported_is_the_projection_in_closed_form(proposal
         assert info["proposed_action"] == [shown] and info["executed_action"] == [float(sent[0])]
         assert info["cbf/correction"] == pytest.approx(abs(float(sent[0]) - shown), rel=1e-12)
         assert not (info["cbf/infeasible"] or info["cbf/unsafe"])
+    assert filtered.filter_calls == len(proposals) and 0.0 < filtered.filter_seconds < 60.0
 
 
 @pytest.mark.parametrize(
@@ -90,6 +92,7 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
         with warnings.catch_warnings(record=True, action="always") as caught:
             _, info = filtered.reset(seed=0, options={"state": [0.0, 1.5]})
             assert info["cbf/unsafe"] and info["cbf/margin"] == pytest.approx(-1.25)
+            assert info.keys() >= {*keys.CBF_BOOLS, *keys.CBF_FLOATS}
             assert [w.category for w in caught] == [sw.UnsafeStateWarning]
             infos = [filtered.step(np.ones(1, np.float32))[4] for _ in range(40)]
         assert len(caught) == 1
