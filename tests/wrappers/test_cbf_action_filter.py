@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds import Cart, Raw, SpeedRow, filtered_cart, full_throttle, wall
+from worlds import Cart, SpeedRow, filtered_cart, full_throttle, wall
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -104,13 +104,14 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
 # Fallbacks --------------------------------------------------------------------------------------------------------
 
 
-class Switch(sw.Constraint):
-    """Asks for nothing, or for what `wanted` says."""
+class Rows(sw.Constraint):
+    """Normals and offsets that can be changed, or none."""
 
-    wanted = None
+    def __init__(self, *fixed):
+        self.fixed = fixed
 
     def rows(self):
-        return sw.HalfSpaces.none(1) if self.wanted is None else sw.HalfSpaces(*map(np.array, self.wanted))
+        return sw.HalfSpaces(*map(np.array, self.fixed)) if self.fixed else sw.HalfSpaces.none(1)
 
 
 CAUSES = {
@@ -130,10 +131,10 @@ CAUSES = {
 )  # fmt: skip
 def test_where_nothing_is_found_the_fallback_acts_once_and_the_cause_is_said(cause, fallback, expected):
     # Bug 2: infeasible, and the unsafe action passed with "intervened" False; a failed solve poisoned the next.
-    filtered = started(SpeedRow(50.0), Switch(), fallback=fallback)
+    filtered = started(SpeedRow(50.0), Rows(), fallback=fallback)
     filtered.step(np.array([0.35], np.float32))
-    switch = filtered.filter.bound[1].spec
-    switch.wanted = CAUSES[cause]
+    rows = filtered.filter.bound[1].spec
+    rows.fixed = CAUSES[cause]
     info = filtered.step(PUSH)[4]
     assert info["cbf/fallback"] and info["cbf/intervened"]
     assert info["cbf/infeasible"] == (cause == "infeasible")
@@ -141,7 +142,7 @@ def test_where_nothing_is_found_the_fallback_acts_once_and_the_cause_is_said(cau
         expected = 0.1 if cause == "infeasible" else 0.0
     np.testing.assert_allclose(info["executed_action"], [expected], atol=1e-4)
     np.testing.assert_array_equal(filtered.unwrapped.given[-1], info["executed_action"])
-    switch.wanted = None
+    rows.fixed = ()
     info = filtered.step(PUSH)[4]
     assert not (info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/intervened"])
 
@@ -153,13 +154,13 @@ NO_NUMBER = "the fallback's control is a number or an array of numbers"
     ("control", "words"), [(["fast"], NO_NUMBER), ([10**400], NO_NUMBER), ([0.0, 0.0], r"got \(2,\)")]
 )  # fmt: skip
 def test_a_fallback_that_returns_no_control_is_an_error(control, words):
-    filtered = started(Raw(*CAUSES["infeasible"]), fallback=lambda plant: control)
+    filtered = started(Rows(*CAUSES["infeasible"]), fallback=lambda plant: control)
     with pytest.raises(ConfigurationError, match=words):
         filtered.step(np.zeros(1))
 
 
 def test_brake_on_mujoco_takes_the_kinetic_energy_away():
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [Raw(np.eye(2), [-5.0, -5.0])])
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [Rows(np.eye(2), [-5.0, -5.0])])
     filtered.reset(seed=0)
     raw = filtered.unwrapped
     raw.set_state(raw.data.qpos.copy(), np.array([3.0, -5.0, 0.0, 0.0]))

@@ -75,13 +75,3 @@ class SpeedRow(sw.Constraint):
     def rows(self):
         left = self.limit - self.plant.state[1]
         return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
-
-
-class Raw(sw.Constraint):
-    """Fixed rows, whatever the state."""
-
-    def __init__(self, normals, offsets):
-        self.half_spaces = sw.HalfSpaces(np.array(normals, float), np.array(offsets, float))
-
-    def rows(self):
-        return self.half_spaces
