@@ -175,7 +175,7 @@ def test_recipes_of_similar_names_are_told():
 @pytest.mark.parametrize("case", shelf.CASES, ids=lambda case: case.env_id)
 def test_an_attacker_breaks_no_limit_of_another_packages_env_in_silence(case):
     pytest.importorskip(case.needs or "gymnasium")
-    steps = {"": 60, "shimmy": 60}.get(case.needs, 4)
+    steps = {"": 60, "shimmy": 60}.get(case.needs, 3)
     on, off = (shelf.run(case, "attacking", filtered, steps) for filtered in (True, False))
     assert on["unflagged"] == 0 and on["violations"] <= off["violations"]
     if case.needs in ("", "gymnasium_robotics") and "MountainCar" not in case.env_id:
