@@ -188,10 +188,12 @@ def test_what_cannot_be_copied_is_simulated_by_forks():
         sw.protect(gym.make("BipedalWalker-v3"), plant=sw.SimulatorPlant())
 
 
-def test_an_asynchronous_vector_env_is_told_how_to_protect_each_env():
+def test_other_vector_envs_are_told_how_to_protect_each_env():
     vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="async")
     assert "gym.make_vec(..., wrappers=[sw.protect])" in refusal(vector)
     vector.close()
+    discrete = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
+    assert "discrete actions are shielded env by env" in refusal(discrete)
 
 
 def test_a_synchronous_vector_env_gets_one_filter_for_all_and_takes_the_same_options():
