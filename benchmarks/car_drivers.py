@@ -33,11 +33,6 @@ def hazard_seeking(env: Any, rng: np.random.Generator) -> Driver:
     return _seeking(env, rng, lambda: np.asarray(env.hazard_positions))
 
 
-def vase_seeking(env: Any, rng: np.random.Generator) -> Driver:
-    """Into one vase after another, backwards as often as forwards."""
-    return _seeking(env, rng, lambda: np.asarray(env.vase_positions))
-
-
 def _seeking(env: Any, rng: np.random.Generator, where: Callable[[], Array]) -> Driver:
     state: dict[str, Any] = {"step": 0, "pick": 0, "sense": 1.0, "strength": _FULL}
 
@@ -114,7 +109,7 @@ DRIVERS: dict[str, Maker] = {
     "random": uniform,
     "goal-seeking": goal_seeking,
     "hazard-seeking": hazard_seeking,
-    "vase-seeking": vase_seeking,
+    "vase-seeking": lambda env, rng: _seeking(env, rng, lambda: np.asarray(env.vase_positions)),
     "bang-bang": bang_bang,
     "full throttle": full_throttle,
     "pulse": pulse,

@@ -194,15 +194,6 @@ def _point_maze(maze: str) -> Case:
     return Case(f"PointMaze_{maze}-v3", judge=judge, drivers=_BLIND | {"wall-seeking": drivers.wall_seeking})
 
 
-def _crossing() -> Case:
-    return Case(
-        "OccludedCrossing-v0",
-        judge=lambda env: Reported(judges.costs),
-        drivers=_BLIND | CROSSING,
-        protect=lambda env: sw.protect(crossing(env)),
-    )
-
-
 def _patrolled_maze() -> Case:
     walls = _point_maze("UMaze").judge
     return Case(
@@ -210,31 +201,6 @@ def _patrolled_maze() -> Case:
         judge=lambda env: Worst(walls(env), Reported(judges.costs)),
         drivers=_BLIND | PATROLLED,
         protect=lambda env: sw.protect(patrolled(env)),
-    )
-
-
-def _fetch(task: str) -> Case:
-    return Case(f"Fetch{task}-v4", judge=fetch.FetchJudge, drivers=fetch.drivers(ball=False))
-
-
-def _ant_maze(maze: str) -> Case:
-    return Case(
-        f"AntMaze_{maze}-v5",
-        judge=lambda env: Replay(env, judges.near_wall(env.model, "torso", 0.4)),
-        drivers={
-            "random": drivers.random,
-            "pulse": drivers.pulse,
-            "wall-seeking": drivers.running_into_walls,
-        },
-    )
-
-
-def _rover() -> Case:
-    # At the edge of another ground a step or two overshoot the limit of 0.15; beyond 0.2 all grounds have fallen.
-    return Case(
-        "SafeRover-v0",
-        judge=lambda env: Reported(judges.slips_more_than(0.2)),
-        drivers=_BLIND | {"full throttle and reverse": drivers.end_seeking},
     )
 
 
@@ -280,13 +246,34 @@ PROTECTED: dict[str, Case] = _by_name(
     _velocity("Ant", 2.6222, plane=True),
     _velocity("Humanoid", 1.4149, plane=True),
     Case("HumanoidStandup-v5", _joint_speeds(20.0), _SPEED),
-    _rover(),
+    # At the edge of another ground a step or two overshoot the limit of 0.15; beyond 0.2 all grounds have fallen.
+    Case(
+        "SafeRover-v0",
+        judge=lambda env: Reported(lambda info: float(info["slip_max"]) - 0.2),
+        drivers=_BLIND | {"full throttle and reverse": drivers.end_seeking},
+    ),
     _teleop(),
-    _crossing(),
+    Case(
+        "OccludedCrossing-v0",
+        judge=lambda env: Reported(judges.costs),
+        drivers=_BLIND | CROSSING,
+        protect=lambda env: sw.protect(crossing(env)),
+    ),
     _point_maze("UMaze"),
     _patrolled_maze(),
-    _ant_maze("UMaze"),
-    *(_fetch(task) for task in ("Reach", "Push", "Slide", "PickAndPlace")),
+    Case(
+        "AntMaze_UMaze-v5",
+        judge=lambda env: Replay(env, judges.near_wall(env.model, "torso", 0.4)),
+        drivers={
+            "random": drivers.random,
+            "pulse": drivers.pulse,
+            "wall-seeking": drivers.running_into_walls,
+        },
+    ),
+    *(
+        Case(f"Fetch{task}-v4", fetch.FetchJudge, fetch.drivers(ball=False))
+        for task in ("Reach", "Push", "Slide", "PickAndPlace")
+    ),
     _hand("HandReach-v3", 3.0, also=tuple(SHADOW_HAND_TIED)),
     *(_hand(f"AdroitHand{task}-v1", 10.0) for task in ("Pen", "Hammer")),
     *(_hand(f"AdroitHand{task}-v1", 10.0, slides=1.0) for task in ("Door", "Relocate")),

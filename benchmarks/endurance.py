@@ -107,7 +107,10 @@ def run(chunk: Chunk) -> dict[str, Any]:
     """Attack, judge and count; then look at the process."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted
     row = learn(chunk) if chunk.driver == LEARNER else attack(chunk)
-    return asdict(chunk) | row | {"mb": used_mb(), "process": _process(), "versions": _versions()}
+    process = f"{os.getpid()} of {Path('/proc/self/stat').read_text().split()[21]}"
+    known = [f"{name} {importlib.metadata.version(name)}" for name in _VERSIONS]
+    versions = ", ".join([f"Python {platform.python_version()}", *known])
+    return asdict(chunk) | row | {"mb": used_mb(), "process": process, "versions": versions}
 
 
 def attack(chunk: Chunk) -> dict[str, Any]:
@@ -271,12 +274,3 @@ def used_mb() -> float:
     ctypes.CDLL(None).malloc_trim(0)
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2.0**20
-
-
-def _process() -> str:
-    return f"{os.getpid()} of {Path('/proc/self/stat').read_text().split()[21]}"
-
-
-def _versions() -> str:
-    known = [f"{name} {importlib.metadata.version(name)}" for name in _VERSIONS]
-    return ", ".join([f"Python {platform.python_version()}", *known])

@@ -100,10 +100,6 @@ def _hopper() -> gym.Env[Any, Any]:
     return sw.BalanceMonitor(sw.ContactMonitor(env))
 
 
-def _stance() -> gym.Env[Any, Any]:
-    return sw.CBFActionFilter(gym.make("Hopper-v5"), [sw.constraints.Stance(cone="exact")])
-
-
 def _teleop() -> gym.Env[Any, Any]:
     link = sw.teleop.Link(delay_s=0.02, jitter_s=0.004, loss=0.05)
     clamp = sw.constraints.Clearance(
@@ -139,7 +135,9 @@ _STACKS: dict[str, Make] = {
     ),
     "InvertedPendulum, a lease alone": _lease_alone,
     "Hopper, all contacts": _hopper,
-    "Hopper, stance": _stance,
+    "Hopper, stance": lambda: sw.CBFActionFilter(
+        gym.make("Hopper-v5"), [sw.constraints.Stance(cone="exact")]
+    ),
     "TeleopContact, over a network": _teleop,
 }
 

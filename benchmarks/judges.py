@@ -229,11 +229,6 @@ def faster_than(limit: float, plane: bool) -> Callable[[dict[str, Any]], float]:
     return missed
 
 
-def slips_more_than(limit: float) -> Callable[[dict[str, Any]], float]:
-    """The largest slip of any loaded wheel at any physics substep, as the task reports it, above `limit`."""
-    return lambda info: float(info["slip_max"]) - limit
-
-
 def costs(info: dict[str, Any]) -> float:
     """A cost at some physics substep, as the task judges itself: 1 or -1."""
     return 1.0 if info["cost_substep"] else -1.0

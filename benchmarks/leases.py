@@ -218,16 +218,11 @@ class CartAndWall(gym.Env[Array, Array]):
         self._reading = gap + share * self.drive.localisation, speed
 
 
-def full_brake(plant: Any) -> list[float]:
-    """The fallback."""
-    return [-1.0]
-
-
 def leased(cart: CartAndWall, drive: Drive) -> sw.LeaseExpiry:
     """The cart under a lease that knows its numbers."""
     bounds = {name: getattr(drive, name) for name in ("braking", "acceleration", "top_speed")}
     budget = sw.StoppingBudget(cart.reading, **bounds, delays_s=drive.to_brake_s + drive.age_s)
-    return sw.LeaseExpiry(cart, budget, max_lease_s=drive.longest_s, fallback=full_brake)
+    return sw.LeaseExpiry(cart, budget, max_lease_s=drive.longest_s, fallback=lambda plant: [-1.0])
 
 
 def episode(mode: str, seed: tuple[int, ...]) -> dict[str, Any]:

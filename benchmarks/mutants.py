@@ -3,11 +3,15 @@
     python -m benchmarks mutants                        # those that matter most, then 40 that are drawn; half an hour
     python -m benchmarks mutants --only filter lease    # in modules whose path has one of these words
     python -m benchmarks mutants --drawn 400 --seed 1   # more of them, and others
+    python -m benchmarks mutants --old                  # mistakes that the package once had, put back one by one
 
 A mistake is made in the syntax tree: a comparison turned round, + for -, another constant, `not` before a condition,
 min for max, a statement left out. The tests of a module are the files that mention most of its
 names. A mutant is killed if a test fails or is more than three times as late as without. Exit status 1 if one of
 those that matter survives, or is gone with its function.
+
+Old mistakes are in `old_bugs.yaml`: what went wrong for a user, the text that stands in a file exactly once, the text
+that puts it back, and the tests, where they are not those of the module. All of them matter; "gone" is the text.
 """
 
 import ast
@@ -24,6 +28,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import yaml
 
 from benchmarks.tables import markdown, options
 
@@ -80,6 +86,7 @@ _MATTER = {
 }
 MATTER = [Mutant(file, *one.rsplit(" ", 1)) for file, of in _MATTER.items() for one in of.split("; ")]
 """What a filter must never get wrong, the first mistake of a kind in a function each."""
+OLD: list[dict[str, str]] = yaml.safe_load(Path(__file__).with_name("old_bugs.yaml").read_text())
 
 
 def _mistakes(node: Any) -> Iterator[tuple[str, Callable[[], None]]]:
@@ -126,6 +133,9 @@ def every(package: Path, only: list[str]) -> list[Mutant]:
 
 def mistaken(text: str, mutant: Mutant) -> tuple[str, str] | None:
     """A module's text with a mistake, and the line that it is in; None if its function is gone."""
+    if mutant.kind == "old":
+        now, was = OLD[mutant.number]["now"], OLD[mutant.number]["was"]
+        return (text.replace(now, was), now.partition("\n")[0]) if text.count(now) == 1 else None
     tree = ast.parse(text)
     before = ast.unparse(tree).splitlines()
     made = [make for function, kind, make in mistakes(tree) if (function, kind) == mutant[1:3]]
@@ -135,6 +145,11 @@ def mistaken(text: str, mutant: Mutant) -> tuple[str, str] | None:
     changed = ast.unparse(ast.fix_missing_locations(tree))
     line = next((old for old, new in zip(before, changed.splitlines(), strict=False) if old != new), "")
     return changed, line.strip()
+
+
+def named_tests(mutant: Mutant) -> str:
+    """Those that the list of old mistakes names; "" for the module's."""
+    return OLD[mutant.number].get("tests", "") if mutant.kind == "old" else ""
 
 
 def tests_of(where: Path, file: str) -> list[str]:
@@ -189,13 +204,15 @@ def fails(where: Path, files: list[str], longest_s: float | None) -> bool:
 
 def verdicts(where: Path, mutants: list[Mutant]) -> Iterator[tuple[Mutant, str, str]]:
     """Of each mutant what became of it, and the line; module by module, the tests once without a mistake before."""
-    for file in dict.fromkeys(mutant.file for mutant in mutants):
+    for file, named in dict.fromkeys((mutant.file, named_tests(mutant)) for mutant in mutants):
         path = where / "safe_wrappers" / file
         text = path.read_text() if path.exists() else ""
-        files, began = tests_of(where, file) if text else [], time.monotonic()
+        files, began = named.split() or (tests_of(where, file) if text else []), time.monotonic()
         untested = not files or fails(where, files, None)
         longest_s = 30.0 + 3.0 * (time.monotonic() - began)
-        for number, mutant in enumerate(mutant for mutant in mutants if mutant.file == file):
+        for number, mutant in enumerate(mutants):
+            if (mutant.file, named_tests(mutant)) != (file, named):
+                continue
             made = mistaken(text, mutant)
             if made is None or untested:
                 yield mutant, "gone" if made is None else "untested", " ".join(files)
@@ -209,7 +226,7 @@ def verdicts(where: Path, mutants: list[Mutant]) -> Iterator[tuple[Mutant, str, 
 
 def main() -> None:
     """Print what became of each mutant, and a table of the areas."""
-    given = options(__doc__, only=[], drawn=40, seed=0)
+    given = options(__doc__, only=[], drawn=40, seed=0, old=False)
     os.environ |= {"MUJOCO_GL": "disabled", "OMP_NUM_THREADS": "1", "SAFE_WRAPPERS_COMPILED": "0"}
     for name in PRELOADED:
         importlib.import_module(name)
@@ -217,8 +234,13 @@ def main() -> None:
         where = Path(folder).resolve()
         copied(where)
         found = every(where / "safe_wrappers", given.only)
-        drawn = random.Random(given.seed).sample(found, min(given.drawn, len(found)))
-        matter = [m for m in MATTER if not given.only or any(word in m.file for word in given.only)]
+        drawn = random.Random(given.seed).sample(found, 0 if given.old else min(given.drawn, len(found)))
+        old = [Mutant(bug["file"], bug["bug"], "old", number) for number, bug in enumerate(OLD)]
+        matter = [
+            m
+            for m in (old if given.old else MATTER)
+            if not given.only or any(word in m.file for word in given.only)
+        ]
         counts: dict[str, Counter[str]] = {}
         bad = 0
         for mutant, verdict, line in verdicts(where, [*matter, *sorted(drawn)]):

@@ -6,6 +6,7 @@ an env whose own step does nothing.
 
 import importlib.util
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -50,19 +51,17 @@ def cycling(call: Callable[..., Any], items: list[Any]) -> Callable[[], Any]:
     return step
 
 
-def by_qpsolvers(solver: str) -> Callable[..., Any]:
+def by_qpsolvers(solver: str, *problem: np.ndarray) -> Any:
     """The same projection written for qpsolvers."""
-
-    def solve(u: np.ndarray, a: np.ndarray, b: np.ndarray, lo: np.ndarray, hi: np.ndarray) -> Any:
-        return qpsolvers.solve_qp(np.eye(u.size), -u, a, b, lb=lo, ub=hi, solver=solver)
-
-    return solve
+    u, a, b, lo, hi = problem
+    return qpsolvers.solve_qp(np.eye(u.size), -u, a, b, lb=lo, ub=hi, solver=solver)
 
 
 def projections(m: int, k: int, active: bool) -> Times:
     """One `project` beside qpsolvers' backends."""
     items = problems(m, k, active)
-    calls = {"project": sw.project} | {f"qpsolvers+{s}": by_qpsolvers(s) for s in ("daqp", "clarabel")}
+    others = {f"qpsolvers+{s}": partial(by_qpsolvers, s) for s in ("daqp", "clarabel")}
+    calls = {"project": sw.project} | others
     return paired_us({name: cycling(call, items) for name, call in calls.items()}, rounds=20)
 
 

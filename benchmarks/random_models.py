@@ -114,10 +114,6 @@ def trial(seed: int) -> tuple[str, str]:
     return "supported", ""
 
 
-def _sleeps(model: mujoco.MjModel) -> bool:
-    return bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
-
-
 def _simulate(env: Machine, seed: int) -> None:
     env.reset(seed=seed)
     for _ in range(STEPS):
@@ -126,14 +122,11 @@ def _simulate(env: Machine, seed: int) -> None:
 
 def _names_a_part(message: str, model: mujoco.MjModel) -> bool:
     """Whether a refusal says which part of the model is not supported."""
-    kinds = ("body", "jnt", "geom", "site", "tendon", "actuator", "eq")
-    names = [getattr(model, kind)(i).name for kind in kinds for i in range(getattr(model, _counts(kind)))]
+    kinds = ("body", "jnt", "geom", "site", "tendon", "eq")
+    counts = {"actuator": "nu", **{kind: f"n{kind}" for kind in kinds}}
+    names = [getattr(model, kind)(i).name for kind, n in counts.items() for i in range(getattr(model, n))]
     named = any(re.search(rf"\b{re.escape(name)}\b", message) for name in names if name)
     return named or bool(re.search(r"'#\d+'|no actuator|the model's \w+ (is|are)", message))
-
-
-def _counts(kind: str) -> str:
-    return {"body": "nbody", "actuator": "nu", "jnt": "njnt"}.get(kind, f"n{kind}")
 
 
 def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random) -> None:
@@ -208,7 +201,8 @@ def _check_forecast(onlooker: sw.MujocoPlant, machine: Machine, executed: Any) -
     end = onlooker.rollout(executed).states[-1]
     reached = np.concatenate([machine.data.qpos, machine.data.qvel])
     was_reset = machine.data.warning.number[mujoco.mjtWarning.mjWARN_BADQPOS :].any() and np.isnan(end).all()
-    rounding = 1e-3 if _sleeps(machine.model) else 0.0  # MuJoCo's state does not say who sleeps
+    sleeps = machine.model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    rounding = 1e-3 if sleeps else 0.0  # MuJoCo's state does not say who sleeps
     if not (was_reset or np.allclose(end, reached, rtol=0.0, atol=rounding, equal_nan=True)):
         raise DefectError(f"the forecast is {np.abs(end - reached).max():.3g} away from the env")
 

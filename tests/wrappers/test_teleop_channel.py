@@ -260,7 +260,7 @@ def test_waves_in_a_queue_are_as_old_as_they_are():
 
 
 class Liar(gym.Env):
-    """A port that shows no effort, and first resists with 5 N."""
+    """Publishes a `Port` that shows no effort, and first resists with 5 N."""
 
     dt, port_flow, port_effort_observed, port_feedthrough = TICK, [0], [0], 0.0
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
@@ -290,14 +290,14 @@ def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
 
 
 def watched(reading, braking=1e6, delays_s=0.0, **times):
-    """A cart whose clearance and speed are what a test says, and what an age of the command leads to."""
+    """A cart whose clearance and speed are what a test says, and what commands of some age, or none, lead to."""
     budget = sw.StoppingBudget(lambda env: reading["now"], braking, acceleration=0.0, delays_s=delays_s)
     env = cart(budget=budget, plant=cart_plant(TICK), fallback=stop, **times)
     reading["now"] = 1e3, 1.0
     env.reset(seed=0)
 
     def revoked(age=0):
-        env.set_observation_time(env.now_s - age * TICK)
+        env.set_observation_time(None if age is None else env.now_s - age * TICK)
         info = env.step(np.array([0.5, 0.0]))[4]
         assert info["executed_action"].tolist() == ([0.0, 1.0] if info["teleop/revoked"] else [0.5, 0.0])
         return info["teleop/revoked"]
@@ -332,6 +332,14 @@ def test_authority_goes_beyond_the_appendix_s_ceiling_and_returns_below_a_share_
     assert all(revoked(share) for _ in range(share - 1))  # of an image from before the revocation
     assert revoked(share + 1) and revoked(share + 1)  # of one from after it, but above the share
     assert not revoked(share) and not revoked(longest)
+
+
+def test_an_operator_who_is_silent_for_a_second_loses_authority_at_rest_too():
+    reading = {}
+    revoked = watched(reading)
+    reading["now"] = 1.0, 0.0
+    revoked()
+    assert [revoked(None) for _ in range(1005)] == [False] * 1000 + [True] * 5
 
 
 @pytest.mark.parametrize("answer", [(np.nan, 0.1), (0.1, np.inf), (-np.inf, 0.0), (0.1, 200.0)])

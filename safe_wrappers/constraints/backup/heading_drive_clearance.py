@@ -38,7 +38,7 @@ class HeadingDriveClearance(Detour, Model):
         state_error: Bound on the error of the measured position, m.
         uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
         detour: When a driving action is refused, first try the same drive while turning towards the nearer tangent of
-            the disc in the way, then turning alone; both only if admitted. No safety measure.
+            the disc in the way, then turning alone, then backing out; each only if admitted. No safety measure.
     """
 
     obstacles: Sequence[Any]
@@ -157,7 +157,9 @@ class HeadingDriveClearance(Detour, Model):
         if side == 0.0:
             return []
         self._keep_side(side)
-        return [self._pair(np.array([ahead, side])) for ahead in (drive, 0.0)]
+        # Close to a disc even turning in place is refused: it swings the axis about the centre of mass.
+        around = (drive, side), (0.0, side), (-drive, side), (-drive, 0.0)
+        return [self._pair(np.array(pair)) for pair in around]
 
     def _side_of_the_nearest(self, drive: float, turn: float) -> float:
         """Where to pass the disc ahead that a control comes nearest: 1 on the left, -1 on the right; 0: none is."""
