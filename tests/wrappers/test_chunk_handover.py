@@ -187,6 +187,12 @@ def test_no_two_neighbours_are_farther_apart_than_the_limit_allows(scenario, par
     assert max(info["handover/peak_jerk"] for info, *_ in steps) <= scenario.limit
 
 
+@given(st.floats(0.05, 9.0), st.floats(0.001, 0.1))
+def test_the_rate_of_a_command_that_is_held_back_is_not_above_the_limit_by_rounding(limit, dt):
+    infos, _ = handed(Line(dt=dt), [np.zeros((1, 1)), np.ones((1, 1))], rate_limit=limit)
+    assert infos[1]["handover/limited"] and infos[1]["handover/peak_jerk"] <= limit
+
+
 def test_what_is_held_back_is_counted_where_the_dtype_hardly_resolves_the_limit():
     swing = np.float32(1e5 + 0.02 * (-1.0) ** np.arange(8)[:, None])
     chunks = [np.full((8, 1), 1e5, np.float32), *[swing] * 5]
@@ -351,16 +357,17 @@ def test_a_position_commands_torque_is_that_of_the_equations_of_motion(name, lim
 # Slow chunks ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("entries", "steps", "delay"), [(2, 3, 0), (5, 4, 3), (9, 33, 0)])
+@pytest.mark.parametrize(("entries", "steps", "delay"), [(4, 2, 0), (5, 4, 3), (9, 33, 0)])
 def test_commands_between_entries_are_the_spline_through_them(entries, steps, delay):
     chunk = np.random.default_rng(0).uniform(-1, 1, (entries, 3))
     times, size = np.arange(entries) * steps, (entries - 1) * steps + 1
     options = {"inference_delay": delay, "steps_per_entry": steps, "rate_limit": 1e9}
-    _, sent = handed(Line(3, 9.0), [chunk], size - delay, **options)
+    infos, sent = handed(Line(3, 9.0), [chunk, np.full_like(chunk, np.nan)], size - delay, **options)
     spline = CubicHermiteSpline(times, chunk, np.gradient(chunk, steps, axis=0))
-    assert sent[delay:] == pytest.approx(spline(np.arange(delay, size - delay)), abs=1e-12)
-    exact = [k for k in range(entries) if delay <= times[k] < size - delay]
+    assert sent[delay:size] == pytest.approx(spline(np.arange(delay, size)), abs=1e-12)
+    exact = times >= delay
     assert np.array_equal(sent[times[exact]], chunk[exact])
+    assert infos[1]["handover/starved"] == size - 2 * delay  # then it has ended
 
 
 @pytest.mark.parametrize(("factor", "refused"), [(1.001, False), (0.999, True)])

@@ -273,6 +273,19 @@ def test_commands_pass_and_are_held_bit_for_bit_while_leases_last(dtype, given_a
     assert info["action/clipped"] == 1e300
 
 
+def test_a_fallback_is_asked_at_the_present_state_and_kept_finite_and_in_the_box():
+    answers, asked = iter([[np.nan, 1.0], [9.0, -9.0]]), []
+    env = leased(
+        BrakedCart(v=1.0), fallback=lambda plant: asked.append(plant.state.tolist()) or next(answers)
+    )
+    states = [env.reset()[0].tolist()]
+    for _ in range(2):
+        env.set_observation_time(None)
+        states.append(env.step(FULL)[0].tolist())
+    assert np.array(env.unwrapped.given).tolist() == [[0.0, 0.0], [1.0, 0.0]]
+    assert asked == states[:2]
+
+
 # Clearances, constraints and functions --------------------------------------------------------------------------
 
 RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]

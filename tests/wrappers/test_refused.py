@@ -220,6 +220,9 @@ def test_a_wrapper_refuses_what_it_cannot_work_with(name, words, error, on, argu
     [
         (sw.StoppingBudget, {"clearance": fixed, "acceleration": 1.0}, "acceleration and braking"),
         (sw.StoppingBudget, {"clearance": fixed, "braking": 1.0}, "acceleration and braking"),
+        (sw.StoppingBudget, {"clearance": RAIL, "acceleration": -1.0}, "acceleration must be .* >= 0"),
+        (sw.StoppingBudget, {"clearance": RAIL, "acceleration": 1.0, "delays_s": -0.1}, "delays_s"),
+        (sw.StoppingBudget, {"clearance": RAIL, "acceleration": 1.0, "top_speed": 0.0}, "top_speed"),
         (sw.StoppingBudget, {"clearance": RAIL}, "takes acceleration, and maybe top_speed"),
         (sw.StoppingBudget, {"clearance": RAIL, "acceleration": 1.0, "braking": 9.0}, "takes acceleration, and"),
         (sw.StoppingBudget, {"clearance": SPEED, "acceleration": 1.0}, "takes closing_speed; got"),
