@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds import Cart, SpeedRow, filtered_cart, full_throttle, wall
+from worlds import Cart, Raw, SpeedRow, filtered_cart, full_throttle, wall
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -104,16 +104,6 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
 # Fallbacks --------------------------------------------------------------------------------------------------------
 
 
-class Rows(sw.Constraint):
-    """Normals and offsets that can be changed, or none."""
-
-    def __init__(self, *fixed):
-        self.fixed = fixed
-
-    def rows(self):
-        return sw.HalfSpaces(*map(np.array, self.fixed)) if self.fixed else sw.HalfSpaces.none(1)
-
-
 CAUSES = {
     "infeasible": [[[1.0], [-1.0]], [-0.2, -0.4]],  # u <= -0.2 and u >= 0.4
     "not a number": [[[np.nan]], [1.0]],
@@ -131,7 +121,7 @@ CAUSES = {
 )  # fmt: skip
 def test_where_nothing_is_found_the_fallback_acts_once_and_the_cause_is_said(cause, fallback, expected):
     # Bug 2: infeasible, and the unsafe action passed with "intervened" False; a failed solve poisoned the next.
-    filtered = started(SpeedRow(50.0), Rows(), fallback=fallback)
+    filtered = started(SpeedRow(50.0), Raw(), fallback=fallback)
     filtered.step(np.array([0.35], np.float32))
     rows = filtered.filter.bound[1].spec
     rows.fixed = CAUSES[cause]
@@ -154,13 +144,13 @@ NO_NUMBER = "the fallback's control is a number or an array of numbers"
     ("control", "words"), [(["fast"], NO_NUMBER), ([10**400], NO_NUMBER), ([0.0, 0.0], r"got \(2,\)")]
 )  # fmt: skip
 def test_a_fallback_that_returns_no_control_is_an_error(control, words):
-    filtered = started(Rows(*CAUSES["infeasible"]), fallback=lambda plant: control)
+    filtered = started(Raw(*CAUSES["infeasible"]), fallback=lambda plant: control)
     with pytest.raises(ConfigurationError, match=words):
         filtered.step(np.zeros(1))
 
 
 def test_brake_on_mujoco_takes_the_kinetic_energy_away():
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [Rows(np.eye(2), [-5.0, -5.0])])
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [Raw(np.eye(2), [-5.0, -5.0])])
     filtered.reset(seed=0)
     raw = filtered.unwrapped
     raw.set_state(raw.data.qpos.copy(), np.array([3.0, -5.0, 0.0, 0.0]))

@@ -75,3 +75,13 @@ class SpeedRow(sw.Constraint):
     def rows(self):
         left = self.limit - self.plant.state[1]
         return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
+
+
+class Raw(sw.Constraint):
+    """Normals and offsets that can be changed, or none."""
+
+    def __init__(self, *fixed):
+        self.fixed = fixed
+
+    def rows(self):
+        return sw.HalfSpaces(*map(np.array, self.fixed)) if self.fixed else sw.HalfSpaces.none(1)
