@@ -175,7 +175,7 @@ def test_recipes_of_similar_names_are_told():
 @pytest.mark.parametrize("case", shelf.CASES, ids=lambda case: case.env_id)
 def test_an_attacker_breaks_no_limit_of_another_packages_env_in_silence(case):
     pytest.importorskip(case.needs or "gymnasium")
-    steps = {"": 60, "shimmy": 60}.get(case.needs, 4)
+    steps = {"": 60, "shimmy": 60}.get(case.needs, 3)
     on, off = (shelf.run(case, "attacking", filtered, steps) for filtered in (True, False))
     assert on["unflagged"] == 0 and on["violations"] <= off["violations"]
     if case.needs in ("", "gymnasium_robotics") and "MountainCar" not in case.env_id:
@@ -188,10 +188,12 @@ def test_what_cannot_be_copied_is_simulated_by_forks():
         sw.protect(gym.make("BipedalWalker-v3"), plant=sw.SimulatorPlant())
 
 
-def test_an_asynchronous_vector_env_is_told_how_to_protect_each_env():
+def test_other_vector_envs_are_told_how_to_protect_each_env():
     vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="async")
     assert "gym.make_vec(..., wrappers=[sw.protect])" in refusal(vector)
     vector.close()
+    discrete = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
+    assert "discrete actions are shielded env by env" in refusal(discrete)
 
 
 def test_a_synchronous_vector_env_gets_one_filter_for_all_and_takes_the_same_options():

@@ -9,6 +9,7 @@ import pytest
 from asking import Asked
 
 import safe_wrappers as sw
+from benchmarks.car_drivers import goal_seeking
 from safe_wrappers.errors import UnsafeStateWarning
 
 FULL = np.array([1.0, 1.0])
@@ -167,6 +168,14 @@ def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
     assert memory["detour"] == (-1.0, 25)
     limit.observe(memory)  # not needed in this step
     assert limit.executed(FULL)["detour"] == (-1.0, 24)
+
+
+def test_a_car_that_is_wedged_between_obstacles_turns_the_other_way():
+    """Without that it stands there in 448 of these steps."""
+    env = sw.StuckEscape(sw.protect(gym.make("SafeCarGoal2-v0")), progress=0.1, escape_s=0)
+    env.reset(seed=1_000_002)
+    driver = goal_seeking(env.unwrapped, np.random.default_rng(0))
+    assert sum(env.step(driver())[4]["cbf/stuck"] for _ in range(600)) < 300
 
 
 def test_what_does_not_rest_within_the_horizon_is_refused_however_far_it_stays_away():

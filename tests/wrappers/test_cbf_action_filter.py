@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from worlds import Cart, Raw, SpeedRow, filtered_cart, full_throttle, wall
 
 import safe_wrappers as sw
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import brake
 
@@ -61,6 +62,7 @@ def test_what_is_executed_and_reported_is_the_projection_in_closed_form(proposal
         assert info["proposed_action"] == [shown] and info["executed_action"] == [float(sent[0])]
         assert info["cbf/correction"] == pytest.approx(abs(float(sent[0]) - shown), rel=1e-12)
         assert not (info["cbf/infeasible"] or info["cbf/unsafe"])
+    assert filtered.filter_calls == len(proposals) and 0.0 < filtered.filter_seconds < 60.0
 
 
 @pytest.mark.parametrize(
@@ -90,6 +92,7 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
         with warnings.catch_warnings(record=True, action="always") as caught:
             _, info = filtered.reset(seed=0, options={"state": [0.0, 1.5]})
             assert info["cbf/unsafe"] and info["cbf/margin"] == pytest.approx(-1.25)
+            assert info.keys() >= {*keys.CBF_BOOLS, *keys.CBF_FLOATS}
             assert [w.category for w in caught] == [sw.UnsafeStateWarning]
             infos = [filtered.step(np.ones(1, np.float32))[4] for _ in range(40)]
         assert len(caught) == 1
@@ -99,15 +102,6 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
 
 
 # Fallbacks --------------------------------------------------------------------------------------------------------
-
-
-class Switch(sw.Constraint):
-    """Asks for nothing, or for what `wanted` says."""
-
-    wanted = None
-
-    def rows(self):
-        return sw.HalfSpaces.none(1) if self.wanted is None else sw.HalfSpaces(*map(np.array, self.wanted))
 
 
 CAUSES = {
@@ -127,10 +121,10 @@ CAUSES = {
 )  # fmt: skip
 def test_where_nothing_is_found_the_fallback_acts_once_and_the_cause_is_said(cause, fallback, expected):
     # Bug 2: infeasible, and the unsafe action passed with "intervened" False; a failed solve poisoned the next.
-    filtered = started(SpeedRow(50.0), Switch(), fallback=fallback)
+    filtered = started(SpeedRow(50.0), Raw(), fallback=fallback)
     filtered.step(np.array([0.35], np.float32))
-    switch = filtered.filter.bound[1].spec
-    switch.wanted = CAUSES[cause]
+    rows = filtered.filter.bound[1].spec
+    rows.fixed = CAUSES[cause]
     info = filtered.step(PUSH)[4]
     assert info["cbf/fallback"] and info["cbf/intervened"]
     assert info["cbf/infeasible"] == (cause == "infeasible")
@@ -138,7 +132,7 @@ def test_where_nothing_is_found_the_fallback_acts_once_and_the_cause_is_said(cau
         expected = 0.1 if cause == "infeasible" else 0.0
     np.testing.assert_allclose(info["executed_action"], [expected], atol=1e-4)
     np.testing.assert_array_equal(filtered.unwrapped.given[-1], info["executed_action"])
-    switch.wanted = None
+    rows.fixed = ()
     info = filtered.step(PUSH)[4]
     assert not (info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/intervened"])
 

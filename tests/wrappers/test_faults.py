@@ -136,23 +136,20 @@ def test_without_a_receiver_the_robot_goes_on_with_the_last_command(kind):
         assert executed[0] == pytest.approx(last / 1000.0)
 
 
-@every_fault
 @pytest.mark.parametrize("bad", [[np.nan, 0.0], [0.0], ["fast", 0.0], 1.0])
-def test_what_is_no_action_is_refused_and_not_carried(kind, bad):
+def test_what_is_no_action_is_refused_at_once_though_it_would_never_arrive(bad):
     cart = BrakedCart()
-    env = faulty(kind, cart)
+    env = RepeatedCommands(sw.RecordInterventions(cart), 1.0)
     env.reset(seed=0)
     with pytest.raises(ActionError):
         env.step(bad)
     assert not cart.given
-    deciding = faulty(kind, leased(BrakedCart()))
-    deciding.reset(seed=0)
-    if np.size(bad) == 2 and bad[0] != "fast":  # a lease has an answer to what is not finite
-        info = deciding.step(np.array(bad))[4]
-        assert info["lease/refused"] != info["fault/active"]
-    else:
-        with pytest.raises(ActionError):
-            deciding.step(bad)
+
+
+def test_a_layer_inside_that_decides_gets_what_is_not_finite():
+    env = RepeatedCommands(leased(BrakedCart()), 0.0)
+    env.reset(seed=0)
+    assert env.step(np.array([np.nan, 0.0]))[4]["lease/refused"]
 
 
 # Random -----------------------------------------------------------------------------------------------------------

@@ -98,6 +98,7 @@ def test_planes_are_moved_by_what_is_kept_free():
     assert point["pos"][0] == env.unwrapped.data.qpos[0] and point["size"][0] == 0.1
 
 
+@pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
 def test_a_box_that_is_kept_has_its_edges_and_what_is_kept_out_its_size():
     ball = sw.constraints.Sphere([0.1, 0.1, 0.01], 0.05)
     block = sw.constraints.Box([0.0, -0.1, 0.0], [0.03, 0.02, 0.01])

@@ -78,10 +78,10 @@ class SpeedRow(sw.Constraint):
 
 
 class Raw(sw.Constraint):
-    """Fixed rows, whatever the state."""
+    """Normals and offsets that can be changed, or none."""
 
-    def __init__(self, normals, offsets):
-        self.half_spaces = sw.HalfSpaces(np.array(normals, float), np.array(offsets, float))
+    def __init__(self, *fixed):
+        self.fixed = fixed
 
     def rows(self):
-        return self.half_spaces
+        return sw.HalfSpaces(*map(np.array, self.fixed)) if self.fixed else sw.HalfSpaces.none(1)

@@ -27,8 +27,9 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
 _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
-# Shares of the drive for the outer and the inner actuator of a detour, as they are tried.
-_AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
+# Shares of the drive for the outer and the inner actuator of a detour, as they are tried. The last two turn the other
+# way, for a machine that is wedged between obstacles.
+_AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0), (-1.0, -0.5), (-1.0, 1.0))
 
 
 @dataclass
@@ -206,7 +207,7 @@ class CoastingClearance(Detour, Model):
         return [*around, 0.5 * acting, self._still]
 
     def _around(self, acting: Array) -> list[Array]:
-        """The same drive turning ever more, then backing out while turning, all to the side that leads around."""
+        """The drive turning ever more, then backing out while turning, to the side that leads around; then away."""
         drive = float(acting[np.abs(acting).argmax()])
         if float(acting.sum()) * drive <= 0.0:
             return []  # turning on the spot, or no drive at all
