@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import stable_baselines3
 import torch
-from fake_task import FILMED
+from fake_task import FILMED, FakeGoal
 from running import Reports, episodes, evaluated, finish, killed_after, resumed, scalars, trained
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -62,6 +62,28 @@ def test_same_seed_same_run_and_other_seed_other_run(kept, fake_experiment):
     experiment = fake_experiment("name=again", *FILMED)
     first, other = (episodes(kept.run_folder(kept.arms[1], seed)) for seed in (0, 1))
     assert episodes(trained(experiment)) == first != other
+
+
+def test_neither_neighbouring_seeds_nor_the_parts_of_a_run_share_an_episode(fake_experiment, monkeypatch):
+    starts, reset = [], FakeGoal.reset
+
+    def noted(self, **options):
+        observation, info = reset(self, **options)
+        starts.append(tuple(observation))
+        return observation, info
+
+    monkeypatch.setattr(FakeGoal, "reset", noted)
+    experiment, parts = fake_experiment(), []
+    for train in (
+        lambda: killed_after(experiment, 2, monkeypatch),
+        lambda: trained(experiment),
+        lambda: trained(experiment, seed=1),
+    ):
+        starts.clear()
+        train()
+        parts.append(set(starts))
+    assert all(len(part) > 10 for part in parts)
+    assert len(set.union(*parts)) == sum(map(len, parts))
 
 
 def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypatch):

@@ -43,6 +43,30 @@ def test_a_move_into_a_pit_is_masked_and_replaced_by_the_preferred_one(prefers):
     assert refused > 20
 
 
+class FromFive(Grid):
+    """The same moves, numbered from 5."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = gym.spaces.Discrete(4, start=5)
+
+    def step(self, action):
+        return super().step(action - 5)
+
+
+def test_numbers_of_actions_begin_where_the_space_s_do():
+    env = sw.ActionShield(FromFive(), [sw.constraints.PredictiveShield("cost", 2, backup=[5, 6, 7, 8])])
+    env.reset(seed=0)
+    for action in np.random.default_rng(0).integers(5, 9, 60).tolist():
+        masks = env.action_masks()
+        np.testing.assert_array_equal(masks, ~pits(env.unwrapped.at))
+        _, _, terminated, _, info = env.step(action)
+        assert env.action_space.contains(int(info["executed_action"][0]))
+        assert info["cbf/intervened"] == (not masks[action - 5])
+        if terminated:
+            env.reset()
+
+
 @pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
 def test_if_nothing_is_admitted_that_is_said_and_what_violates_least_is_left():
     # h falls to the right: every move but that one is as bad as staying.
