@@ -65,6 +65,13 @@ def test_distance_is_signed_and_its_gradient_is_the_normal(name, size, data):
         np.testing.assert_allclose(near.normal[0], gradient, atol=1e-4)
 
 
+@pytest.mark.parametrize("kind", [sw.constraints.Disc, sw.constraints.Sphere])
+def test_at_the_very_centre_there_is_a_way_out(kind):
+    obstacle = kind([0.3, -0.2, 0.1][: kind.coordinates], 0.5)
+    near = obstacle.nearest(np.array(obstacle.center), None)
+    assert near.distance[0] == -0.5 and np.linalg.norm(near.normal[0]) == 1.0
+
+
 @every_shape
 def test_curvature_is_what_sideways_motion_gains(name, size):
     # The second derivative of the distance along a straight line is curvature times (speed along it)^2.

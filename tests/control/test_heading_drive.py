@@ -87,6 +87,19 @@ def test_clearances_are_those_of_mujocos_steps_until_it_rests(control):
         )
 
 
+def test_what_an_uncertain_machine_leaves_is_told_of_each_model_apart():
+    drive, rng = robot()[2], np.random.default_rng(5)
+    models = np.array([drive, *drive.corners(0.25)], dtype=np.float64)
+    for _ in range(10):
+        given = np.array(random_motion(rng)), *rng.uniform(-1.0, 1.0, 2)
+        discs = np.column_stack([rng.uniform(-1.2, 1.2, (6, 2)), np.full(6, 0.1)])
+        every = clearances(models, *given, discs, True)
+        alone = clearances(models[:1], *given, discs, True)
+        others = [clearances(models[[0, i]], *given, discs, True)[:, 6:] for i in range(1, len(models))]
+        np.testing.assert_array_equal(every, np.concatenate([alone, *others], axis=1))
+        assert (others != alone).any()
+
+
 def test_no_braking_gets_farther_than_its_reach():
     _, _, drive = robot()
     rng, places = np.random.default_rng(6), np.empty((drive.substeps, 2))

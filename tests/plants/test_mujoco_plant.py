@@ -331,8 +331,9 @@ def test_the_state_is_predicted_over_whole_holds_of_delay(delay):
 
 
 @pytest.mark.parametrize("delay", [0.03, 0.07, 0.12])
-def test_the_state_is_predicted_over_fractions_of_a_hold(delay):
-    check_delay(delay, [0.3, -0.7, 1.0, 0.4])
+@pytest.mark.parametrize("executed", [4, 1, 0])  # in a young episode nothing, and then little, is in flight
+def test_the_state_is_predicted_over_fractions_of_a_hold(delay, executed):
+    check_delay(delay, [0.3, -0.7, 1.0, 0.4][:executed])
 
 
 def check_delay(delay, commands):
@@ -344,6 +345,14 @@ def check_delay(delay, commands):
         plant.executed(np.array([u]))
     plant.observe()
     np.testing.assert_allclose(plant.state, delayed_truth(0.2, 1.5, commands, 0.05, delay), atol=1e-12)
+
+
+def test_a_state_that_is_no_number_is_not_predicted_to_be_one():
+    env = Scene(CART, frame_skip=5)
+    plant = bound(env, delay_s=0.07)
+    env.data.qvel[0] = np.nan  # MuJoCo would step on from its own reset
+    plant.observe()
+    assert np.isnan(plant.state).any()
 
 
 def test_forgetting_clears_the_commands_in_flight():

@@ -202,3 +202,26 @@ def test_a_task_s_own_cost_is_not_hidden():
     with pytest.raises(sw.SafeWrappersError, match="reports a cost of its own"):
         env.reset(seed=0)
         env.step(env.action_space.high)
+
+
+class SameInfo(Scripted):
+    """Hands out one dict, with one array in it, at every step."""
+
+    def __init__(self, infos):
+        super().__init__(infos)
+        self.seen, self.info = np.zeros(1, bool), {}
+
+    def step(self, action):
+        *answer, info = super().step(action)
+        self.seen[:] = info[keys.OCCLUSION_VISIBLE]
+        self.info |= {keys.OCCLUSION_VISIBLE: self.seen, keys.COST: info[keys.COST]}
+        return *answer, self.info
+
+
+def test_an_env_may_write_every_step_into_the_same_info():
+    script = [{keys.OCCLUSION_VISIBLE: seen, keys.COST: float(seen)} for seen in (True, True, True, False)]
+    _, summary, _ = play(sw.RecordInterventions(SameInfo(script)))
+    assert summary["seen"] == 0.75 and summary["cost"] == 3.0
+    env = sw.ChunkHandover(SameInfo(script), 4, 4, rate_limit=1e9, fallback="zero")
+    env.reset(seed=0)
+    assert env.step(np.zeros((4, 1), np.float32))[4][keys.COST] == 3.0
