@@ -78,8 +78,14 @@ class Session:
 
     def __init__(self, name):
         self.name, found = name, []
-        self.env = build(name, next(iter(EXAMPLES[name])), lambda env: found.append(Bottom(env)) or found[-1])
-        self.bottom, self.actions = found[0], actions(self.env, LONG)
+
+        def around(env):
+            found.append(Bottom(env))
+            return found[-1]
+
+        self.env = build(name, next(iter(EXAMPLES[name])), around)
+        (self.bottom,) = found
+        self.actions = actions(self.env, LONG)
 
     def begin(self):
         self.env.reset(seed=0)
