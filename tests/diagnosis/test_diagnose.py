@@ -1,5 +1,6 @@
 """diagnose: what was planted ranks first and is treated; what is healthy has no symptom; the env stays as it was."""
 
+import itertools
 import math
 import warnings
 
@@ -42,8 +43,9 @@ def test_a_healthy_env_has_no_symptom(name):
 
 def test_the_env_is_left_as_it_was_and_two_diagnoses_are_the_same():
     env = gym.make("Swimmer-v5")
+    stack = str(env)
     first, second = (str(diagnose(env, steps=50, seed=3)) for _ in range(2))
-    assert first == second
+    assert first == second and str(env) == stack
     observation, _ = env.reset(seed=5)
     plain = gym.make("Swimmer-v5")
     assert np.array_equal(observation, plain.reset(seed=5)[0])
@@ -209,10 +211,10 @@ def test_findings_are_ranked_and_told():
 
 
 def test_what_presses_all_the_time_is_no_impact():
-    env = Bench(CART.format(stiffness=20_000), [0.955])
-    policy = lambda observation: np.array([20.0])  # noqa: E731
-    finding = found(env, policy, steps=300)["contact_forces"]
-    assert finding.figure < 60.0 and not finding.present  # 20 N on a cart of 9.8 N
+    env = Bench(CART.format(stiffness=20_000).replace("-20 20", "-700 700"), [0.95])
+    pushes = itertools.chain(np.linspace(0.0, 700.0, 100), itertools.repeat(700.0))  # N, on a cart of 9.8 N
+    finding = found(env, lambda observation: np.array([next(pushes)]), steps=300)["contact_forces"]
+    assert finding.figure < 10.0 and not finding.present
 
 
 ROVER = """

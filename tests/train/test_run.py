@@ -1,6 +1,7 @@
 """One run in this process: where it resumes, what it refuses, what it leaves behind."""
 
 import json
+import os
 import random
 import resource
 import shutil
@@ -36,6 +37,19 @@ def test_a_half_written_last_row_is_none(tmp_path):
         path.write_bytes(wrong)
         with pytest.raises(RunStateError, match="is no table of numbers"):
             read_rows(path)
+
+
+def test_a_file_is_the_old_one_or_the_new_one(tmp_path, monkeypatch):
+    path = tmp_path / "episodes.csv"
+    write_rows(path, ("cost",), [{"cost": 1.0}])
+
+    def killed(file):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_rows(path, ("cost",), [{"cost": 2.0}])
+    assert read_rows(path) == [{"cost": 1.0}]
 
 
 def test_a_run_leaves_rows_logs_and_a_policy_and_is_not_run_again(finished):
