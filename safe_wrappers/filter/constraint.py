@@ -46,7 +46,7 @@ class Constraint:
     Attributes:
         promise: What holds for an executed control that is not flagged: "proved" or "best effort".
         margin: Kept free before the limit, in the unit of h.
-        state_error: Bound on the error of what is measured, in the same unit. Its own h or rows count it, no one else.
+        state_error: Bound on the error of what is measured, in the same unit. Only its own h or rows count it.
         horizon: Control intervals of the trajectory.
         max_decrease: The most that h can fall within `horizon` control steps; states with more than that left need
             no trajectory. It is checked at every step, and dropped with a warning when broken. None: unknown.
