@@ -104,8 +104,12 @@ bench: .venv/bench
 shelf: .venv/shelf
 	$(BIN)/python -m benchmarks shelf
 
+.venv/sbx: .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[sbx]'
+	@touch $@
+
 # What safety costs in return, task by task: days on two cores; goes on where it was stopped.
-table: .venv/installed
+table: .venv/sbx
 	$(BIN)/python -m benchmarks table
 
 # Attackers against the proved filters, 20,000,000 steps: hours on one core; goes on where it was stopped.

@@ -54,6 +54,8 @@ def changed(**settings):
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_config_of_the_repo_is_valid_and_fits_the_schema_that_it_names(path):
     assert path.read_text().startswith("# yaml-language-server: $schema=schema.json\n")
+    if "sbx." in path.read_text():
+        pytest.importorskip("sbx")
     assert fits(read_config(path), SCHEMA)
     # As editors read it: in YAML 1.2 100_000 is a text.
     text = re.sub(r"\b(\d[\d]*_[\d_]*)\b", r'"\1"', path.read_text())
@@ -61,7 +63,7 @@ def test_every_config_of_the_repo_is_valid_and_fits_the_schema_that_it_names(pat
     experiment = parse_experiment(read_config(path))
     assert experiment.name == path.stem
     kinds = {arm.name: arm.filter.kind for arm in experiment.arms}
-    assert "none" in kinds.values() or path.stem == "pointgoal1_learners"
+    assert "none" in kinds.values() or path.stem in ("pointgoal1_learners", "goal_leads")
     assert experiment.evaluation_filter.kind == "protect"
 
 
