@@ -172,11 +172,13 @@ def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
 
 
 def test_a_car_that_is_wedged_between_obstacles_turns_the_other_way():
-    """Without that it stands there in 448 of these steps."""
+    """Without that it stands there in 658 of these steps."""
     env = sw.StuckEscape(sw.protect(gym.make("SafeCarGoal2-v0")), progress=0.1, escape_s=0)
-    env.reset(seed=1_000_002)
-    driver = goal_seeking(env.unwrapped, np.random.default_rng(0))
-    assert sum(env.step(driver())[4]["cbf/stuck"] for _ in range(600)) < 300
+    driver, stuck = goal_seeking(env.unwrapped, np.random.default_rng(0)), 0
+    for seed in (2, 3):
+        env.reset(seed=1_000_000 + seed)
+        stuck += sum(env.step(driver())[4]["cbf/stuck"] for _ in range(600))
+    assert stuck < 450
 
 
 def test_what_does_not_rest_within_the_horizon_is_refused_however_far_it_stays_away():
