@@ -6,6 +6,7 @@ One table has what is refused, by the command and, where it can know, by the sch
 import json
 import re
 import runpy
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -28,8 +29,11 @@ from safe_wrappers.train.config import (
     read_config,
     stored_arm,
 )
+from safe_wrappers.train.config.algorithms import algorithm_class
 from safe_wrappers.train.experiment import check_training
+from safe_wrappers.train.processes.on_ray import check_place
 from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.trackers import check_trackers
 
 ROOT = Path(__file__).parents[2]
 CONFIGS, DOCS = ROOT / "configs", ROOT / "docs"
@@ -249,6 +253,9 @@ UNSEEN = [
     (judged("Reacher-v5", "fake_task:without_h"), "env.judge: RowsOnly has no h "),
     (judged("Pendulum-v1", "fake_task:slow_pendulum", delay_s=0.05), "the filter's plant looks 0.05 s ahead"),
     (judged("Pendulum-v1", "gymnasium:Wrapper"), "env.judge: the filter has no constraints and plant"),
+    (of_env("test_algorithms:DictGoal-v0") | {"algorithm": "sbx.PPO"}, "unfiltered: sbx.PPO observes one array"),
+    (of_env("test_algorithms:DictGoal-v0", kwargs={"shape": [1, 2]}) | {"algorithm": "sbx.SAC"},
+     "arms.unfiltered: sbx.SAC observes one array, or"),
 ]  # fmt: skip
 
 
@@ -260,6 +267,21 @@ def test_what_is_refused_and_with_which_words(settings, message):
         check_training(changed(**settings))
     assert message in str(refusal.value)
     assert fits({**MINIMAL, **settings}, SCHEMA) == ((settings, message) in UNSEEN)
+
+
+@pytest.mark.parametrize(
+    ("package", "use", "extra"),
+    [
+        ("sb3_contrib", lambda: algorithm_class("TQC"), "contrib"),
+        ("sbx", lambda: algorithm_class("sbx.SAC"), "sbx"),
+        ("wandb", lambda: check_trackers(changed(trackers=["wandb"]).arms[0]), "wandb"),
+        ("ray", lambda: check_place("ray"), "ray"),
+    ],
+)
+def test_a_package_that_is_not_installed_is_named(monkeypatch, package, use, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ConfigurationError, match=rf"pip install 'safe-wrappers\[{extra}\]'"):
+        use()
 
 
 # The schema -------------------------------------------------------------------------------------------------------

@@ -68,7 +68,11 @@ def policy(reacher, tmp_path):
     return shutil.copytree(reacher / "policy", tmp_path / "policy")
 
 
-@pytest.mark.parametrize("settings", [None, SAC, DQN, SBX], ids=["PPO", "SAC", "DQN", "sbx"])
+@pytest.mark.parametrize(
+    "settings",
+    [None, SAC, DQN, pytest.param(SBX, marks=pytest.mark.slow)],
+    ids=["PPO", "SAC", "DQN", "sbx"],
+)
 def test_its_folder_acts_as_the_run_does(settings, reacher, tmp_path):
     if settings is SBX:
         pytest.importorskip("sbx")
