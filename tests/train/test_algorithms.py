@@ -131,7 +131,7 @@ def one_arm(fake_experiment, algorithm, learner, *overrides):
 def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, algorithm):
     experiment = one_arm(fake_experiment, algorithm, "safe_action" if algorithm in OFF_POLICY else "naive")
     (arm,), (job,) = experiment.arms, training_jobs(one_arm(fake_experiment, algorithm, "naive", "seeds=[0]"))
-    folder = killed_after(experiment, 1, monkeypatch, arm=0)
+    folder = killed_after(experiment, 1, arm=0)
     assert latest_checkpoint(folder / "checkpoints").timesteps == 64
     model = resumed(arm, folder)
     assert type(model) is algorithm_class(algorithm)

@@ -92,7 +92,7 @@ def test_neither_neighbouring_seeds_nor_the_parts_of_a_run_share_an_episode(fake
     monkeypatch.setattr(FakeGoal, "reset", noted)
     experiment, parts = fake_experiment(), []
     for train in (
-        lambda: killed_after(experiment, 2, monkeypatch),
+        lambda: killed_after(experiment, 2),
         lambda: trained(experiment),
         lambda: trained(experiment, seed=1),
     ):
@@ -114,7 +114,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypa
     experiment = fake_experiment(
         "total_steps=768", "normalize.reward=true", "hyperparameters.learning_rate=linear_1e-3"
     )
-    folder = killed_after(experiment, 2, monkeypatch)
+    folder = killed_after(experiment, 2)
     rows = episodes(folder)
     assert latest_checkpoint(folder / "checkpoints").timesteps == 256
     assert [row for row in rows if row["timesteps"] > 256]  # whose rows must not be counted twice
@@ -142,7 +142,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypa
 
 def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment, monkeypatch):
     experiment = fake_experiment(*SAC, "total_steps=320")
-    folder = killed_after(experiment, 1, monkeypatch)
+    folder = killed_after(experiment, 1)
     buffer = resumed(experiment.arms[1], folder).replay_buffer
     assert buffer.size() == latest_checkpoint(folder / "checkpoints").timesteps == 128
     assert buffer.buffer_size == 320  # not a million: it would be saved with every checkpoint
@@ -164,9 +164,9 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     # Raised, it fills a new buffer before it learns.
     trained_at, train = [], stable_baselines3.SAC.train
 
-    def noting(self, *given):
+    def noting(self, **given):
         trained_at.append(self.num_timesteps)
-        train(self, *given)
+        train(self, **given)
 
     monkeypatch.setattr(stable_baselines3.SAC, "train", noting)
     reports = Reports()
@@ -273,10 +273,10 @@ def test_a_start_that_fails_leaves_the_folder_to_the_corrected_command(fake_expe
 
 
 def test_a_checkpoint_that_cannot_be_read_is_named_and_without_it_the_one_before_counts(
-    fake_experiment, monkeypatch
+    fake_experiment,
 ):
-    experiment = fake_experiment("total_steps=512")
-    folder = killed_after(experiment, 3, monkeypatch)
+    experiment = fake_experiment("total_steps=640")
+    folder = killed_after(experiment, 3)
     older, newer = sorted((folder / "checkpoints").glob("step_*"))
     model = newer / "model.zip"
     model.write_bytes(model.read_bytes()[:-100])
@@ -286,7 +286,7 @@ def test_a_checkpoint_that_cannot_be_read_is_named_and_without_it_the_one_before
     shutil.rmtree(newer)
     assert latest_checkpoint(folder / "checkpoints").folder == older
     trained(experiment)
-    assert finish(folder)["timesteps"] == 512
+    assert finish(folder)["timesteps"] == 640
 
 
 def test_two_processes_do_not_train_one_run_and_a_killed_one_holds_no_folder(fake_experiment, monkeypatch):
