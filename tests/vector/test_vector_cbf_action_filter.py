@@ -3,7 +3,6 @@
 The oracle is Gymnasium's own vector env around `CBFActionFilter`s.
 """
 
-import copy
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -189,15 +188,6 @@ def test_after_a_reset_nothing_is_left_of_the_last_episode():
     play(alike, together, forward * np.nan)  # held: nothing yet in the new episode
     play(alike, together, forward.repeat(3, axis=0))
     play(alike, together, forward * np.nan, seed=None)  # held: the last action
-
-
-def test_a_copy_plays_alike_and_leaves_the_original_alone():
-    alike, together = at_hazard().pair()
-    play(alike, together, script(alike, 4))
-    copied = copy.deepcopy(together)  # Gymnasium's envs are made anew
-    there = [env.unwrapped.data.qpos.copy() for env in together.env.envs]
-    assert play(alike, copied, script(alike)) > 3
-    np.testing.assert_equal([env.unwrapped.data.qpos for env in together.env.envs], there)
 
 
 def test_a_state_that_is_not_a_number_runs_the_fallback_and_a_start_outside_is_warned_of():
