@@ -229,21 +229,17 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
         assert {"interventions/goals_reached", "evaluation_filter_off/return"} <= written
         assert not [tag for tag in written if "cost" in tag or "violations" in tag or "lease" in tag]
         assert ("interventions/infeasible" in written) == (arm.name == "filtered")
-        assert "evaluation_filter_on/infeasible" in written
-        of_the_filter = {
-            f"evaluation_filter_off/{key}" for key in ("infeasible", "unsafe", "correction_mean")
+        of_filter = {
+            tag.removeprefix("evaluation_") for tag in written if "infeasible" in tag or "unsafe" in tag
         }
-        assert not of_the_filter & written
+        assert "filter_on/infeasible" in of_filter and not {tag for tag in of_filter if "filter_off" in tag}
     with (experiment.folder / "per_seed.csv").open() as file:
         assert all(row["violations"] == row["cost"] == "" for row in csv.DictReader(file))
     text = (experiment.folder / "summary.json").read_text()
-    assert "cost" not in text and "NaN" not in text and json.loads(text)
-    assert "Steps in violation, total │ not judged │ not judged" in table and not summary.judged
-    assert "┃ unfiltered ┃ filtered ┃" in table
+    assert "cost" not in text and "NaN" not in text and json.loads(text) and not summary.judged
+    assert "Steps in violation, total │ not judged │ not judged" in table
     said = "Violations are not judged: the task reports no cost."
     assert said in table and said in page and said in " ".join(verdict(experiment, summary))
-    shown = page.partition("How to read this")[0]
-    assert "of 40 steps in violation" not in shown and "cost per episode" not in shown
     # The page's note; cost and violations of two arms in three conditions.
     assert page.partition("In numbers")[2].partition("The same episode")[0].count("not judged") == 1 + 2 * 6
 

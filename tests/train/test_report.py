@@ -225,22 +225,6 @@ def test_the_verdict_names_what_either_policy_returns_and_how_surely(fake_experi
     assert f"trained without it returned more ({surely})." in choice
 
 
-@pytest.mark.parametrize(
-    ("arms", "compared"),
-    [
-        # Without an arm that has none the filter is switched off; policies of several tasks are all compared.
-        ("{a: {filter: {factory: 'fake_task:shield'}}, b: {filter: {factory: 'fake_task:shield'}}}", 400),
-        ("{a: {filter: none}, b: {filter: none, env: Pendulum-v1}}", 800),
-    ],
-)
-def test_where_policies_are_the_same_their_evaluation_alone_is_compared(fake_experiment, arms, compared):
-    experiment = fake_experiment(f"arms={arms}", "evaluation.filter={factory: 'fake_task:shield'}")
-    fill(experiment, {"violations": 5}, {})
-    said = " ".join(verdict(experiment, summarize(experiment)))
-    of = f"of {compared} steps"
-    assert f"none {of} was in violation; without it {compared // 20} {of} (5 %)" in said
-
-
 # Pictures: their sentences against planted numbers, and what they are drawn from -----------------------------------
 
 
