@@ -164,13 +164,6 @@ def test_an_env_without_a_recipe_gets_lines_that_filter_it(says):
     assert any(info["cbf/intervened"] for info in infos) and not any(info["cbf/infeasible"] for info in infos)
 
 
-def test_recipes_of_similar_names_are_told():
-    with mock.patch.dict(gym.registry):
-        gym.register("lab/Swimer-v3", entry_point="gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv")
-        message = refusal(gym.make("lab/Swimer-v3"))
-    assert message.partition("Recipes of similar names: ")[2].split(", ")[0] == "Swimmer"
-
-
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "case",

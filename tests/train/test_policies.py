@@ -221,9 +221,10 @@ def test_a_policy_goes_to_the_hub_and_comes_back(reacher, tmp_path, monkeypatch,
     def push_to_hub(repo_id, filename, commit_message):
         shutil.copy(filename, tmp_path / filename)
 
-    package = types.SimpleNamespace(
-        push_to_hub=push_to_hub, load_from_hub=lambda _, name: str(tmp_path / name)
-    )
+    def load_from_hub(repo_id, filename):
+        return str(tmp_path / filename)
+
+    package = types.SimpleNamespace(push_to_hub=push_to_hub, load_from_hub=load_from_hub)
     monkeypatch.setitem(sys.modules, "huggingface_sb3", package)
     write_card(load_policy(reacher).arm, 0, reacher)
     assert main(["push", str(reacher), "me/reacher"]) == 0

@@ -88,7 +88,6 @@ PLAYS = {
     "InvertedPendulum": on("InvertedPendulum-v5", changes={"margin": 0.85}),
     "PointMaze_UMaze": on("PointMaze_UMaze-v3", changes={"margin": 0.25}),
     "HalfCheetah": on("SafeHalfCheetahVelocity-v0", changes={"limit": 0.2}),
-    "Humanoid": on("SafeHumanoidVelocity-v0", changes={"limit": 0.03}),
     "FetchReach": on("FetchReach-v4"),
     "delay": at_hazard(plant=functools.partial(sw.MujocoPlant, delay_s=0.02)),
     "margin": at_hazard(options={"margin": 0.05}),
