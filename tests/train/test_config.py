@@ -190,13 +190,10 @@ SEEN = [  # by the schema, too
     ({"env": None}, "arms.unfiltered: 'env' is missing."),
     ({"device": "gpu"}, "device: input should be 'cpu', 'cuda' or 'auto', got 'gpu'."),
     ({"total_steps": 0}, "total_steps: input should be greater than or equal to 1, got 0."),
-    ({"n_envs": 0}, "n_envs: input should be greater than or equal to 1, got 0."),
     ({"trackers": ["wand"]}, "input should be 'wandb' or 'mlflow'"),
     ({"seeds": []}, "seeds: list should have at least 1 item"),
-    ({"seeds": 0}, "seeds: input should be a valid list"),
     ({"arms": {}}, "arms: expected at least one"),
     ({"normalize": {"reward": 1}}, "normalize.reward: input should be a valid boolean"),
-    ({"evaluation": {"episodes": "many"}}, "evaluation.episodes: "),
     ({"evaluation": {"filter": "protct"}}, "Did you mean 'protect'?"),
     (of_arm(filter="protected"), "a.filter: unknown name 'protected'. Did you mean 'protect'?"),
     (of_arm(filter=False), "a.filter: expected a mapping of protect, factory, kwargs"),
@@ -392,10 +389,20 @@ def test_the_stack_has_every_layer_in_its_place():
     learner = LearnerConfig("adaption_penalty", penalty=2.0)
     stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), filtered, learner)
     assert stack.penalty == 2.0
-    kinds = [type(wrapper).__name__ for wrapper in wrappers_of(stack)]
     order = ["AdaptionPenalty", "Monitor", "RepeatedCommands", "Outages", "RecordInterventions"]
-    order += ["StuckEscape", "LeaseExpiry", "CBFActionFilter"]
-    assert [kind for kind in kinds if kind in order] == order
+    order += ["StuckEscape", "LeaseExpiry", "CBFActionFilter", "OcclusionPenalty"]
+    kinds = [type(wrapper).__name__ for wrapper in wrappers_of(stack)]
+    assert [kind for kind in kinds if kind in order] == order[:-1]
+    occlusion = {
+        "tracks": [{"bodies": "car*", "acceleration_noise": [0.0225, 0], "start_position_std": [0.3, 0]}],
+        "sensor": {"camera": "eye", "range_m": 6},
+        "tolerance": 0.5,
+        "weight": 0.1,
+    }
+    crossing = EnvConfig("OccludedCrossing-v0", {}, {}, occlusion)
+    seeing = make_stack(crossing, FilterConfig(protect={"cars": "estimated"}))
+    kinds = [type(wrapper).__name__ for wrapper in wrappers_of(seeing)]
+    assert [kind for kind in kinds if kind in order] == [order[1], order[4], *order[-2:]]
     stack.reset(seed=0)
     infos = [stack.step(np.array([0.3, 0.1], np.float32))[4] for _ in range(100)]
     assert any(i["fault/active"] for i in infos) and any(i["lease/remaining_s"] > 0.02 for i in infos)
@@ -404,27 +411,6 @@ def test_the_stack_has_every_layer_in_its_place():
     (clearance,) = stack.get_wrapper_attr("filter").constraints
     (own,) = sw.protect(gym.make("SafePointGoal1-v0")).constraints
     assert clearance.margin == pytest.approx(own.margin + 0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
-def test_the_occlusion_penalty_is_inside_the_filter_and_the_recorder_counts_what_it_tells():
-    occlusion = {
-        "tracks": [{"bodies": "car*", "acceleration_noise": [0.0225, 0], "start_position_std": [0.3, 0]}],
-        "sensor": {"camera": "eye", "range_m": 6},
-        "tolerance": 0.5,
-        "weight": 0.1,
-    }
-    env = EnvConfig("OccludedCrossing-v0", {}, {}, occlusion)
-    stack = make_stack(env, FilterConfig(protect={"cars": "estimated"}))
-    stack.reset(seed=0)
-    total, taken, info, done = 0.0, 0.0, {}, False
-    while not done:
-        _, reward, _, done, info = stack.step(np.array([0.0, 1.0, 0.2], np.float32))
-        total, taken = total + reward, taken + info["occlusion/penalty"]
-    assert info["interventions"]["return"] == pytest.approx(total + taken)
-    assert info["episode"]["r"] == pytest.approx(total, abs=1e-5)  # Monitor's holds the penalty
-    assert info["interventions"]["return"] > total and "collisions" in info["interventions"]
 
 
 def test_all_arms_observe_the_same_features():
