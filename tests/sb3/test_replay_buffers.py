@@ -100,20 +100,13 @@ class BehindTheWall(sw.Constraint):
         return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
 
 
-def drift(x):
-    return np.zeros(1)
-
-
-def push(x):
-    return np.ones((1, 1))
-
-
-def read(env):
-    return np.array([env.x])
-
-
 def filtered(wall=WALL, task=Line):
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=HOLD)
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.zeros(1),
+        g=lambda x: np.ones((1, 1)),
+        state=lambda env: np.array([env.x]),
+        control_dt=HOLD,
+    )
     return Monitor(sw.RecordInterventions(sw.CBFActionFilter(task(), [BehindTheWall(wall)], plant=plant)))
 
 

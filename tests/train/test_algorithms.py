@@ -49,21 +49,11 @@ class BehindTheWall(sw.Constraint):
         return [] if control is not None else [np.array([-1.0, 0.0])]
 
 
-def drift(x):
-    return np.zeros(2)
-
-
-def push(x):
-    return np.eye(2)
-
-
-def read(env):
-    return env.agent_position
-
-
 def shield(env):
     """The fake task's point moves by 0.1 of its action: an integrator, held for 0.1 s."""
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=0.1)
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.zeros(2), g=lambda x: np.eye(2), state=lambda env: env.agent_position, control_dt=0.1
+    )
     return sw.CBFActionFilter(env, [BehindTheWall()], plant=plant)
 
 
