@@ -239,10 +239,6 @@ def bang_bang(judge, space, k, rng):
     return signs(space, k, 9)
 
 
-def pulse(judge, space, k, rng):
-    return signs(space, k, 20) * (k % 20 < 4)
-
-
 def full(judge, space, k, rng):
     return space.high
 

@@ -1,6 +1,5 @@
 """Traction and SlipLimiter: slip within its limit on every ground, without being told which; its parts by oracles."""
 
-import math
 import warnings
 
 import gymnasium as gym
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from asking import bound
 from scenes import Scene
-from scipy.integrate import solve_ivp
 
 import safe_wrappers as sw
 from safe_wrappers.control.vehicle import slip_ratio
@@ -163,7 +161,8 @@ TROLLEY = """
 """
 WHEEL = '<geom type="cylinder" size="0.1 0.02" euler="90 0 0" mass="0.5" friction="{friction} 0.005 0.0001"/>'
 MOTORS = '<motor joint="left" gear="6" ctrlrange="-1 1"/><motor joint="right" gear="6" ctrlrange="-1 1"/>'
-PLANE = 'type="plane" size="50 50 0.1"'
+PLANE, BOX = 'type="plane" size="50 50 0.1"', 'type="box" size="50 50 0.1" pos="0 0 -0.1"'
+"""A contact names its geoms by their types' order: a wheel comes second on a plane, first on a box."""
 LEFT_RIGHT = ["left", "right"]
 
 
@@ -180,10 +179,10 @@ def slip_of_the(wheel, data):
     return slip_ratio(0.1 * data.qvel[6 + wheel], data.qvel[0], 0.5)
 
 
-@pytest.mark.parametrize(("friction", "most"), [(0.15, 0.0), (0.7, 0.05)])
-def test_on_mujocos_own_friction(friction, most):
+@pytest.mark.parametrize(("friction", "floor", "most"), [(0.15, BOX, 0.0), (0.7, PLANE, 0.05)])
+def test_on_mujocos_own_friction(friction, floor, most):
     """On much friction the trolley's wheels hop under full throttle, and have no force in the air."""
-    env, free = sw.SlipLimiter(Trolley(friction), wheels=LEFT_RIGHT), Trolley(friction)
+    env, free = sw.SlipLimiter(Trolley(friction, floor=floor), wheels=LEFT_RIGHT), Trolley(friction)
     data, slips, spins = env.unwrapped.data, [], []
     env.reset(seed=0), free.reset(seed=0)
     for _ in range(150):
@@ -248,9 +247,6 @@ def test_a_state_that_is_no_number_is_forgotten():
     np.testing.assert_array_equal(traction.spec.seen.present, 0.0)
 
 
-# The wheels: motion against MuJoCo's own velocities in any attitude, loads from whatever they stand on --------
-
-
 def test_motion_is_that_of_the_wheels_centres_in_any_attitude():
     env = Trolley()
     env.reset(seed=0)
@@ -277,107 +273,3 @@ def test_motion_is_that_of_the_wheels_centres_in_any_attitude():
             assert sideways[k] == pytest.approx(velocity[3:] @ left, abs=1e-9)
             tilted += abs(axle[2]) > 0.5
     assert tilted > 20
-
-
-BOX = 'type="box" size="5 5 0.1" pos="0 0 -0.1"'
-
-
-@pytest.mark.parametrize("floor", [PLANE, BOX])
-def test_loads_on_any_floor(floor):
-    """A contact names its geoms by their types' order: a wheel comes second on a plane, first on a box."""
-    env = Trolley(floor=floor)
-    wheels = DrivenWheels(bound(env), LEFT_RIGHT)
-    env.reset(seed=0)
-    for _ in range(100):
-        env.step(np.zeros(2))
-    caster, force = 0.0, np.zeros(6)
-    for k, pair in enumerate(env.data.contact.geom):
-        if env.model.body("front").id in env.model.geom_bodyid[pair]:
-            mujoco.mj_contactForce(env.model, env.data, k, force)
-            caster += force[0]
-    weight = 9.81 * env.model.body_mass.sum()
-    assert wheels.loads(env.model, env.data).sum() == pytest.approx(weight - caster, rel=1e-3)
-    assert caster > 0.1 * weight
-
-
-# A quarter of a car, written down as its equations ------------------------------------------------------------
-
-RADIUS, MASS, INERTIA, DRAG, MOST = 0.3, 400.0, 1.2, 0.05, 1500.0
-QUARTER = f"""
-<mujoco>
-  <option timestep="0.0002"/>
-  <worldbody>
-    <geom type="plane" size="900 900 1" condim="1"/>
-    <body pos="0 0 {RADIUS}">
-      <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
-      <geom type="box" size="0.2 0.2 0.1" mass="{MASS - 20.0}" contype="0" conaffinity="0"/>
-      <body>
-        <joint name="wheel" axis="0 1 0" damping="{DRAG}"/>
-        <inertial pos="0 0 0" mass="20" diaginertia="0.8 {INERTIA} 0.8"/>
-        <geom type="sphere" size="{RADIUS}" condim="1" density="0"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor joint="wheel" gear="{MOST}" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
-BURCKHARDT = {"dry": (1.2801, 23.99, 0.52), "wet": (0.857, 33.822, 0.347), "snow": (0.1946, 94.129, 0.0646)}
-
-
-def burckhardt(ground, slip):
-    c1, c2, c3 = BURCKHARDT[ground]
-    return math.copysign(c1 * (1.0 - math.exp(-c2 * abs(slip))) - c3 * abs(slip), slip)
-
-
-def slip_of(v, w):
-    return (RADIUS * w - v) / max(abs(v), abs(RADIUS * w), 0.5)
-
-
-class QuarterCar(Scene):
-    """Its tyre follows Burckhardt's published curve, which is not the shape that the estimate believes in."""
-
-    def __init__(self, ground, speed):
-        super().__init__(QUARTER, frame_skip=50)
-        self.ground, self.start = ground, ([0.0, -1e-4, 0.0], [speed, 0.0, speed / RADIUS])
-
-    def step(self, action):
-        self.data.ctrl[:] = action
-        for _ in range(self.frame_skip):
-            force = burckhardt(self.ground, slip_of(*self.data.qvel[[0, 2]])) * MASS * 9.81
-            self.data.qfrc_applied[:] = force, 0.0, -RADIUS * force
-            mujoco.mj_step(self.model, self.data)
-        return np.zeros(1), 0.0, False, False, {}
-
-
-def equations(ground, torque, state, hold):
-    """Speed, rate and the force's impulse after one hold, by scipy."""
-
-    def change(_, y):
-        force = burckhardt(ground, slip_of(y[0], y[1])) * MASS * 9.81
-        return [force / MASS, (torque - DRAG * y[1] - RADIUS * force) / INERTIA, force]
-
-    return solve_ivp(change, (0.0, hold), [*state, 0.0], method="LSODA", rtol=1e-8, atol=1e-9).y[:, -1]
-
-
-@pytest.mark.parametrize(
-    ("ground", "speed", "action"), [("dry", 3.0, 1.0), ("wet", 15.0, -1.0), ("snow", 3.0, 1.0)]
-)
-def test_a_quarter_car_by_its_equations(ground, speed, action):
-    """Each hold by scipy from the env's state: its end, the force observed, the slip, and the grip that is used."""
-    raw = QuarterCar(ground, speed)
-    env = sw.SlipLimiter(raw, wheels=["wheel"])
-    env.reset(seed=0)
-    traction, slips, errors = env.filter.bound[0].spec, [], []
-    for _ in range(60):
-        before = raw.data.qvel[[0, 2]].copy()
-        info = env.step(np.array([action]))[4]
-        v, w, impulse = equations(ground, MOST * info["executed_action"][0], before, raw.dt)
-        np.testing.assert_allclose(raw.data.qvel[[0, 2]], (v, w), rtol=5e-3, atol=5e-3)
-        env.filter.observe()
-        errors.append(abs(traction.seen.traction[0] - impulse / raw.dt) / (MASS * 9.81))
-        slips.append(abs(slip_of(v, w)))
-    assert max(errors) < 0.02  # of the load
-    assert max(slips) < 0.16
-    top = max(burckhardt(ground, s) for s in np.linspace(0.0, 1.0, 2001))
-    # A start on dry ground is the slowest: 0.70 of what the peak would give, as the force is learned step by step.
-    assert abs(raw.data.qvel[0] - speed) / (60 * raw.dt) > 0.65 * top * 9.81
