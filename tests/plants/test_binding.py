@@ -120,7 +120,7 @@ class FromDmControl(gym.Env):
 
     def __init__(self, task, scale):
         suite = pytest.importorskip("dm_control.suite")
-        self.inner, self.scale = suite.load(*task, task_kwargs={"random": 0}), scale
+        self.inner, self.scale = suite.load(*task.split("-"), task_kwargs={"random": 0}), scale
         self.physics, spec = self.inner.physics, self.inner.action_spec()
         self.action_space = gym.spaces.Box(spec.minimum / scale, spec.maximum / scale, spec.shape, np.float64)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.physics.get_state().size,), np.float64)
@@ -135,17 +135,10 @@ class FromDmControl(gym.Env):
         return self.physics.get_state(), 0.0, False, False, {}
 
 
-TASKS = [
-    ("cartpole", "balance"),
-    ("reacher", "easy"),
-    ("walker", "walk"),
-    ("finger", "spin"),
-    ("humanoid", "run"),
-]
-
-
-@pytest.mark.parametrize("task", TASKS, ids="-".join)
-@pytest.mark.parametrize("scale", [1.0, 0.5])
+@pytest.mark.parametrize(
+    ("task", "scale"),
+    [("cartpole-balance", 1.0), ("walker-walk", 0.5), ("finger-spin", 0.5), ("humanoid-run", 1.0)],
+)
 def test_a_step_of_a_dm_control_task_is_its_forecast(task, scale):
     env = FromDmControl(task, scale)
     plant = sw.MujocoPlant(
