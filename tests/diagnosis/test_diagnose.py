@@ -5,6 +5,7 @@ import itertools
 import math
 import re
 import warnings
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -273,16 +274,10 @@ def test_an_action_that_is_not_finite_never_reaches_the_env():
     assert calls and all(calls)
 
 
-class Model:
-    """A policy as Stable-Baselines3 has it."""
-
-    def predict(self, observation, deterministic=True):
-        assert deterministic
-        return np.zeros(2, np.float32), None
-
-
-def test_a_model_with_predict_is_a_policy():
-    assert found(gym.make("Swimmer-v5"), Model(), steps=20)["command_steps"].figure == 0.0
+def test_a_model_with_predict_is_a_policy_and_asked_deterministically():
+    answers = {True: np.zeros(2, np.float32), False: np.full(2, np.nan)}
+    model = SimpleNamespace(predict=lambda observation, deterministic: (answers[deterministic], None))
+    assert found(gym.make("Swimmer-v5"), model, steps=20)["command_steps"].figure == 0.0
 
 
 class Half(gym.ActionWrapper):

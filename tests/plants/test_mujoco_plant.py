@@ -1,4 +1,4 @@
-"""MujocoPlant: f and g against MuJoCo itself, actuators of every kind, points, its own model."""
+"""MujocoPlant: f and g against MuJoCo itself, actuators of every kind, points."""
 
 import gymnasium as gym
 import mujoco
@@ -198,26 +198,6 @@ def test_clamped_sums_of_forces_and_an_integrator_of_whole_steps_are_refused():
     )
     with pytest.raises(UnsupportedEnvError, match="joint '#1' clamps"):
         bound(nameless)
-
-
-# Its own model ------------------------------------------------------------------------------------------------
-
-
-def test_perturbing_the_plant_leaves_the_env_untouched():
-    env = gym.make("HalfCheetah-v5")
-    env.reset(seed=0)
-    model, plant = env.unwrapped.model, bound(env)
-    before = model.body_mass.copy(), model.dof_damping.copy()
-    plant.observe()
-    effect = plant.acceleration[1].copy()
-    plant.perturb(mass=2.0, damping=0.5)
-    plant.observe()
-    np.testing.assert_array_equal(model.body_mass, before[0])
-    np.testing.assert_array_equal(model.dof_damping, before[1])
-    np.testing.assert_array_equal(plant.model.body_mass, 2.0 * model.body_mass)
-    np.testing.assert_array_equal(plant.model.dof_damping, 0.5 * model.dof_damping)
-    np.testing.assert_array_equal(plant.model.body_subtreemass, 2.0 * model.body_subtreemass)
-    assert not np.allclose(plant.acceleration[1], effect)
 
 
 CARRIED = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="shelf"><geom size=".1"/></body>
