@@ -27,7 +27,6 @@ BEGIN = (
     "test_cli",
     "test_golden_traces",
     "test_wrapper_contract",
-    "test_wrappers_in_vector_envs",
     "test_protect",
     "test_vector_cbf_action_filter",
     "test_algorithms",

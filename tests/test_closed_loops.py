@@ -1,6 +1,7 @@
 """Every env that `protect` knows, under drivers that attack it, judged on the env's own state at every substep."""
 
 import copy
+import math
 import warnings
 from collections import Counter
 from dataclasses import replace
@@ -22,29 +23,38 @@ pytestmark = [
     pytest.mark.filterwarnings("error:.*farther than the declared max_decrease"),  # of a recipe
 ]
 STEPS = {
-    "SafePointGoal": 800,
-    "SafeCarGoal": 300,
+    "SafePointGoal": 400,
+    "SafeCarGoal": 200,
     "PatrolledPointMaze": 200,
     "PointMaze": 400,
     "Pendulum": 150,
-    "TeleopContact": 2000,
+    "TeleopContact": 1500,
     "OccludedCrossing": 300,
-    "Reacher": 300,
-    "Hand": 30,
-    "Velocity": 150,
-    "": 80,
+    "Reacher": 200,
+    "Hand": 20,
+    "Walker2d": 150,
+    "Humanoid": 80,
+    "Velocity": 100,
+    "Fetch": 45,
+    "": 60,
 }
 """Of each driver, by a part of the env's name; what is dear is short."""
 HARMLESS = "Goal0", "HumanoidVelocity", "InvertedPendulum-v5"
 """Whose drivers break nothing in so few steps without a filter, the plain pendulum's because it falls first."""
 
 
-def attack(case: Case, driver, steps, filtered=True, seed=0):
-    """What happened: steps that violated, those that nothing flagged, what the filter reported, the reward."""
+def made(case: Case, filtered=True):
+    if any(word in case.env_id for word in ("Maze", "Fetch", "Hand")):
+        pytest.importorskip("gymnasium_robotics")
     env = case.make()
-    env = case.protect(env) if filtered else env
-    judge = case.judge(env.unwrapped)
-    act = case.drivers[driver](env.unwrapped, np.random.default_rng(seed))
+    return case.protect(env) if filtered else env
+
+
+def attack(case: Case, env, driver, steps, seed=0, enough=math.inf):
+    """What happened in so many steps, or until there were enough violations: violations, those that nothing flagged,
+    what the filter reported, the reward."""
+    judge, rng = case.judge(env.unwrapped), np.random.default_rng(seed)
+    act, filtered = case.drivers[driver](env.unwrapped, rng), env.has_wrapper_attr("filter")
     told, over, episode = Counter(), True, 1000 * seed
     for _ in range(steps):
         while over:
@@ -59,73 +69,55 @@ def attack(case: Case, driver, steps, filtered=True, seed=0):
         told.update(flags, violations=violated, unflagged=violated and not any(flags.values()), reward=reward)
         told["intervened"] += info.get("cbf/intervened", False)
         if filtered and not info["cbf/intervened"]:
-            assert (
-                executed.astype(action.dtype).tobytes()
-                == np.clip(action, env.action_space.low, env.action_space.high).tobytes()
-            )
+            within = np.clip(action, env.action_space.low, env.action_space.high)
+            assert executed.astype(action.dtype).tobytes() == within.tobytes()
+        if told["violations"] > enough:
+            break
         over = bool(truncated or (terminated and not case.past_termination))
     return told
 
 
-def together(name, filtered, drivers=None):
-    """The same of all drivers of a case."""
-    if any(word in name for word in ("Maze", "Fetch", "Hand")):
-        pytest.importorskip("gymnasium_robotics")
-    case, steps = CASES[name], next(n for word, n in STEPS.items() if word in name)
-    every = drivers or [driver for driver in case.drivers if driver != "random"]
-    return sum((attack(case, driver, steps, filtered) for driver in every), Counter())
+def steps_of(name):
+    return next(n for word, n in STEPS.items() if word in name)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_no_driver_breaks_a_limit_without_a_flag(name):
-    told = together(name, True, ["corner-seeking", "margin-reading"] if "Fetch" in name else None)
+    case, env = CASES[name], made(CASES[name])
+    chosen = ("corner-seeking", "margin-reading") if "Fetch" in name else set(case.drivers) - {"random"}
+    told = sum((attack(case, env, driver, steps_of(name)) for driver in sorted(chosen)), Counter())
     assert told["unflagged"] == 0, told
-    case = CASES[name]
-    if all(c.promise == "proved" for c in case.protect(case.make()).constraints):
+    if all(c.promise == "proved" for c in env.constraints):
         assert told["violations"] == told["infeasible"] == told["fallback"] == told["unsafe"] == 0, told
     assert told["intervened"] > 0 or any(word in name for word in HARMLESS)
 
 
 @pytest.mark.parametrize("name", [n for n in CASES if not any(word in n for word in HARMLESS)])
 def test_the_same_drivers_break_it_without_the_filter(name):
-    assert together(name, False, ["corner-seeking"] if "Fetch" in name else None)["violations"] > 2
+    case, env = CASES[name], made(CASES[name], filtered=False)
+    chosen = ["corner-seeking"] if "Fetch" in name else sorted(set(case.drivers) - {"random"}, reverse=True)
+    told = (attack(case, env, driver, steps_of(name), enough=2) for driver in chosen)
+    assert any(one["violations"] > 2 for one in told)
 
 
 @pytest.mark.parametrize("name", ["SafePointGoal1-v0", "SafeCarGoal1-v0"])
 def test_the_goal_is_still_reached(name):
-    kept, free = (attack(CASES[name], "goal-seeking", 1500, filtered) for filtered in (True, False))
+    case = CASES[name]
+    kept, free = (attack(case, made(case, filtered), "goal-seeking", 1000) for filtered in (True, False))
     assert kept["violations"] == 0 < free["violations"]
     assert kept["reward"] > 0.35 * free["reward"] > 0.0, (kept["reward"], free["reward"])
 
 
 def test_an_arm_reaches_as_well_as_without_the_filter():
-    pytest.importorskip("gymnasium_robotics")
-    case, solved = CASES["FetchReach-v4"], Counter()
+    case = CASES["FetchReach-v4"]
     for filtered in (False, True):
-        env = case.protect(case.make()) if filtered else case.make()
+        env = made(case, filtered)
         for seed in range(4):
             seen, info = env.reset(seed=seed)
             for _ in range(20):
                 way = np.clip(10.0 * (seen["desired_goal"] - seen["achieved_goal"]), -1.0, 1.0)
                 seen, *_, info = env.step(np.append(way, 0.0).astype(np.float32))
-            solved[filtered] += int(info["is_success"])
-    assert solved == {False: 4, True: 4}
-
-
-@pytest.mark.parametrize(("options", "farther"), [({"margin": 0.102}, 0.1), ({"state_error": 0.1}, 0.1)])
-def test_a_margin_and_an_error_keep_it_farther_away(options, farther):
-    def closest(**options):
-        hazards = sw.constraints.HeadingDriveClearance(
-            [sw.constraints.Discs("hazard_positions", 0.2)], **options
-        )
-        env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [hazards])
-        layout = {"agent": [0.0, 0.0, 0.0], "goal": [9.0, 9.0], "hazards": [[1.5, 0.0]], "vases": []}
-        env.reset(seed=0, options={"layout": layout})
-        for _ in range(400):
-            env.step(np.array([1.0, 0.0], np.float32))
-        return float(np.linalg.norm(env.unwrapped.agent_position - env.unwrapped.hazard_positions[0]))
-
-    assert closest(**options) - closest() == pytest.approx(farther, abs=0.01)
+            assert info["is_success"]
 
 
 # What a wrong model breaks: without these, the tests above might be unable to fail --------------------------------
@@ -159,9 +151,10 @@ def on_ice(env):
     ("PointMaze_UMaze-v3", "bang-bang", another_clip),
 ])  # fmt: skip
 def test_a_filter_of_another_machine_is_found_out(name, driver, protect):
+    case = with_filter(name, protect)
     with warnings.catch_warnings(action="ignore"):
-        told = [attack(with_filter(name, protect), driver, 1000, seed=seed) for seed in range(3)]
-    assert sum(one["violations"] for one in told) > 0
+        told = (attack(case, made(case), driver, 1000, seed, enough=0) for seed in range(3))
+        assert any(one["violations"] for one in told)
 
 
 @pytest.mark.slow
@@ -172,7 +165,7 @@ def test_a_wrong_plant_inside_the_declared_uncertainty(mass, damping):
     case = with_filter("SafePointGoal2-v0", lambda env: wrong_plant(env, mass, damping, uncertainty=0.25))
     with warnings.catch_warnings(action="ignore"):
         for driver in ("hazard-seeking", "lateral-drift", "bang-bang"):
-            assert attack(case, driver, 1000, seed=7)["violations"] == 0
+            assert attack(case, made(case), driver, 1000, seed=7)["violations"] == 0
 
 
 # Other stacks ----------------------------------------------------------------------------------------------------
@@ -182,7 +175,7 @@ def test_a_wrong_plant_inside_the_declared_uncertainty(mass, damping):
 @pytest.mark.parametrize("cars", ["true", "estimated"])
 def test_no_car_hits_a_robot_that_knows_or_estimates_them(driver, cars):
     case = with_filter("OccludedCrossing-v0", lambda env: sw.protect(crossing(env), cars=cars))
-    told = attack(case, driver, 250, seed=1)
+    told = attack(case, made(case), driver, 250, seed=1)
     assert told["violations"] == 0 and told["infeasible"] + told["fallback"] + told["unsafe"] <= 5, told
 
 
@@ -194,20 +187,20 @@ def permission_and_ways_out(env):
 
 
 def test_a_permission_and_ways_out_together_stop_where_it_is_safe_to():
-    told = attack(with_filter("OccludedCrossing-v0", permission_and_ways_out), "goal-seeking", 250, seed=2)
+    case = with_filter("OccludedCrossing-v0", permission_and_ways_out)
+    told = attack(case, made(case), "goal-seeking", 250, seed=2)
     assert told["violations"] == 0 and told["intervened"] > 20, told
 
 
 @pytest.mark.parametrize("task", ["Reach", "PickAndPlace"])
 def test_no_finger_gets_into_a_ball_that_is_kept_out(task):
-    pytest.importorskip("gymnasium_robotics")
     case = replace(
         CASES[f"Fetch{task}-v4"],
         judge=lambda env: fetch.FetchJudge(env, True),
         drivers=fetch.drivers(ball=True),
         protect=lambda env: sw.protect(env, keep_out=fetch.obstacles(env.unwrapped)),
     )
-    kept, free = (attack(case, "ball-seeking", 100, filtered) for filtered in (True, False))
+    kept, free = (attack(case, made(case, filtered), "ball-seeking", 100) for filtered in (True, False))
     assert kept["violations"] == 0 < free["violations"] and kept["infeasible"] <= 1
 
 

@@ -172,7 +172,11 @@ def test_recipes_of_similar_names_are_told():
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("case", shelf.CASES, ids=lambda case: case.env_id)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=pytest.mark.slow) if "Kitchen" in c.env_id else c for c in shelf.CASES],
+    ids=lambda case: case.env_id,
+)
 def test_an_attacker_breaks_no_limit_of_another_packages_env_in_silence(case):
     pytest.importorskip(case.needs or "gymnasium")
     steps = {"": 60, "shimmy": 60}.get(case.needs, 3)

@@ -76,11 +76,11 @@ def cart(**more):
     return Play(ScheduledCart, [BEFORE_THE_WALL], plant=cart_plant, **more)
 
 
-def simulated(**more):
+def simulated():
     backup = [lambda x: [-2.0 * np.sign(x[2])], "zero"]
     shield = sw.constraints.PredictiveShield(lambda x: 2.0 - abs(x[2]), 5, backup=backup, candidates=4)
     plant = functools.partial(sw.SimulatorPlant, check_steps=0)
-    return Play(lambda: gym.make("Pendulum-v1", max_episode_steps=HORIZON), [shield], plant=plant, **more)
+    return Play(lambda: gym.make("Pendulum-v1", max_episode_steps=HORIZON), [shield], plant=plant)
 
 
 PLAYS = {
@@ -89,24 +89,19 @@ PLAYS = {
     "InvertedPendulum": on("InvertedPendulum-v5", changes={"margin": 0.85}),
     "PointMaze_UMaze": on("PointMaze_UMaze-v3", changes={"margin": 0.25}),
     "HalfCheetah": on("SafeHalfCheetahVelocity-v0", changes={"limit": 0.2}),
-    "Ant": on("SafeAntVelocity-v0", changes={"limit": 0.4}),
-    "Hopper": on("SafeHopperVelocity-v0", changes={"limit": 0.1}),
-    "Swimmer": on("SafeSwimmerVelocity-v0", changes={"limit": 0.05}),
     "Humanoid": on("SafeHumanoidVelocity-v0", changes={"limit": 0.03}),
     "FetchReach": on("FetchReach-v4"),
     "delay": at_hazard(plant=functools.partial(sw.MujocoPlant, delay_s=0.02)),
     "margin": at_hazard(options={"margin": 0.05}),
     "hold": cart(options={"fallback": "hold"}),
+    "simulated": simulated(),
+    # The reward of Reacher has the action's dtype.
+    "Reacher, float16": on("Reacher-v5", changes={"limit": 1.0}, form=np.float16),
+    "Reacher, list": on("Reacher-v5", changes={"limit": 1.0}, form=np.ndarray.tolist),
 }
-FORMS = {"list": np.ndarray.tolist, "float64": np.float64, "float16": np.float16}
-for form in FORMS:  # the reward of Reacher has the action's dtype
-    PLAYS[f"SafePointGoal1, {form}"] = at_hazard(form=FORMS[form])
-    PLAYS[f"Reacher, {form}"] = on("Reacher-v5", changes={"limit": 1.0}, form=FORMS[form])
 for mode in AutoresetMode:
     PLAYS[f"SafePointGoal1, {mode.value}"] = at_hazard(mode=mode)
-    PLAYS[f"Reacher, {mode.value}"] = on("Reacher-v5", changes={"limit": 1.0}, mode=mode)
     PLAYS[f"cart, {mode.value}"] = cart(mode=mode)
-    PLAYS[f"simulated, {mode.value}"] = simulated(mode=mode)
 
 
 def script(envs, steps=STEPS, seed=0):
@@ -183,17 +178,14 @@ def test_what_changes_during_an_episode_is_read_again():
         single.plant.perturb(mass=1.5, damping=0.7)
     play(alike, together, script(alike, 4, seed=1), seed=None)
     for envs in (alike.envs, together.env.envs):
-        raw = envs[1].unwrapped
-        raw._hazards = raw._hazards[1:]
+        envs[1].set_wrapper_attr("shown", False)
     play(alike, together, script(alike, seed=2), seed=None)
 
 
 def test_after_a_reset_nothing_is_left_of_the_last_episode():
     alike, together = at_hazard(options={"fallback": "hold"}).pair()
     forward = np.ones((1, ENVS, 2), np.float32)
-    play(
-        alike, together, forward.repeat(HORIZON, axis=0)
-    )  # to the end of the episode, before the reset that follows
+    play(alike, together, forward.repeat(HORIZON, axis=0))  # to the end, before the reset that follows
     play(alike, together, forward * np.nan)  # held: nothing yet in the new episode
     play(alike, together, forward.repeat(3, axis=0))
     play(alike, together, forward * np.nan, seed=None)  # held: the last action
@@ -225,7 +217,7 @@ def test_a_state_that_is_not_a_number_runs_the_fallback_and_a_start_outside_is_w
 def test_actions_of_another_shape_and_other_vector_envs_are_refused():
     envs = sw.protect(gym.make_vec("SafePointGoal1-v0", 2, vectorization_mode="sync"))
     envs.reset(seed=0)
-    with pytest.raises(sw.SafeWrappersError, match=r"expected an action of shape \(2, 2\), got shape \(2,\)"):
+    with pytest.raises(sw.SafeWrappersError, match="expected an action of shape"):
         envs.step(np.zeros(2))
     with pytest.raises(sw.SafeWrappersError, match="VectorCBFActionFilter inside the filter"):
         sw.protect(envs)

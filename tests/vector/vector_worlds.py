@@ -3,14 +3,12 @@
 Everything is a function or a class of a module, so that a spawned process can unpickle it; no learner is imported.
 """
 
-import warnings
 from collections import deque
 from functools import partial
 from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import safe_wrappers as sw
 from safe_wrappers.info import COST, COST_SUBSTEP
@@ -74,25 +72,6 @@ def slow(x):
     return 0.25 - x[1] ** 2
 
 
-class CountUnsafeWarnings(gym.Wrapper):
-    """Says in info how often this episode has warned of an unsafe state: warnings do not cross processes."""
-
-    def reset(self, **kwargs):
-        self.count = 0
-        observation, info = self._watched(self.env.reset, **kwargs)
-        return observation, {**info, "unsafe_warnings": self.count}
-
-    def step(self, action):
-        *rest, info = self._watched(self.env.step, action)
-        return *rest, {**info, "unsafe_warnings": self.count}
-
-    def _watched(self, function, *args, **kwargs):
-        with warnings.catch_warnings(record=True, action="always") as caught:
-            result = function(*args, **kwargs)
-        self.count += sum(issubclass(w.category, sw.UnsafeStateWarning) for w in caught)
-        return result
-
-
 def cart_plant(delay_s=0.0):
     return sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=DT, delay_s=delay_s)
 
@@ -114,43 +93,32 @@ def cart_filter(index=0, delay_s=0.0, fallback="hold"):
 
 def cart(index=0, delay_s=0.25):
     """The whole stack; the delay makes commands in flight show in `cbf/margin`."""
-    return CountUnsafeWarnings(sw.RecordInterventions(cart_filter(index, delay_s)))
+    return sw.RecordInterventions(cart_filter(index, delay_s))
 
 
 class AtHazard(gym.Wrapper):
-    """Starts every episode in front of a hazard; goal and vase stay random."""
+    """Starts every episode in front of a hazard, until it is shown no more; goal and vase stay random."""
+
+    shown = True
+
+    @property
+    def hazard_positions(self):
+        return self.unwrapped.hazard_positions[: self.shown]
 
     def reset(self, *, seed=None, options=None):
         layout = {"agent": [0.0, 0.0, 0.0], "hazards": [[0.26, 0.0]]}
         return self.env.reset(seed=seed, options={"layout": layout})
 
 
-def point_goal_filter(env):
-    return sw.protect(AtHazard(env), fallback="hold", plant=sw.MujocoPlant(delay_s=0.03))
-
-
-def reacher_filter(env):
-    return sw.protect(env, fallback="hold")
-
-
-def pendulum_filter(env):
-    """The pole falls, and so terminates, by itself; the margin brings the rail's end within reach of that."""
-    return sw.protect(env, margin=0.85, fallback="hold", plant=sw.MujocoPlant(delay_s=0.06))
-
-
 def point_goal(index=0):
     env = gym.make("SafePointGoal1-v0", max_episode_steps=7 + 2 * index)
-    return CountUnsafeWarnings(sw.RecordInterventions(point_goal_filter(env)))
+    plant = sw.MujocoPlant(delay_s=0.03)
+    return sw.RecordInterventions(sw.protect(AtHazard(env), fallback="hold", plant=plant))
 
 
 def reacher(index=0):
     env = gym.make("Reacher-v5", max_episode_steps=7 + 2 * index)
-    return CountUnsafeWarnings(sw.AdaptionPenalty(sw.RecordInterventions(reacher_filter(env)), penalty=0.1))
-
-
-def pendulum(index=0):
-    env = gym.make("InvertedPendulum-v5", max_episode_steps=9 + index)
-    return CountUnsafeWarnings(sw.RecordInterventions(pendulum_filter(env)))
+    return sw.AdaptionPenalty(sw.RecordInterventions(sw.protect(env, fallback="hold")), penalty=0.1)
 
 
 class AtSpeed(gym.Wrapper):
@@ -165,7 +133,7 @@ def rover(index=0):
     env = AtSpeed(gym.make("SafeRover-v0", max_episode_steps=7 + 2 * index))
     traction = sw.constraints.Traction(["rear_left", "rear_right"], friction=2.0)
     limiter = sw.CBFActionFilter(env, [traction], fallback="hold")
-    return CountUnsafeWarnings(sw.RecordInterventions(limiter))
+    return sw.RecordInterventions(limiter)
 
 
 def commanded_cart(index=0):
@@ -176,14 +144,6 @@ def commanded_cart(index=0):
     env = sw.LeaseExpiry(env, budget, plant=cart_plant(), fallback="hold", **lease)
     env = sw.ChunkHandover(sw.RecordInterventions(env), 4, 2, [0, 2], rate_limit=6.0, fallback="hold")
     return RepeatedCommands(Outages(env, 0.6, 0.3), 0.2)
-
-
-def commanded_point_goal(index=0):
-    env = AtHazard(gym.make("SafePointGoal1-v0", max_episode_steps=14 + 4 * index))
-    env = sw.CBFActionFilter(env, [HAZARDS], fallback="hold")
-    budget = sw.StoppingBudget(HAZARDS, closing_speed=4.0)
-    env = sw.RecordInterventions(sw.LeaseExpiry(env, budget, max_lease_s=0.2, min_lease_s=0.08))
-    return Outages(sw.ChunkHandover(env, 6, 2, [0, 2], rate_limit=40.0), 0.1, 0.1)
 
 
 def leased_pendulum(index=0):
@@ -210,18 +170,11 @@ TASKS = {
     "cart": cart,
     "point_goal": point_goal,
     "reacher": reacher,
-    "pendulum": pendulum,
     "rover": rover,
     "commanded_cart": commanded_cart,
-    "commanded_point_goal": commanded_point_goal,
     "leased_pendulum": leased_pendulum,
     "occluded": occluded,
 }
-
-
-KINDS = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
-WAYS = [*(("sync", mode) for mode in AutoresetMode), ("async", AutoresetMode.SAME_STEP)]
-"""Vector envs and their modes. Processes send what any env says: the mode that says most at once is enough."""
 
 
 def sub_envs(make, n=3):

@@ -1,3 +1,0 @@
-from safe_wrappers.envs import register_envs
-
-register_envs()
