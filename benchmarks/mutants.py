@@ -36,7 +36,7 @@ from benchmarks.tables import markdown, options
 ROOT = Path(__file__).parents[1]
 PRELOADED = ("numba", "gymnasium", "hypothesis", "mujoco", "scipy.optimize", "pytest")
 """Imported once for all the processes that run tests."""
-AREAS = "filter", "constraints", "control", "plants", "wrappers"
+AREAS = "filter", "constraints", "control", "plants", "wrappers", "train/evaluation"
 MOST_TESTS = 5
 VERDICTS = ("killed", "survived", "gone", "untested")
 """Gone: with its function; untested: its tests fail without a mistake, or there are none."""
@@ -158,7 +158,7 @@ def tests_of(where: Path, file: str) -> list[str]:
     names = [n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef) if n.name[0] != "_"]
     names += [rf"{Path(file).stem} import", *(name.removeprefix("Bound") for name in names)]
     word = re.compile(rf"\b({'|'.join(names)})\b")
-    folders = ("filter", "constraints", "control", "plants", "wrappers", "vector", "contract")
+    folders = ("filter", "constraints", "control", "plants", "wrappers", "vector", "contract", "train")
     paths = [path for folder in folders for path in sorted((where / "tests" / folder).rglob("test_*.py"))]
     texts = {path: path.read_text() for path in paths}
     counts = {

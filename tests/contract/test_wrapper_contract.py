@@ -4,6 +4,7 @@ They are found by `safe_wrappers.__all__`; a new one needs an example in tests/w
 """
 
 import ast
+import contextlib
 import functools
 import inspect
 import json
@@ -63,17 +64,10 @@ def test_a_vector_env_is_refused_with_the_line_to_write(name):
 
 
 @every_wrapper
-def test_gym_make_rebuilds_it_from_its_spec(name, case):
-    again = gym.make(build(name, case).spec)
-    assert type(again) is getattr(sw, name)
-    assert trace(again) == fresh_trace(name, case)
-
-
-@every_wrapper
-def test_its_spec_survives_json(name, case):
-    text = build(name, case).spec.to_json()
-    json.loads(text)
-    assert trace(gym.make(EnvSpec.from_json(text))) == fresh_trace(name, case)
+def test_gym_make_rebuilds_it_from_its_spec_and_from_the_spec_s_json(name, case):
+    spec = build(name, case).spec
+    assert type(gym.make(spec)) is getattr(sw, name)
+    assert trace(gym.make(EnvSpec.from_json(spec.to_json()))) == fresh_trace(name, case)
 
 
 @every_wrapper
@@ -297,6 +291,36 @@ def test_info_holds_no_wall_clock_value(name, case):
     else:
         env.env.step = lambda action: (sum(i * i for i in range(20_000)), inner(action))[1]
     assert trace(env, steps=20) == fresh_trace(name, case)[:21]
+
+
+def check_infos_inside(kind, name, case):
+    """What each env says arrives whole, with its own types."""
+    single = build(name, case)
+    single.reset(seed=0)
+    steps = actions(single, 25)
+    makers = [lambda: gym.wrappers.TimeLimit(build(name, case), 10)] * 2
+    with contextlib.closing(kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)) as envs:
+        envs.reset(seed=0)
+        for compared, action in enumerate(steps):  # the first episode
+            _, _, terminated, truncated, infos = envs.step(np.stack([action, action]))
+            if (terminated | truncated).any():
+                assert compared >= 2
+                return
+            for key, value in single.step(action)[4].items():
+                assert infos[f"_{key}"].all()
+                assert infos[key].dtype == np.asarray(value).dtype, key
+                np.testing.assert_array_equal(infos[key][0], value, err_msg=key)
+    raise AssertionError("the first episode does not end")
+
+
+@every_wrapper
+def test_inside_a_vector_env_infos_are_whole(name, case):
+    check_infos_inside(gym.vector.SyncVectorEnv, name, case)
+
+
+@pytest.mark.parametrize("name", EXPORTED)
+def test_inside_processes_infos_are_whole(name):
+    check_infos_inside(gym.vector.AsyncVectorEnv, name, next(iter(EXAMPLES[name])))
 
 
 # 9: pickling --------------------------------------------------------------------------------------------------

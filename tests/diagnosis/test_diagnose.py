@@ -1,23 +1,114 @@
 """diagnose: what was planted ranks first and is treated; what is healthy has no symptom; the env stays as it was."""
 
+import dataclasses
 import itertools
 import math
+import re
 import warnings
+from types import SimpleNamespace
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
+from scenes import Scene
 
 import safe_wrappers as sw
-from safe_wrappers import diagnosis
-from safe_wrappers.diagnosis import SYMPTOMS, Finding, attacker, diagnose, policy_driver, record
+from safe_wrappers.diagnosis import SYMPTOMS, attacker, diagnose, policy_driver, record, wheels
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
 
-pytest.importorskip("gymnasium_robotics")
-from tests.diagnosis.planted import CART, HEALTHY, PLANTED, STOPPED, Bench, waving
-
+gym.register_envs(pytest.importorskip("gymnasium_robotics"))
 pytestmark = pytest.mark.filterwarnings("ignore")
+
+
+def waving(share=0.3, period=60.0, seam=0):
+    """Slow sines; with a `seam` another phase every so many steps, as chunks have that do not fit together."""
+
+    def policy(env):
+        high, rng, state = (
+            env.action_space.high.astype(float),
+            np.random.default_rng(0),
+            {"k": 0, "phase": 0.0},
+        )
+
+        def act(observation):
+            if seam and state["k"] % seam == 0:
+                state["phase"] = rng.uniform(0.0, 2.0 * np.pi)
+            state["k"] += 1
+            angle = 2.0 * np.pi * state["k"] / period + state["phase"] + np.arange(high.size)
+            return (share * high * np.sin(angle)).astype(env.action_space.dtype)
+
+        return act
+
+    return policy
+
+
+CART = """
+<mujoco><compiler autolimits="true"/><option timestep="0.002"/><worldbody>
+  <geom type="box" name="wall" pos="1.05 0 0" size=".05 .3 .3" solref="-{stiffness} -20"/>
+  <body name="cart"><joint name="slide" type="slide" axis="1 0 0"/>
+    <geom size=".05" mass="1" solref="-{stiffness} -20"/></body>
+  </worldbody><actuator><motor joint="slide" ctrlrange="-20 20"/></actuator></mujoco>
+"""
+STOPPED = """
+<mujoco><compiler autolimits="true"/><option timestep="0.002" gravity="0 0 0"/><worldbody>
+  <body><joint name="swing" axis="0 0 1" range="-60 60" damping=".01"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass="1"/></body>
+  </worldbody><actuator><motor joint="swing" ctrlrange="-4 4"/></actuator></mujoco>
+"""
+
+
+class Bench(Scene):
+    """A machine of a few parts; the observation is its state."""
+
+    def __init__(self, xml, at=None):
+        super().__init__(xml)
+        self.at = np.zeros(self.model.nq) if at is None else np.array(at)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2 * self.model.nq,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        self.start = self.at + self.np_random.uniform(-0.01, 0.01, self.model.nq), np.zeros(self.model.nv)
+        super().reset()
+        return np.concatenate([self.data.qpos, self.data.qvel]), {}
+
+    def step(self, action):
+        super().step(action)
+        return np.concatenate([self.data.qpos, self.data.qvel]), 0.0, False, False, {}
+
+
+def cart(stiffness=20_000):
+    return CART.format(stiffness=stiffness)
+
+
+PLANTED = {
+    "chunks that do not fit together": ("command_steps", 200, "Swimmer-v5", waving(seam=10)),
+    "chunks on joints that ring": ("command_steps", 300, "FlexJointReach-v0", waving(0.5, 200.0, seam=24)),
+    "icy ground": ("wheel_slip", 200, "SafeRover-v0", None),
+    "a stiff wall": ("contact_forces", 300, lambda: Bench(cart(40_000)), waving(0.5, 200.0)),
+    "a maze with stiff walls": ("contact_forces", 300, "PointMaze_UMaze-v3", None),
+    "a stop that is run into": ("limits", 300, lambda: Bench(STOPPED), waving(0.5, 100.0)),
+    "hazards": ("limits", 600, "SafePointGoal1-v0", waving(0.5, 100.0)),
+    "a speed limit": ("limits", 300, "SafeSwimmerVelocity-v0", waving(1.0, 25.0)),
+}
+"""What is planted, for how many steps it is looked at, the env and its policy."""
+HEALTHY = {
+    "Swimmer": ("Swimmer-v5", waving()),
+    "FetchReach, slowly": ("FetchReach-v4", waving(0.2)),
+    "SafeRover, slowly": (lambda: sw.protect(gym.make("SafeRover-v0")), waving(0.2, 200.0)),
+    "swing": (lambda: Bench(STOPPED), waving(0.02, 60.0)),
+    "SafePointGoal1, protected": (lambda: sw.protect(gym.make("SafePointGoal1-v0")), None),
+    "Reacher": ("Reacher-v5", waving(0.05)),
+    "FlexJointReach": ("FlexJointReach-v0", waving(0.15, 200.0)),
+    "TeleopContact through waves, in the air": (
+        lambda: sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, impedance=40.0),
+        waving(0.02, 500.0),
+    ),
+}
+
+
+def made(build, policy):
+    env = gym.make(build) if isinstance(build, str) else build()
+    return env, None if policy is None else policy(env)
 
 
 def found(*driven, **options):
@@ -25,30 +116,38 @@ def found(*driven, **options):
     return {finding.symptom: finding for finding in diagnose(*driven, **options)}
 
 
+def treated(env, finding):
+    """The env after the lines of a finding have been run."""
+    scope = {"env": env, "sw": sw}
+    exec(finding.code, scope)
+    return scope["env"]
+
+
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_fault_ranks_first_and_its_lines_halve_the_figure(name):
-    symptom, steps, make = PLANTED[name]
-    first = diagnose(*make(), steps=steps)[0]
-    assert first.present and first.symptom == symptom
-    env, policy = make()
-    scope = {"env": env, "sw": sw}
-    exec(first.code, scope)
-    assert found(scope["env"], policy, steps)[symptom].figure <= 0.5 * first.figure
+    symptom, steps, *parts = PLANTED[name]
+    seen = diagnose(*made(*parts), steps=steps)
+    first = seen[0]
+    assert first.present and first.symptom == symptom and str(first).endswith(first.code.splitlines()[-1])
+    ranks = [2 * finding.present + (not finding.missing) for finding in seen]
+    assert ranks == sorted(ranks, reverse=True)
+    env, policy = made(*parts)
+    assert found(treated(env, first), policy, steps)[symptom].figure <= 0.5 * first.figure
 
 
 @pytest.mark.parametrize("name", HEALTHY)
 def test_a_healthy_env_has_no_symptom(name):
-    assert not any(finding.present for finding in diagnose(*HEALTHY[name](), steps=200))
+    assert not any(finding.present for finding in diagnose(*made(*HEALTHY[name]), steps=200))
 
 
 def test_the_env_is_left_as_it_was_and_two_diagnoses_are_the_same():
-    env = gym.make("Swimmer-v5")
+    env, plain = gym.make("Swimmer-v5"), gym.make("Swimmer-v5")
     stack = str(env)
-    first, second = (str(diagnose(env, steps=50, seed=3)) for _ in range(2))
-    assert first == second and str(env) == stack
-    observation, _ = env.reset(seed=5)
-    plain = gym.make("Swimmer-v5")
-    assert np.array_equal(observation, plain.reset(seed=5)[0])
+    first, second = (found(env, steps=50, seed=3) for _ in range(2))
+    assert str(first) == str(second) and str(env) == stack
+    for name, finding in first.items():  # of an attacker, what only a policy has is not measured
+        assert ("give a policy" in finding.missing) == SYMPTOMS[name].policies_only, name
+    assert np.array_equal(env.reset(seed=5)[0], plain.reset(seed=5)[0])
     action = np.array([0.3, -0.2], np.float32)
     assert np.array_equal(env.step(action)[0], plain.step(action)[0])
 
@@ -73,11 +172,9 @@ class Drifting(gym.Env):
 def test_an_env_of_ones_own_is_simulated_while_it_is_diagnosed_and_nothing_leaks():
     env = Drifting()
     with warnings.catch_warnings(action="error"):
-        finding = found(env, steps=300)["limits"]
-    scope = {"env": env, "sw": sw}
-    exec(finding.code, scope)
+        finding = found(env, steps=200)["limits"]
     assert "PredictiveShield" in finding.code
-    assert found(scope["env"], steps=300)["limits"].figure < finding.figure
+    assert found(treated(env, finding), steps=200)["limits"].figure < finding.figure
     stopping = lambda seen: [np.clip(-10.0 * seen[1], -1.0, 1.0)]  # noqa: E731
     shield = sw.constraints.PredictiveShield("cost", horizon=10, backup=stopping)
     filtered = sw.CBFActionFilter(gym.wrappers.TimeLimit(Drifting(), 100), [shield])
@@ -85,71 +182,73 @@ def test_an_env_of_ones_own_is_simulated_while_it_is_diagnosed_and_nothing_leaks
     assert filtered.env.env is filtered.unwrapped, "what looked on is gone"
 
 
+def jumping(observation, signs=itertools.cycle([1.0, -1.0])):  # noqa: B008
+    return np.array([next(signs)])
+
+
 def test_an_env_without_physics_says_what_is_missing_and_judges_commands_and_costs():
-    env = gym.make("Pendulum-v1")
-    jumping = iter(range(10_000))
-    seen = found(env, lambda observation: np.array([2.0 * (-1) ** next(jumping)]), steps=60)
+    seen = found(gym.make("Pendulum-v1"), lambda observation: 2.0 * jumping(observation), steps=60)
     assert [name for name, finding in seen.items() if finding.present] == ["command_steps"]
     assert seen["command_steps"].figure == pytest.approx(1.0)
     for name in ("limits", "contact_forces", "wheel_slip"):
-        assert "MuJoCo" in seen[name].missing, name
+        assert "MuJoCo" in seen[name].missing and "unknown" in str(seen[name]), name
     assert math.isnan(seen["limits"].figure) and not seen["limits"].present
 
 
-def test_without_a_policy_its_symptoms_are_not_measured():
-    for name, finding in found(gym.make("Swimmer-v5"), steps=30).items():
-        assert ("give a policy" in finding.missing) == SYMPTOMS[name].policies_only, name
-
-
-def test_the_policy_counts_where_there_is_one():
-    env = Bench(STOPPED)
-    still = found(env, lambda observation: np.zeros(1), steps=400)
-    assert still["limits"].figure == 0.0 < found(env, steps=400)["limits"].figure
-
-
 def test_what_treats_a_symptom_is_refused_with_the_reason():
-    jumping = iter(range(10_000))
-    seen = found(Drifting(), lambda observation: np.array([(-1.0) ** next(jumping)]), steps=60)
-    code = seen["command_steps"].code
+    code = found(Drifting(), jumping, steps=60)["command_steps"].code
     assert code.startswith("# ChunkHandover(") and "is refused: " in code and "has no attribute dt" in code
 
 
 def test_what_hits_without_a_name_is_found_all_the_same():
-    env = Bench(CART.format(stiffness=20_000).replace('name="cart"', ""))
+    env = Bench(cart().replace('name="cart"', ""))
     finding = found(env, lambda observation: np.array([20.0]), steps=200)["contact_forces"]
     assert finding.present and finding.code.startswith("# Limit the speed of what hits")
 
 
-def test_an_error_in_a_measurement_is_not_taken_for_a_refusal(monkeypatch):
-    def broken(recording):
-        raise ConfigurationError("of a bug")
-
-    monkeypatch.setitem(SYMPTOMS, "limits", SYMPTOMS["limits"]._replace(measure=broken))
-    with pytest.raises(ConfigurationError, match="of a bug"):
-        diagnose(gym.make("Swimmer-v5"), steps=2)
+def test_what_presses_all_the_time_is_no_impact():
+    env = Bench(cart().replace("-20 20", "-700 700"), [0.95])
+    pushes = itertools.chain(np.linspace(0.0, 700.0, 100), itertools.repeat(700.0))  # N, on a cart of 9.8 N
+    finding = found(env, lambda observation: np.array([next(pushes)]), steps=300)["contact_forces"]
+    assert finding.figure < 10.0 and not finding.present
 
 
-def test_bad_input_is_refused_by_name():
-    env = gym.make("Swimmer-v5")
-    with pytest.raises(
-        UnsupportedEnvError, match=r"takes one env, as gym\.make returns it; got 'Swimmer-v5'"
-    ):
-        diagnose("Swimmer-v5")
-    with pytest.raises(UnsupportedEnvError, match="needs a Box action space"):
-        diagnose(gym.make("CartPole-v1"))
-    with pytest.raises(ConfigurationError, match="policy is a function of the observation"):
-        diagnose(env, policy=3)
-    with pytest.raises(ActionError, match="an action of 2 finite numbers, got array"):
-        diagnose(env, policy=lambda observation: np.zeros(3))
-    with pytest.raises(ConfigurationError, match="steps"):
-        diagnose(env, steps=1)
+def test_a_simulation_that_diverges_is_found_though_mujoco_resets_it():
+    xml = cart().replace('timestep="0.002"', 'timestep="0.002" integrator="Euler"')
+    finding = diagnose(
+        Bench(xml.replace('type="slide" axis', 'type="slide" stiffness="1e9" axis')), steps=60
+    )[0]
+    assert finding.symptom == "contact_forces" and finding.present and finding.figure == math.inf
+    assert finding.code.startswith("# The simulation diverged: a shorter timestep")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "error", "says"),
+    [
+        ("Swimmer-v5", {"policy": 3}, ConfigurationError, "policy is a function of the observation"),
+        (
+            "Swimmer-v5",
+            {"policy": lambda observation: np.zeros(3)},
+            ActionError,
+            "2 finite numbers, got array",
+        ),
+        ("Swimmer-v5", {"steps": 1}, ConfigurationError, "steps"),
+        ("CartPole-v1", {}, UnsupportedEnvError, "needs a Box action space"),
+        (None, {}, UnsupportedEnvError, r"takes one env, as gym\.make returns it; got None"),
+    ],
+)
+def test_bad_input_is_refused_by_name(env_id, options, error, says):
+    with pytest.raises(error, match=says):
+        diagnose(env_id and gym.make(env_id), **options)
+
+
+# What a policy is, and what is recorded of it ---------------------------------------------------------------------
 
 
 class Remembers:
     """A policy with a memory: what it has been asked since its last reset."""
 
-    def __init__(self):
-        self.asked = 0
+    asked = 0
 
     def reset(self):
         self.asked = 0
@@ -175,46 +274,48 @@ def test_an_action_that_is_not_finite_never_reaches_the_env():
     assert calls and all(calls)
 
 
-def test_a_simulation_that_diverges_is_found_though_mujoco_resets_it():
-    xml = CART.format(stiffness=20_000).replace('timestep="0.002"', 'timestep="0.002" integrator="Euler"')
-    wild = xml.replace('type="slide" axis', 'type="slide" stiffness="1e9" axis')
-    env = Bench(wild)
-    finding = diagnose(env, steps=60)[0]
-    assert finding.symptom == "contact_forces" and finding.present and finding.figure == math.inf
-    assert finding.code.startswith("# The simulation diverged: a shorter timestep")
+def test_a_model_with_predict_is_a_policy_and_asked_deterministically():
+    answers = {True: np.zeros(2, np.float32), False: np.full(2, np.nan)}
+    model = SimpleNamespace(predict=lambda observation, deterministic: (answers[deterministic], None))
+    assert found(gym.make("Swimmer-v5"), model, steps=20)["command_steps"].figure == 0.0
 
 
-class Model:
-    """A policy as Stable-Baselines3 has it."""
-
-    def predict(self, observation, deterministic=True):
-        assert deterministic
-        return np.zeros(2, np.float32), None
+class Half(gym.ActionWrapper):
+    def action(self, action):
+        return 0.5 * action
 
 
-def test_a_model_with_predict_is_a_policy():
-    assert found(gym.make("Swimmer-v5"), Model(), steps=20)["command_steps"].figure == 0.0
+def test_the_attacker_is_seeded_and_holds_corners_and_what_the_env_was_given_is_recorded():
+    env = Half(gym.make("Swimmer-v5"))
+    act = attacker(env, 4)
+    taken = np.array([act(None) for _ in range(45)])
+    assert (np.abs(taken) == 1.0).all()
+    assert all(len(np.unique(taken[k : k + 15], axis=0)) == 1 for k in (0, 15, 30))
+    assert np.allclose(record(env, attacker(env, 4), 45, 0).executed, 0.5 * taken)
 
 
-def test_findings_are_ranked_and_told():
-    env = Bench(STOPPED)
-    seen = diagnose(env, waving(env, 0.5, 100.0), steps=300)
-    ranks = [2 * finding.present + (not finding.missing) for finding in seen]
-    assert ranks == sorted(ranks, reverse=True) and {0, 1, 3} == set(ranks)
-    assert str(Finding("wheel_slip", 0.5, "env = env\n# b")).splitlines() == [
-        "  FOUND     wheel_slip        wheels that spin or lock: 50 % (a symptom from 5 % on)",
-        "      env = env",
-        "      # b",
-    ]
-    assert str(Finding("balance", missing="no model")) == "  unknown   balance           no model"
-    assert str(Finding("contact_forces", 6.0)).endswith("6 weights (a symptom from 60 weights on)")
+# Figures of what was recorded -------------------------------------------------------------------------------------
 
 
-def test_what_presses_all_the_time_is_no_impact():
-    env = Bench(CART.format(stiffness=20_000).replace("-20 20", "-700 700"), [0.95])
-    pushes = itertools.chain(np.linspace(0.0, 700.0, 100), itertools.repeat(700.0))  # N, on a cart of 9.8 N
-    finding = found(env, lambda observation: np.array([next(pushes)]), steps=300)["contact_forces"]
-    assert finding.figure < 10.0 and not finding.present
+def recorded(env, **arrays):
+    """A recording of an env with other numbers in it."""
+    recording = record(env, attacker(env, 0), 2, 0)
+    k = len(next(iter(arrays.values())))
+    return dataclasses.replace(recording, infos=[{}] * k, **{"first": np.zeros(k, bool)} | arrays)
+
+
+def test_command_steps_are_not_counted_over_resets():
+    executed = np.array([[0.0], [0.1], [0.2], [-1.0], [-0.9], [-0.8]])
+    first = np.array([True, False, False, True, False, False])
+    recording = recorded(Drifting(), executed=executed, first=first)
+    assert SYMPTOMS["command_steps"].measure(recording) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("speeds", "horizon"), [(np.linspace(0.0, 4.0, 30), 29), (np.zeros(30), 5)])
+def test_a_horizon_covers_the_time_to_brake(speeds, horizon):
+    pressed = np.full((30, 1), 2.0)  # rad; the stop is at 60 degrees
+    recording = recorded(Bench(STOPPED), qpos=pressed, qvel=speeds[:, None])
+    assert re.findall(r"horizon=(\d+)", SYMPTOMS["limits"].tool(recording)) == [str(horizon)]
 
 
 ROVER = """
@@ -230,61 +331,14 @@ ROVER = """
 
 
 def test_wheels_are_what_rolls_and_their_slip_is_that_of_kinematics():
-    model = mujoco.MjModel.from_xml_string(ROVER)
-    rolling = diagnosis.wheels(model)
-    assert [model.joint(j).name for j in rolling] == ["wheel"] and list(rolling.values()) == [0.1]
-
-    class Seen:
-        qpos = np.tile(model.qpos0, (8, 1))
-        qvel = np.zeros((8, model.nv))
-
-    Seen.model = model
-    Seen.qpos[4:, 3:7] = [np.cos(0.6), 0.0, 0.0, np.sin(0.6)]  # turned round by 1.2 rad
-    Seen.qvel[:4, 0], Seen.qvel[4:, :2] = 1.0, [np.cos(1.2), np.sin(1.2)]
-    driven, braked = (
-        [10.0 / (1.0 - slip) for slip in (0.19, 0.21)],
-        [10.0 * (1.0 - s) for s in (0.19, 0.21)],
-    )
-    Seen.qvel[:, 6] = [*driven, *braked] * 2
-    assert SYMPTOMS["wheel_slip"].measure(Seen) == 0.5  # each second one is above 0.2
-
-
-def test_command_steps_are_not_counted_over_resets():
-    class Seen:
-        env = gym.Env()
-        executed = np.array([[0.0], [0.1], [0.2], [-1.0], [-0.9], [-0.8]])
-        first = np.array([True, False, False, True, False, False])
-
-    Seen.env.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
-    assert SYMPTOMS["command_steps"].measure(Seen) == pytest.approx(0.05)
-
-
-def test_the_attacker_is_seeded_and_holds_corners():
-    env = gym.make("Reacher-v5")
-    first, second = ([attacker(env, 4)(None) for _ in range(2)] for _ in range(2))
-    assert np.array_equal(first, second)
-    act = attacker(env, 0)
-    taken = np.array([act(None) for _ in range(45)])
-    assert (np.abs(taken) == 1.0).all()
-    assert all(len(np.unique(taken[k : k + 15], axis=0)) == 1 for k in (0, 15, 30))
-
-
-def test_what_the_env_was_given_is_seen_inside_of_wrappers():
-    class Half(gym.ActionWrapper):
-        def action(self, action):
-            return 0.5 * action
-
-    env = Half(gym.make("Swimmer-v5"))
-    recording = record(env, attacker(env, 0), 20, 0)
-    act = attacker(env, 0)
-    assert np.allclose(recording.executed, [0.5 * act(None) for _ in range(20)])
-
-
-def test_a_horizon_covers_the_time_to_brake():
-    class Seen:
-        qvel = np.linspace(0.0, 4.0, 30)[:, None]
-        first = np.zeros(30, bool)
-
-    assert diagnosis._braking(Seen) == 29
-    Seen.qvel = 0.0 * Seen.qvel
-    assert diagnosis._braking(Seen) == 5
+    env = Scene(ROVER)
+    rolling = wheels(env.model)
+    assert [env.model.joint(j).name for j in rolling] == ["wheel"] and list(rolling.values()) == [0.1]
+    qpos, qvel = np.tile(env.model.qpos0, (8, 1)), np.zeros((8, env.model.nv))
+    qpos[4:, 3:7] = [np.cos(0.6), 0.0, 0.0, np.sin(0.6)]  # turned round by 1.2 rad
+    qvel[:4, 0], qvel[4:, :2] = 1.0, [np.cos(1.2), np.sin(1.2)]
+    driven, braked = ([10.0 * (1.0 - slip) ** sign for slip in (0.19, 0.21)] for sign in (-1, 1))
+    qvel[:, 6] = [*driven, *braked] * 2
+    assert (
+        SYMPTOMS["wheel_slip"].measure(recorded(env, qpos=qpos, qvel=qvel)) == 0.5
+    )  # each second one is above 0.2

@@ -4,10 +4,9 @@ From a drawn state that is safe the backup is admitted; whatever is proposed, th
 breaks nothing at any physics substep, and the next state is safe again.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,7 +19,7 @@ from simulated_worlds import DT, TOP, WALL, Cart
 
 import safe_wrappers as sw
 from benchmarks.cases import CASES
-from benchmarks.judges import Judge, Replay, Reported
+from benchmarks.judges import Replay, Reported
 from safe_wrappers.control.backup.damped_axis import damped_axis
 from safe_wrappers.plants.plant import Model, Trajectory
 
@@ -106,47 +105,38 @@ def in_the_maze(raw, drawn):
     )
 
 
-def protected(env_id):
-    return lambda: CASES[env_id].protect(CASES[env_id].make())
-
-
-class Kind(NamedTuple):
-    """A filtered env, how to put a machine somewhere, and who judges."""
-
-    make: Callable[[], Any]
-    place: Callable[[Any, Drawn], None]
-    judge: Callable[[Any], Judge]
+def known(env_id, place):
+    case = CASES[env_id]
+    return lambda: case.protect(case.make()), place, case.judge
 
 
 KINDS = {
-    "a heading drive": Kind(
-        protected("SafePointGoal1-v0"), beside_a_hazard, CASES["SafePointGoal1-v0"].judge
+    "a heading drive": known("SafePointGoal1-v0", beside_a_hazard),
+    "MuJoCo's model of a car": known("SafeCarGoal1-v0", beside_a_hazard),
+    "a point on two axes": known("PointMaze_UMaze-v3", in_the_maze),
+    "copies of the env": (
+        cart_before_a_wall,
+        in_the_cart,
+        lambda raw: Reported(lambda info: info["cost"] - 0.5),
     ),
-    "MuJoCo's model of a car": Kind(
-        protected("SafeCarGoal1-v0"), beside_a_hazard, CASES["SafeCarGoal1-v0"].judge
-    ),
-    "a point on two axes": Kind(
-        protected("PointMaze_UMaze-v3"), in_the_maze, CASES["PointMaze_UMaze-v3"].judge
-    ),
-    "copies of the env": Kind(
-        cart_before_a_wall, in_the_cart, lambda raw: Reported(lambda info: info["cost"] - 0.5)
-    ),
-    "a user's own": Kind(
+    "a user's own": (
         lambda: sw.CBFActionFilter(Scene(SLED, frame_skip=4), [EndOfRail()]),
         on_the_rail,
         lambda raw: Replay(raw, lambda data: float(data.qpos[0]) - END_M - ROUNDING),
     ),
 }
+"""A filtered env, how to put its machine somewhere, and who judges it."""
 
 
 @cache
 def made(kind):
-    env = KINDS[kind].make()
+    make, _, judge = KINDS[kind]
+    env = make()
     env.reset(seed=0)
     found = env
     while not isinstance(found, sw.CBFActionFilter):
         found = found.env
-    return env, found, KINDS[kind].judge(env.unwrapped)
+    return env, found, judge(env.unwrapped)
 
 
 number = st.floats(-1.0, 1.0, width=32)
@@ -156,7 +146,7 @@ HALVINGS = 12
 def begin(kind, drawn):
     """Put the machine there: h of its way to rest, infinite where nothing is near."""
     env, flt, _ = made(kind)
-    KINDS[kind].place(env.unwrapped, drawn)
+    KINDS[kind][1](env.unwrapped, drawn)
     flt.filter.start()
     (bound,) = flt.filter.bound
     # A shield's h is that of the present state: its way to rest is the backup's plan.

@@ -1,14 +1,12 @@
 """Which models are a point on two slides among walls, what is read from them, and which are refused, by name."""
 
-import gymnasium as gym
 import mujoco
-import numpy as np
 import pytest
+from asking import bound
+from scenes import Scene
 
-import safe_wrappers  # noqa: F401 (registers the crossing)
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.planar_point import planar_point, walls
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>'
 BALL = '<geom type="sphere" size="0.1"/>'
@@ -29,25 +27,14 @@ def xml(slides=SLIDES, ball=BALL, motors=MOTORS, world=WALL, option="", body="")
     </mujoco>"""
 
 
-class World(gym.Env):
-    frame_skip = 2
-
-    def __init__(self, text):
-        self.model = mujoco.MjModel.from_xml_string(text)
-        self.data = mujoco.MjData(self.model)
-        limits = self.model.actuator_ctrlrange
-        self.action_space = gym.spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float64)
-
-
-def bound(text):
-    plant = MujocoPlant()
-    plant.bind(World(text))
+def observing(text):
+    plant = bound(Scene(text, frame_skip=2))
     plant.observe()
     return plant
 
 
 def test_the_point_is_found():
-    plant = bound(xml())
+    plant = observing(xml())
     point = planar_point(plant, clip=4.0)
     assert plant.model.body(point.body).name == "point"
     assert (point.joints, point.actuators, point.origin.tolist()) == ([0, 1], [0, 1], [0.5, -0.25])
@@ -59,42 +46,61 @@ def test_the_point_is_found():
         assert (axis.low, axis.high, axis.clip, axis.substeps, axis.timestep) == (low, high, 4.0, 2, 0.01)
 
 
+YAW = '<joint name="yaw" type="hinge" axis="0 0 1"/>'
+ONE_SLIDE, ONE_MOTOR = SLIDES.split("/>")[0] + "/>", MOTORS.split("/>")[0] + "/>"
+LIMITED = SLIDES.replace('"0 1 0"', '"0 1 0" range="-1 1" limited="true"')
+SPRINGS = SLIDES.replace('type="slide"', 'type="slide" stiffness="4"')
+TWO_MOTORS = MOTORS + '<motor joint="x" ctrlrange="-1 1"/>'
+ALONE = [
+    ({"slides": SLIDES.replace("slide", "hinge")}, "hinge"),
+    ({"slides": "<freejoint/>", "motors": ""}, "free"),
+    ({"slides": SLIDES.replace("0 1 0", "0 0 1")}, "world x and world y"),
+    ({"slides": SLIDES.replace("1 0 0", "-1 0 0")}, "world x and world y"),
+    ({"body": 'euler="0 0 30"'}, "world x and world y"),
+    ({"slides": LIMITED}, "no limits"),
+    ({"motors": ONE_MOTOR}, "actuator of its own"),
+    ({"motors": TWO_MOTORS}, "actuator of its own"),
+    ({"motors": MOTORS.replace("-1 2", "0 2")}, "push both ways"),
+    ({"motors": MOTORS.replace('gear="10"', 'gear="-10"')}, "gear above zero"),
+    ({"motors": MOTORS.replace("<motor joint", '<position kp="3" joint')}, "is .* off that"),
+    ({"slides": SPRINGS}, "springs"),
+    ({"slides": SLIDES.replace('type="slide"', 'type="slide" frictionloss="1"')}, "friction"),
+    ({"option": 'integrator="RK4"'}, "Euler"),
+    ({"option": 'density="1000" viscosity="1"'}, "is .* off that"),
+    ({"world": WALL + '<body><freejoint/><geom size="0.1"/></body>'}, "nothing else that moves"),
+    ({"ball": BALL + '<body><joint type="hinge"/><geom size="0.1"/></body>'}, "nothing else that moves"),
+]
+AMONG_OTHERS = [
+    ({"slides": ONE_SLIDE, "motors": ONE_MOTOR}, "it has 1"),
+    ({"world": '<body><freejoint/><geom size="0.1"/></body>'}, "before any free or ball joint"),
+    ({"slides": YAW + SLIDES}, "is .* off that"),
+    ({"slides": SLIDES + YAW, "ball": BALL.replace("size", 'pos="0.2 0 0" size')}, "is .* off that"),
+    ({"ball": BALL + f'<body>{YAW}<geom pos="0.2 0 0" size="0.1"/></body>'}, "is .* off that"),
+    ({"motors": TWO_MOTORS}, "only one"),
+    ({"slides": LIMITED}, "no limits"),
+    ({"slides": SPRINGS}, "springs"),
+]
+"""What is no point mass on two slides, alone or as the named body among other things that move."""
+
+
 @pytest.mark.parametrize(
-    ("changed", "says"),
-    [
-        ({"slides": SLIDES.replace("slide", "hinge")}, "hinge"),
-        ({"slides": "<freejoint/>", "motors": ""}, "free"),
-        ({"slides": SLIDES.replace("0 1 0", "0 0 1")}, "world x and world y"),
-        ({"slides": SLIDES.replace("1 0 0", "-1 0 0")}, "world x and world y"),
-        ({"body": 'euler="0 0 30"'}, "world x and world y"),
-        ({"slides": SLIDES.replace('"0 1 0"', '"0 1 0" range="-1 1" limited="true"')}, "no limits"),
-        ({"motors": MOTORS.split("/>")[0] + "/>"}, "actuator of its own"),
-        ({"motors": MOTORS + '<motor joint="x" ctrlrange="-1 1"/>'}, "actuator of its own"),
-        ({"motors": MOTORS.replace("-1 2", "0 2")}, "push both ways"),
-        ({"motors": MOTORS.replace('gear="10"', 'gear="-10"')}, "gear above zero"),
-        ({"motors": MOTORS.replace("<motor joint", '<position kp="3" joint')}, "is .* off that"),
-        ({"slides": SLIDES.replace('type="slide"', 'type="slide" stiffness="4"')}, "springs"),
-        ({"slides": SLIDES.replace('type="slide"', 'type="slide" frictionloss="1"')}, "friction"),
-        ({"option": 'integrator="RK4"'}, "Euler"),
-        ({"option": 'density="1000" viscosity="1"'}, "is .* off that"),
-        ({"world": WALL + '<body><freejoint/><geom size="0.1"/></body>'}, "nothing else that moves"),
-        ({"ball": BALL + '<body><joint type="hinge"/><geom size="0.1"/></body>'}, "nothing else that moves"),
-    ],
+    ("changed", "says", "name"),
+    [*((*one, None) for one in ALONE), *((*one, "point") for one in AMONG_OTHERS)],
 )
-def test_other_machines_are_refused_with_the_reason_and_the_alternative(changed, says):
+def test_other_machines_are_refused_with_the_reason_and_the_alternative(changed, says, name):
     with pytest.raises(UnsupportedEnvError, match=f"(?s){says}.*Use Clearance"):
-        planar_point(bound(xml(**changed)), 5.0)
+        planar_point(observing(xml(**changed)), 5.0, name)
 
 
 def found(world, ball=BALL):
-    plant = bound(xml(world=world, ball=ball))
+    plant = observing(xml(world=world, ball=ball))
     return walls(plant.model, plant.named("body", "point"))
 
 
 def test_a_box_is_a_wall_and_reach_is_where_a_contact_is_reported():
     (wall,), reach = found(WALL)
     assert wall == pytest.approx((1.5, 2.5, -1.0, 1.0))
-    plant = bound(xml())
+    plant = observing(xml())
     data = mujoco.MjData(plant.model)
     # Versions of MuJoCo differ in whether two contact margins add up: between these two a contact may be reported.
     for distance, contacts in ((reach + 1e-6, 0), (0.102 - 1e-6, 1)):
@@ -129,36 +135,3 @@ def test_what_cannot_be_run_into_is_left_out(world):
 def test_what_is_no_wall_along_x_and_y_is_refused_by_name(world, says):
     with pytest.raises(UnsupportedEnvError, match=f"(?s){says}.*Use Clearance"):
         found(world)
-
-
-# A point among other things that move ------------------------------------------------------------------------------
-
-YAW = '<joint name="yaw" type="hinge" axis="0 0 1"/>'
-
-
-@pytest.mark.parametrize(
-    ("changed", "says"),
-    [
-        ({"slides": SLIDES.split("/>")[0] + "/>", "motors": MOTORS.split("/>")[0] + "/>"}, "it has 1"),
-        ({"world": '<body><freejoint/><geom size="0.1"/></body>'}, "before any free or ball joint"),
-        ({"slides": YAW + SLIDES}, "is .* off that"),
-        ({"slides": SLIDES + YAW, "ball": BALL.replace("size", 'pos="0.2 0 0" size')}, "is .* off that"),
-        ({"ball": BALL + f'<body>{YAW}<geom pos="0.2 0 0" size="0.1"/></body>'}, "is .* off that"),
-        ({"motors": MOTORS + '<motor joint="x" ctrlrange="-1 1"/>'}, "only one"),
-        ({"slides": SLIDES.replace('"0 1 0"', '"0 1 0" range="-1 1" limited="true"')}, "no limits"),
-        ({"slides": SLIDES.replace('type="slide"', 'type="slide" stiffness="4"')}, "springs"),
-    ],
-    ids=[
-        "one slide",
-        "free joint before",
-        "turns its slides",
-        "off its centre",
-        "swings something",
-        "two motors",
-        "limits",
-        "springs",
-    ],
-)
-def test_what_acts_on_the_named_point_is_found_out(changed, says):
-    with pytest.raises(UnsupportedEnvError, match=f"(?s){says}.*Use Clearance"):
-        planar_point(bound(xml(**changed)), np.inf, "point")
