@@ -75,6 +75,7 @@ TASKS = (
     Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000", SBX), "_sbx_1m"),
     Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=50000", SBX, *SLOWER), "_sbx_8"),
     Task("SafeCarGoal1-v0", "goal_sac", 3, (SBX,), "_sbx"),
+    Task("SafeCarGoal1-v0", "goal_sac", 3, ("total_steps=250000", SBX), "_sbx_1m"),
     Task("SafeCarGoal2-v0", "goal_sac", 3, ("total_steps=50000", SBX, *SLOWER), "_sbx_8"),
     Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5, ("total_steps=400000", SBX), "_sbx_400k"),
     Task("SafeHopperVelocity-v0", "velocity_sac", 3, ("total_steps=400000", SBX), "_sbx_400k"),
