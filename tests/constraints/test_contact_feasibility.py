@@ -17,7 +17,6 @@ from scipy.linalg import block_diag
 from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
-from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import weight_n
 
 BALLS = """<mujoco><option timestep="0.005" cone="{cone}"/>
@@ -62,11 +61,6 @@ def test_in_the_air_nothing_is_missed():
     limit.plant.observe()
     control = np.array([1.0, -1.0])
     assert limit.admits(control) and limit.slacks(control).tolist() == [0.0, 0.0]
-
-
-def test_where_nothing_has_friction_there_is_no_cone_to_stay_in():
-    with pytest.raises(UnsupportedEnvError, match="no body of this model"):
-        sw.CBFActionFilter(pushed_balls(condim=1), [sw.constraints.ContactFeasibility()])
 
 
 TIPS = MASS * 9.81 / HEIGHT / 50.0
