@@ -167,7 +167,7 @@ def test_a_way_out_that_was_begun_stays_open_until_its_end():
 
 def test_of_the_proposals_the_nearest_comes_first_and_one_is_admitted():
     raw, plant, clearance = bound([TRUE_CARS, PILLARS])
-    tried, blended = 0, 0
+    tried, most = 0, 0
     for qpos, qvel, control in random_states(300, seed=1):
         anew(raw, plant, clearance, qpos, qvel)
         if clearance.value().min() < MARGIN or clearance.admits(control):
@@ -180,11 +180,10 @@ def test_of_the_proposals_the_nearest_comes_first_and_one_is_admitted():
         assert away == sorted(away)
         if found:
             tried += 1
-            admitted = [candidate for candidate in found if clearance.admits(candidate)]
-            assert admitted and clearance.admits(clearance.backup())
-            full = [np.abs(candidate[:2]).max() == 1.0 for candidate in admitted]
-            blended += not full[0] and any(full)
-    assert tried > 8 and blended > 3
+            assert any(clearance.admits(candidate) for candidate in found)
+            assert clearance.admits(clearance.backup())
+            most = max(most, len(found))
+    assert tried > 8 and most > 5  # not only braking and full drive along an axis
 
 
 def test_under_a_delay_all_are_where_they_will_be():
