@@ -191,7 +191,6 @@ def test_without_the_filter_one_of_them_breaks_it(name):
 
 STRETCHED = None
 OUTSIDE = {
-    "farther than both ends": ("joint position of Reacher", ([1.7, 0.5], [0.0, 0.0]), [1.0, 1.0], 12, 1e-3),
     "both joints": ("joint position of Reacher", ([-1.7, -1.65], [0.0, 0.0]), [-1.0, -1.0], 12, 1e-3),
     "too fast": ("joint speed of Reacher", ([0.0, 0.0], [9.0, -7.0]), [1.0, -1.0], 30, 1e-6),
     "stretched": ("singularity of Pusher", STRETCHED, [0.0] * 7, 25, 1e-6),

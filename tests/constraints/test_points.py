@@ -228,8 +228,7 @@ PITCHING = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" si
 <velocity joint="right" kv="1" ctrlrange="-12 12" forcerange="-.6 .6"/></actuator></mujoco>"""
 
 
-@pytest.mark.parametrize("action", [0.0, 12.0])
-def test_a_robot_parked_inside_the_margin_is_not_infeasible(action):
+def test_a_robot_parked_inside_the_margin_is_not_infeasible():
     env = Scene(PITCHING, frame_skip=10)
     env.reset()
     for _ in range(40):
@@ -241,6 +240,6 @@ def test_a_robot_parked_inside_the_margin_is_not_infeasible(action):
     filtered = sw.CBFActionFilter(env, [limit])
     filtered.reset()
     for _ in range(60):
-        info = filtered.step(np.full(2, action))[4]
+        info = filtered.step(np.full(2, 12.0))[4]
         assert not info["cbf/infeasible"] and not info["cbf/unsafe"]
         assert info["cbf/margin"] > 0.0099
