@@ -262,11 +262,11 @@ def creeping(slack):
 
 @pytest.mark.parametrize("steps", [1, 5, 6, 7])
 def test_a_refused_control_is_linearised_up_to_six_times(steps):
-    found, made = search(creeping(lambda u: 1.0001 - 0.1 * steps - u[0])), min(steps, 6)
-    admitted, control, rows = found.relinearize(np.ones(2), np.ones(2), NONE, NONE)
-    assert admitted == (steps <= 6) and len(rows[1]) == made
-    np.testing.assert_allclose(control, [1.0 - 0.1 * made, 1.0])
-    assert found.decide(np.ones(2), LAST).infeasible != admitted
+    decision = decide((1.0, 1.0), creeping(lambda u: 1.0001 - 0.1 * steps - u[0]))
+    assert decision.infeasible == (steps > 6)
+    if steps <= 6:
+        assert decision.stage is Stage.RELINEARIZED
+        keeps(decision, 1.0 - 0.1 * steps, 1.0)
 
 
 def test_provisional_tangents_give_way_to_the_next_ones():
@@ -276,12 +276,9 @@ def test_provisional_tangents_give_way_to_the_next_ones():
         def linearize(self, control):
             return sw.HalfSpaces(np.array([[1.0, 0.0]]), np.array([next(limits)]), next(provisional))
 
-    admitted, control, rows = search(Guessing(only((0.6, 1.0)))).relinearize(
-        np.ones(2), np.ones(2), NONE, NONE
-    )
-    assert admitted
-    np.testing.assert_allclose(control, [0.6, 1.0])
-    np.testing.assert_allclose(rows[1], [0.9, 0.6])
+    decision = decide((1.0, 1.0), Guessing(only((0.6, 1.0))))
+    assert decision.stage is Stage.RELINEARIZED
+    keeps(decision, 0.6, 1.0)
 
 
 # Shortening -------------------------------------------------------------------------------------------------------
@@ -306,18 +303,11 @@ def test_more_of_a_correction_that_contradicts_the_rows_is_no_overshoot():
 # The least violation of "at most 0" and "at least 0.5" is 0.25. A prediction that asks for 0.2 would let it through.
 
 
-def contradicting(asked):
-    return Predicting(lambda u: u[0] - 0.2, tangents=lambda u: at_least(next(asked)))
-
-
 @pytest.mark.parametrize("before", [0, 2, 5])
 def test_tangents_against_rows_let_nothing_through_that_breaks_the_rows(before):
-    asked = [0.1] * before + [0.5] * 9
-    least = search(contradicting(iter(asked)), LEFT)
-    admitted, control, _ = least.relinearize(np.zeros(2), np.zeros(2), STRICT, STRICT)
-    assert control[0] == pytest.approx(0.25, abs=0.03)
-    assert not admitted
-    decision = decide((0.0, 0.0), contradicting(iter(asked)), LEFT, fallback="zero")
+    asked = iter([0.1] * before + [0.5] * 9)
+    contradicting = Predicting(lambda u: u[0] - 0.2, tangents=lambda u: at_least(next(asked)))
+    decision = decide((0.0, 0.0), contradicting, LEFT, fallback="zero")
     assert decision.stage is Stage.FALLBACK and decision.infeasible and decision.fallback
     keeps(decision, 0.0, 0.0)
 
