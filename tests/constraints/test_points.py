@@ -77,11 +77,9 @@ def measured(direction, velocity):
 def velocities(v, u, timestep, substeps):
     """Of both bodies after each substep of a held control, shape (substeps, 2, 3), by hand."""
     t = timestep * np.arange(1, substeps + 1)
-    out = np.zeros((substeps, 2, 3))
-    out[:, 0] = v[:3]
-    out[:, 0, 0] += t * u[0] / WEIGHTS[0]
-    out[:, 1, 0] = v[3] + t * u[1] / WEIGHTS[1]
-    return out
+    still = 0.0 * t
+    first = np.stack([v[0] + t * u[0] / WEIGHTS[0], v[1] + still, v[2] + still], axis=1)
+    return np.stack([first, np.stack([v[3] + t * u[1] / WEIGHTS[1], still, still], axis=1)], axis=1)
 
 
 @given(
@@ -184,33 +182,22 @@ def test_every_bound_that_there_is_and_every_obstacle_counts_by_itself():
     env = Scene(ARM)
     env.data.qpos[:] = [0.4, -0.7, 0.2]
     mujoco.mj_forward(env.model, env.data)
-    (x, y, z), (p, q, r) = tip, bone = env.data.site("tip").xpos.copy(), env.data.geom("bone").xpos.copy()
+    both = np.array([env.data.site("tip").xpos, env.data.geom("bone").xpos])
 
     def left(**arguments):
         return asked(env, of.Workspace(sites=["tip"], geoms=["bone"], **arguments)).value()
 
-    np.testing.assert_allclose(left(low=[-1.0, None, None]), [x + 1.0, p + 1.0])
-    np.testing.assert_allclose(
-        left(low=[None, -1.0, None], high=[2.0, None, 3.0], radius=0.1),
-        np.array([y + 1.0, q + 1.0, 2.0 - x, 3.0 - z, 2.0 - p, 3.0 - r]) - 0.1,
-    )
-    disc, ball = of.Disc([0.1, 0.2], 0.05), of.Sphere([0.1, 0.2, 0.9], 0.05)
-    wall, block = (
-        of.Plane([0.0, 0.0, 0.5], [0.0, 3.0, 4.0]),
-        of.Box([9.0, 0.0, 0.0], [1.0, 99.0, 99.0]),
-    )
-    np.testing.assert_allclose(
-        left(keep_out=[disc, ball, wall, block], radius=0.01),
-        np.concatenate(
-            [
-                [np.hypot(a - 0.1, b - 0.2) - 0.05 for a, b in (tip[:2], bone[:2])],
-                [np.linalg.norm(each - [0.1, 0.2, 0.9]) - 0.05 for each in (tip, bone)],
-                [0.6 * each[1] + 0.8 * (each[2] - 0.5) for each in (tip, bone)],
-                [8.0 - x, 8.0 - p],
-            ]
-        )
-        - 0.01,
-    )
+    np.testing.assert_allclose(left(low=[-1.0, None, None]), both[:, 0] + 1.0)
+    expected = np.concatenate([both[:, 1] + 1.0, ([2.0, 3.0] - both[:, [0, 2]]).ravel()]) - 0.1
+    np.testing.assert_allclose(left(low=[None, -1.0, None], high=[2.0, None, 3.0], radius=0.1), expected)
+    obstacles = [
+        (of.Disc([0.1, 0.2], 0.05), np.linalg.norm(both[:, :2] - [0.1, 0.2], axis=1) - 0.05),
+        (of.Sphere([0.1, 0.2, 0.9], 0.05), np.linalg.norm(both - [0.1, 0.2, 0.9], axis=1) - 0.05),
+        (of.Plane([0.0, 0.0, 0.5], [0.0, 3.0, 4.0]), 0.6 * both[:, 1] + 0.8 * (both[:, 2] - 0.5)),
+        (of.Box([9.0, 0.0, 0.0], [1.0, 99.0, 99.0]), 8.0 - both[:, 0]),
+    ]
+    keep_out, distances = zip(*obstacles, strict=True)
+    np.testing.assert_allclose(left(keep_out=keep_out, radius=0.01), np.concatenate(distances) - 0.01)
 
 
 # A robot that pitches: what its body does after the wheels have stopped is not up to the actuators ---------------

@@ -144,15 +144,14 @@ class Approaching(sw.Constraint, Model):
 
 @pytest.mark.parametrize(("left", "often"), [(0.5, 10), (-0.1, 1)])
 def test_slopes_are_kept_for_ten_control_steps_and_from_outside_for_none(left, often):
-    plant = SimpleNamespace(has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1)
-    plant.model_version = 0
-    limit, memory, made = Bound(Approaching(left), plant), {}, []
+    ends = {"lower": -np.ones(2), "upper": np.ones(2)}
+    plant = SimpleNamespace(has_acceleration=False, control_dt=0.1, model_version=0, **ends)
+    limit, memory = Bound(Approaching(left), plant), {}
     for plant.observation_id in range(1, 25):
         limit.observe(memory)
         limit.spec.sketches = 0
         for _ in range(2):  # once per observation
             limit.rows()
-        made.append(limit.spec.sketches)
+        # Of braking and of one difference for each control.
+        assert limit.spec.sketches == 3 * ((plant.observation_id - 1) % often == 0)
         memory = limit.executed(np.zeros(2))
-    # Of braking and of one difference for each control.
-    assert made == [3 * (k % often == 0) for k in range(24)]
