@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from judged_loops import slider
 from scenes import Scene
 
-import safe_wrappers as sw
 from safe_wrappers import constraints as of
 from safe_wrappers.envs import SPEED_LIMITS
 
@@ -198,35 +197,3 @@ def test_every_bound_that_there_is_and_every_obstacle_counts_by_itself():
     ]
     keep_out, distances = zip(*obstacles, strict=True)
     np.testing.assert_allclose(left(keep_out=keep_out, radius=0.01), np.concatenate(distances) - 0.01)
-
-
-# A robot that pitches: what its body does after the wheels have stopped is not up to the actuators ---------------
-
-PITCHING = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="9 9 .1"/>
-<body name="chassis" pos="0 0 .145"><freejoint/><geom type="box" size=".15 .12 .03" mass="2"/>
-<geom type="capsule" fromto="0 0 0 0 0 .45" size=".03" mass=".8"/>
-<geom type="sphere" pos=".13 0 -.1" size=".045" friction="0 0 0" mass=".05"/>
-<geom type="sphere" pos="-.13 0 -.1" size=".045" friction="0 0 0" mass=".05"/>
-<body pos="0 .15 -.05"><joint name="left" axis="0 1 0"/>
-<geom type="cylinder" size=".1 .02" euler="90 0 0" mass=".2"/></body>
-<body pos="0 -.15 -.05"><joint name="right" axis="0 1 0"/>
-<geom type="cylinder" size=".1 .02" euler="90 0 0" mass=".2"/></body>
-</body></worldbody><actuator><velocity joint="left" kv="1" ctrlrange="-12 12" forcerange="-.6 .6"/>
-<velocity joint="right" kv="1" ctrlrange="-12 12" forcerange="-.6 .6"/></actuator></mujoco>"""
-
-
-def test_a_robot_parked_inside_the_margin_is_not_infeasible():
-    env = Scene(PITCHING, frame_skip=10)
-    env.reset()
-    for _ in range(40):
-        env.step(np.zeros(2))  # it settles on its springy contacts
-    env.start = env.data.qpos.copy(), env.data.qvel.copy()
-    limit = of.Workspace(
-        high=[float(env.data.body("chassis").xpos[0]) + 0.01, None, None], bodies=["chassis"], margin=0.02
-    )
-    filtered = sw.CBFActionFilter(env, [limit])
-    filtered.reset()
-    for _ in range(60):
-        info = filtered.step(np.full(2, 12.0))[4]
-        assert not info["cbf/infeasible"] and not info["cbf/unsafe"]
-        assert info["cbf/margin"] > 0.0099

@@ -16,7 +16,6 @@ from safe_wrappers.control.backup.heading_drive import (
     brake_control,
     clearances,
     look,
-    reach,
 )
 from safe_wrappers.plants.mujoco.planar_robot import heading_drive
 
@@ -100,19 +99,6 @@ def test_what_an_uncertain_machine_leaves_is_told_of_each_model_apart():
         others = [clearances(models[[0, i]], *given, discs, True)[:, 6:] for i in range(1, len(models))]
         np.testing.assert_array_equal(every, np.concatenate([alone, *others], axis=1))
         assert (others != alone).any()
-
-
-def test_no_braking_gets_farther_than_its_reach():
-    _, _, drive = robot()
-    rng, places = np.random.default_rng(6), np.empty((drive.substeps, 2))
-    for k in range(50):
-        motion = random_motion(rng, yaw=0.4)
-        if k % 2:  # sideways, where nothing brakes
-            motion = motion._replace(heading=math.atan2(motion.vx, -motion.vy), yaw_rate=0.0)
-        start = motion
-        for _ in range(300):
-            motion = advance(drive, motion, brake_control(drive, motion), 0.0, places)
-            assert np.linalg.norm(places - start[:2], axis=1).max() <= reach(drive, start)
 
 
 def random_scenes(count):
