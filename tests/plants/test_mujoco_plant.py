@@ -146,19 +146,22 @@ def test_the_force_is_affine_inside_the_acting_range_and_the_same_beyond_it(kind
     assert np.abs(effect).max() > 0.0
 
 
-def test_a_speed_servos_clamp_moves_with_the_speed():
+def test_a_speed_servos_clamp_moves_with_the_speed_and_is_widened_by_what_a_hold_can_change():
+    kv, gear, most_n = 2.0, 1.5, 0.05
     for speed in (-0.4, 0.0, 0.5):
-        env = scene('<velocity joint="hinge" kv="1" ctrlrange="-1 1" forcerange="-.05 .05"/>')
+        env = scene(
+            f'<velocity joint="hinge" kv="{kv}" gear="{gear}" ctrlrange="-1 1" forcerange="-{most_n} {most_n}"/>'
+        )
         env.data.qvel[0] = speed
         plant = bound(env)
         plant.observe()
-        low, high = plant.acting_range  # at least the present clamp, widened by what a hold can change
-        assert (
-            speed - 0.15 <= low[0] <= speed - 0.05 + 1e-12 and speed + 0.15 >= high[0] >= speed + 0.05 - 1e-12
-        )
         drift, effect = plant.acceleration
-        (found,) = accelerations(env.model, env.data.qpos, env.data.qvel, [[speed + 0.02]])
-        np.testing.assert_allclose(drift + effect @ [speed + 0.02], found, atol=1e-9)
+        middle, per_newton = gear * speed, effect[0, 0] / kv
+        reach = most_n / kv + most_n * per_newton * gear * plant.control_dt
+        np.testing.assert_allclose(plant.acting_range, [[middle - reach], [middle + reach]], atol=1e-9)
+        inside = [middle + 0.02]
+        (found,) = accelerations(env.model, env.data.qpos, env.data.qvel, [inside])
+        np.testing.assert_allclose(drift + effect @ inside, found, atol=1e-9)
 
 
 MUSCLE = "0.75 1.05 -1 200 0.5 1.6 1.5 1.3 1.2"
