@@ -32,6 +32,8 @@ def test_f_and_g_are_mujocos_own_derivatives(env_id):
     for k in range(30):
         if k % 10 == 0:
             env.reset(seed=k)
+            if k == 20:  # as MuJoCo takes it for large models
+                raw.model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)
         env.step(rng.uniform(env.action_space.low, env.action_space.high).astype(np.float32))
         plant.observe()
         drift, effect = plant.acceleration
@@ -51,7 +53,7 @@ def test_f_and_g_are_mujocos_own_derivatives(env_id):
         np.testing.assert_array_equal(plant.g, np.vstack([np.zeros((nq, nu)), effect]))
         np.testing.assert_array_equal(plant.state, np.concatenate([qpos, qvel]))
     # Where the difference crosses a switch of contacts the two differ.
-    assert np.median(effects) < 1e-6 and np.median(drifts) < 1e-6
+    assert (np.median(np.reshape([effects, drifts], (2, 3, 10)), axis=2) < 1e-6).all()
 
 
 @pytest.mark.parametrize(
