@@ -21,7 +21,7 @@ BEGIN = (
     # Each worker compiles other parts of the package first and finds those of the other one compiled.
     "test_heading_drive",
     "test_point_among_walls",
-    "test_support_distances",
+    "test_contact",
     "test_contact_feasibility",
     # What takes long comes early, so that no worker is alone with it in the end.
     "test_cli",

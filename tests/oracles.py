@@ -13,13 +13,6 @@ def blind_covariance(start, a, q, time_s):
     return transition @ start @ np.swapaxes(transition, -1, -2) + noise
 
 
-def double_integrator_covariance(start, intensity, t):
-    """The closed form for position and velocity under white acceleration noise."""
-    (p, both), (_, v) = start
-    apart = both + v * t + intensity * t**2 / 2
-    return np.array([[p + 2 * both * t + v * t**2 + intensity * t**3 / 3, apart], [apart, v + intensity * t]])
-
-
 def in_cone(forces, normals, friction, tolerance=0.0):
     return cone_excess(forces, normals, friction) <= tolerance
 

@@ -12,8 +12,8 @@ With the delays T_video + T_human + T_act of a remote operator (without the down
 the lease is the longest round trip of the network, `T_RTT <= (D_clear - d_brake) / v - delays`. It bounds
 displacement, not energy or contact force.
 
-**Reach.** `furthest` and `admits` are necessary bounds: no reachable goal is refused. `jerk_limited_time` asks
-ruckig. Metres stand for any unit of length.
+**Reach.** `furthest` and `admits` are necessary bounds: no reachable goal is refused. `transit_time` asks ruckig.
+Metres stand for any unit of length.
 
 Source: appendix "Kinematic derivation of watchdog validity leases", "Teleoperation network round-trip time bounds"
 and "Trajectory transit time and reachable distance".
@@ -103,10 +103,6 @@ def _lease(d: float, v: float, b: float, late: float, loc: float, gap: float, a:
     return -math.inf if math.isnan(lease) else lease
 
 
-State = tuple[ArrayLike, ArrayLike, ArrayLike]
-"""Position (m), velocity (m/s), acceleration (m/s^2), each of shape (axes,) or scalar."""
-
-
 def furthest(
     duration: ArrayLike, velocity: ArrayLike, max_speed: ArrayLike, max_acceleration: ArrayLike
 ) -> tuple[Array, Array]:
@@ -154,30 +150,30 @@ def admits(
         return np.asarray((lowest - slack <= way) & (way <= highest + slack) & np.isfinite(way))
 
 
-def jerk_limited_time(
-    start: State,
-    end: State,
+def transit_time(
+    goal: ArrayLike,
+    position: ArrayLike,
+    velocity: ArrayLike,
+    max_speed: ArrayLike,
     max_acceleration: ArrayLike,
-    max_speed: ArrayLike = math.inf,
     max_jerk: ArrayLike = math.inf,
 ) -> float:
-    """The shortest time, s, in which all axes arrive at their end state together.
+    """The shortest time, s, after which all axes, shape (axes,) or scalar, rest at the goal; arguments of `admits`.
 
-    A start outside the limits is first brought back inside. inf where ruckig finds no profile, where a state is not
-    finite, and where the end state violates the limits: too fast, too strongly accelerated, or reached only from
-    above the speed limit. The limits are of all axes or of each, > 0, in m/s^2 (finite), m/s and m/s^3 (inf: none).
+    A start that is too fast is first braked. With `max_jerk`, m/s^3, it is one without acceleration. inf where goal,
+    position or velocity are not finite, and where ruckig finds no profile.
     """
-    limits = max_acceleration, max_speed, max_jerk
-    given = [np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (*start, *end, *limits)]
-    p0, v0, a0, p1, v1, a1, a_max, v_max, jerk = np.broadcast_arrays(*given)
-    if not all(np.isfinite(x).all() for x in (p0, v0, a0, p1, v1, a1)):
+    given = (goal, position, velocity, max_speed, max_acceleration, max_jerk)
+    end, start, v, v_max, a_max, jerk = np.broadcast_arrays(
+        *(np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in given)
+    )
+    if not (np.isfinite(end) & np.isfinite(start) & np.isfinite(v)).all():
         return math.inf
-    request, trajectory = ruckig.InputParameter(p0.size), ruckig.Trajectory(p0.size)
-    request.current_position, request.current_velocity, request.current_acceleration = p0, v0, a0
-    request.target_position, request.target_velocity, request.target_acceleration = p1, v1, a1
-    request.max_acceleration, request.max_velocity, request.max_jerk = a_max, v_max, jerk
+    request, trajectory = ruckig.InputParameter(end.size), ruckig.Trajectory(end.size)
+    request.current_position, request.current_velocity, request.target_position = start, v, end
+    request.max_velocity, request.max_acceleration, request.max_jerk = v_max, a_max, jerk
     try:
-        ruckig.Ruckig(p0.size).calculate(request, trajectory)
+        ruckig.Ruckig(end.size).calculate(request, trajectory)
     except ruckig.RuckigError:
         return math.inf
     return float(trajectory.duration)

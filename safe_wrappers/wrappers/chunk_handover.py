@@ -20,7 +20,7 @@ from safe_wrappers.control.handover import (
     limit_of_each,
     shortest_blend,
 )
-from safe_wrappers.control.watchdog import admits, jerk_limited_time
+from safe_wrappers.control.watchdog import admits, transit_time
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,
@@ -383,10 +383,10 @@ class Admission:
     def admits(self, end: Array, duration_s: float) -> bool:
         """Whether a chunk may be executed that ends with a command (m,) after so many seconds."""
         position, velocity = self._raw.data.actuator_length, self._raw.data.actuator_velocity
+        motion, limits = (end, position, velocity), (self._speed, self._acceleration)
         if self._rest:
-            states = (position, velocity, 0.0), (end, 0.0, 0.0)
-            return jerk_limited_time(*states, self._acceleration, self._speed) <= duration_s
-        return bool(admits(end, position, velocity, duration_s, self._speed, self._acceleration).all())
+            return transit_time(*motion, *limits) <= duration_s
+        return bool(admits(*motion, duration_s, *limits).all())
 
 
 def upsampled(chunk: Array, steps: int) -> Array:

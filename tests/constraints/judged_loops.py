@@ -144,39 +144,21 @@ def manipulability(model, data, kind, name, joints, directions="xyz"):
 
 def moves(model, body):
     """Whether a body has a joint between itself and the world."""
-    while body:
-        if model.body_dofnum[body]:
-            return True
-        body = model.body_parentid[body]
-    return False
-
-
-def solver_force(model, data, contact):
-    """Along the normal and the two tangents: what a contact's rows of the solver add up to, N."""
-    first, dim = contact.efc_address, contact.dim
-    if dim == 1:
-        return np.array([data.efc_force[first], 0.0, 0.0])
-    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-        return np.array(data.efc_force[first : first + 3])
-    # A row pushes along an edge of the pyramid: the normal, plus or minus a tangent times its friction.
-    edges = data.efc_force[first : first + 2 * (dim - 1)].reshape(-1, 2)
-    sideways = (edges[:2, 0] - edges[:2, 1]) * contact.friction[:2]
-    return np.array([edges.sum(), *sideways])
+    return model.body_treeid[body] >= 0
 
 
 def touches(model, data):
     """Point, normal, force on the robot and friction of each contact with what does not move."""
-    for contact in data.contact:
+    wrench = np.zeros(6)
+    for k, contact in enumerate(data.contact):
         if contact.efc_address < 0 or -1 in contact.geom:
             continue
-        one, two = (int(model.geom_bodyid[g]) for g in contact.geom)
-        if moves(model, one) == moves(model, two):
-            continue
-        frame = contact.frame.reshape(3, 3)
-        side = 1.0 if moves(model, two) else -1.0
-        force = side * frame.T @ solver_force(model, data, contact)
-        friction = min(contact.friction[:2]) if contact.dim > 1 else 0.0
-        yield contact.pos.copy(), side * frame[0], force, friction
+        one, two = (moves(model, model.geom_bodyid[g]) for g in contact.geom)
+        if one != two:
+            side, frame = (1.0 if two else -1.0), contact.frame.reshape(3, 3)
+            mujoco.mj_contactForce(model, data, k, wrench)
+            friction = min(contact.friction[:2]) if contact.dim > 1 else 0.0
+            yield contact.pos.copy(), side * frame[0], side * frame.T @ wrench[:3], friction
 
 
 def cone_room(share, tolerance=0.0):
@@ -199,15 +181,10 @@ def inside_the_hull(inset):
 
     def room(model, data):
         found = list(touches(model, data))
-        if not found:
-            return np.inf
-        points, forces = (np.array([one[i] for one in found]) for i in (0, 2))
+        points, forces = (np.array([one[i] for one in found]).reshape(-1, 3) for i in (0, 2))
         flat, pressure = points[:, :2], forces[:, 2]
-        if (
-            len(flat) < 3
-            or np.linalg.matrix_rank(flat - flat.mean(axis=0), 1e-6) < 2
-            or pressure.sum() <= 0.0
-        ):
+        lifted = len(found) < 3 or pressure.sum() <= 0.0
+        if lifted or np.linalg.matrix_rank(flat - flat.mean(axis=0), 1e-6) < 2:
             return np.inf
         # Points above the mean height have moments of their own tangential forces.
         up = points[:, 2] - points[:, 2].mean()
@@ -237,10 +214,6 @@ def at_random(judge, space, k, rng):
 
 def bang_bang(judge, space, k, rng):
     return signs(space, k, 9)
-
-
-def pulse(judge, space, k, rng):
-    return signs(space, k, 20) * (k % 20 < 4)
 
 
 def full(judge, space, k, rng):

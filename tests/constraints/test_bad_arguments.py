@@ -1,5 +1,7 @@
 """What no constraint and no obstacle can be made of, or bound to, is refused with what to give instead."""
 
+from dataclasses import fields
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ CARS = of.TrackedDiscs(0.4, attribute="car_tracks")
 NO_TRACKS = of.TrackedDiscs(0.4, attribute="car_radius")
 UNLIMITED = {"lower": None, "upper": None, "joints": ["joint0"]}
 TOUCH = {"bodies": ["fingertip"], "against": ["sideE"]}
+SQUARE = [[0, 0], [1, 1], [0, 1]]
 TIP = {"body": "fingertip", "directions": "xy"}
 RIGHT = {
     of.Barrier: {"h": lambda x: 1.0 - x[0] ** 2},
@@ -40,48 +43,38 @@ RIGHT = {
     of.Workspace: {"low": [0.0, 0.0, 0.0], "bodies": ["fingertip"]},
 }
 
+
+def numbers(kind):
+    return [field.name for field in fields(kind) if field.init and field.type in (float, int, float | None)]
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in RIGHT for name in numbers(kind)])
+def test_a_number_that_is_none_or_negative_is_refused_by_its_name(kind, name):
+    kind(**RIGHT[kind])
+    for wrong in (np.nan, "much", -0.1, [[1.0]]):
+        with pytest.raises(ConfigurationError, match=name):
+            kind(**RIGHT[kind] | {name: wrong})
+
+
 MADE = [
     (of.Barrier, {"h": 4.0}, "h must be a function of the state, got 4.0"),
-    (of.Barrier, {"alpha": -1.0}, "alpha must be a finite number > 0 in 1/s, got -1.0"),
-    (of.Barrier, {"alpha": lambda value: value}, "alpha must be a number in 1/s"),
     (of.Box, {"half_size": [1, 1, 1]}, "half_size must be 2 finite numbers"),
     (of.Clearance, {"obstacles": []}, "obstacles is a list with at least one obstacle"),
     (of.Clearance, {"obstacles": ["wall"]}, "expected an obstacle .* got 'wall'"),
-    (of.Clearance, {"braking": -2}, r"braking must be a finite number > 0 in m/s\^2, got -2"),
-    (of.Clearance, {"state_error": np.nan}, "state_error must be a finite number >= 0 in m, got nan"),
     (of.Clearance, {"position": [0] * 4, "velocity": [1] * 4}, "position and velocity are up to three"),
     (of.Clearance, {"position": [0], "velocity": [1, 2]}, "position and velocity .* in the same order"),
     (of.CoastingClearance, {"keep_out": []}, "keep_out .* or untouched"),
     (of.CoastingClearance, {"keep_out": [of.Plane([0.0], [1.0])]}, "holds Disc and Discs, got Plane"),
     (of.CoastingClearance, {"keep_out": [of.Discs("a", 1.0, "v")]}, "past discs that stand still"),
     (of.CoastingClearance, {"untouched": [DISC]}, "untouched needs the machine's outline"),
-    (of.CoastingClearance, {"outline": [[0, 0], [1, 0], [0, 1]]}, "give the obstacles .* in untouched"),
-    (
-        of.CoastingClearance,
-        {"untouched": [DISC], "outline": [[0, 0], [1, 1]]},
-        "not on one line",
-    ),
+    (of.CoastingClearance, {"outline": SQUARE}, "keep_out is for the body's origin alone"),
+    (of.CoastingClearance, {"untouched": [DISC], "outline": SQUARE[:2]}, "not on one line"),
     (of.CoastingClearance, {"untouched": [DISC], "outline": [0, 1, 2]}, r"list of points \[x, y\] in m"),
-    (of.CoastingClearance, {"horizon": 1}, "horizon"),
-    (of.CoastingClearance, {"max_decrease": -1.0}, "max_decrease must be"),
-    (of.CoastingClearance, {"margin": -0.1}, "margin must be"),
-    (of.ContactFeasibility, {"friction_share": 0.0}, "friction_share"),
-    (of.ContactFeasibility, {"friction_share": "all"}, "friction_share"),
-    (of.ContactFeasibility, {"tolerance": np.nan}, "tolerance"),
-    (of.Disc, {"radius": -1}, "radius must be a finite number > 0 in m, got -1"),
     (of.Disc, {"center": [0, 0, 0]}, "center must be 2 finite numbers, got"),
-    (of.EscapeClearance, {"obstacles": []}, "at least one obstacle"),
     (of.EscapeClearance, {"obstacles": [SPHERE]}, "obstacles holds TrackedDiscs and Discs"),
-    (of.EscapeClearance, {"radius": -0.1}, "radius"),
-    (of.JointSpeedLimit, {"limit": 0.0}, "limit must be a finite number > 0 in rad/s or m/s, got 0.0"),
-    (of.JointSpeedLimit, {"margin": -0.1}, "margin must be a finite number >= 0 in rad/s or m/s, got -0.1"),
+    (of.EscapeClearance, {"obstacles": [of.Plane([0, 0, 0], [0, 0, 1])]}, "seen from above"),
     (of.JointSpeedLimit, {"joints": []}, "joints is a list of names, or None"),
-    (of.JointSpeedLimit, {"horizon": 0}, "horizon"),
-    (of.JointPositionLimit, {"lower": np.nan}, "lower is a position in rad or m, or one per joint; got nan"),
-    (of.JointPositionLimit, {"margin": -1.0}, "margin must be a finite number >= 0 in rad or m, got -1.0"),
-    (of.ImpactSpeedLimit, {"force_limit": 0.0}, "force_limit must be a finite number > 0 in N, got 0.0"),
     (of.ImpactSpeedLimit, {"margin": 100.0}, "the margin 100.0 N leaves nothing of the limit 100.0 N"),
-    (of.ImpactSpeedLimit, {"stiffness": None}, "stiffness must be a number in N/m"),
     (of.ImpactSpeedLimit, {"bodies": []}, r"bodies is a list of names of bodies or geoms; got \[\]"),
     (of.Plane, {"normal": [1]}, "normal must be 2 finite numbers"),
     (of.PredictiveShield, {"h": 3}, "h is a function"),
@@ -89,46 +82,29 @@ MADE = [
     (of.PredictiveShield, {"backup": 0.5}, "backup is zero, hold"),
     (of.PredictiveShield, {"backup": []}, "a list with at least one"),
     (of.PredictiveShield, {"terminal": 1.0}, "terminal is a function or None, got 1.0"),
-    (of.PredictiveShield, {"horizon": 0}, "horizon"),
-    (of.PredictiveShield, {"margin": -1.0}, "margin"),
-    (of.PredictiveShield, {"candidates": -1}, "candidates"),
     (of.PredictiveShield, {"sees": "all"}, "sees is one of observation, env, view"),
     (of.SingularityMargin, {"threshold": None}, "give a threshold .*, or a task_speed and a rate_limit"),
     (of.SingularityMargin, {"body": None}, "name the one site, body or geom .*site=None"),
     (of.SingularityMargin, {"directions": "xw"}, 'directions is some of "xyz"'),
-    (of.SpeedLimit, {"limit": 0.0}, "limit must be a finite number > 0 in m/s, got 0.0"),
-    (of.SpeedLimit, {"limit": "fast"}, "limit must be a number in m/s, got 'fast'"),
     (of.SpeedLimit, {"margin": 1.0}, "the margin 1.0 leaves nothing of the limit 1.0"),
     (of.SpeedLimit, {"direction": ""}, "no direction ''; choose"),
     (of.SpeedLimit, {"average": "mean"}, "no average 'mean'; choose step or substep"),
-    (of.SpeedLimit, {"look_ahead_below": 0.0}, "look_ahead_below must be"),
-    (of.Stance, {"friction_share": 0.0}, "friction_share"),
     (of.Stance, {"friction_share": 1.1}, r"\(0, 1\]"),
     (of.Stance, {"cone": "round"}, "pyramid"),
-    (of.SupportMargin, {"inset": 0.0}, "inset"),
-    (of.SupportMargin, {"inset": "1 cm"}, "inset"),
-    (of.SupportMargin, {"inset": np.nan}, "inset"),
-    (of.TrackPermission, {"braking": 0.0}, "braking.*m/s"),
     (of.TrackPermission, {"tracks": "car0"}, "list of names"),
     (of.TrackPermission, {"tracks": []}, "tracks is a list of names, or None for all"),
-    (of.Traction, {"max_slip": 0.0}, r"\(0, 1\)"),
-    (of.Traction, {"max_slip": np.nan}, "max_slip"),
-    (of.Traction, {"friction": -0.5}, "friction"),
+    (of.Traction, {"max_slip": 1.0}, r"\(0, 1\)"),
     (of.Traction, {"margin": 0.15}, "margin must be below max_slip = 0.15, got 0.15"),
-    (of.WallClearance, {"margin": -0.1}, "margin.*m, got -0.1"),
-    (of.WallClearance, {"velocity_clip": np.inf}, "velocity_clip.*finite"),
     (of.Workspace, {"low": None}, r"give a bound in low or high \(m\), or something to keep_out of"),
     (of.Workspace, {"low": [0.0, 1.0]}, r"low is \[x, y, z\] in m, None where there is no"),
     (of.Workspace, {"high": [np.nan, 0.0, 0.0]}, "high must be finite"),
     (of.Workspace, {"high": [1.0, 1.0, 1.0], "radius": 0.3, "margin": 0.2}, "nothing is left of the box"),
-    (of.Workspace, {"margin": np.nan}, "margin must be a finite number >= 0"),
     (of.Workspace, {"bodies": "fingertip"}, "bodies is a list of names; got"),
 ]
 
 
 @pytest.mark.parametrize(("kind", "wrong", "words"), MADE)
 def test_it_is_not_made_of(kind, wrong, words):
-    kind(**RIGHT[kind])
     with pytest.raises(ConfigurationError, match=words):
         kind(**RIGHT[kind] | wrong)
 

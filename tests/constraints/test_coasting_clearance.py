@@ -1,6 +1,7 @@
 """CoastingClearance: what it admits, suggests as a `Detour`, refuses and says."""
 
 import warnings
+from functools import cache
 
 import gymnasium as gym
 import mujoco
@@ -18,8 +19,8 @@ NONE = np.zeros(2)
 SQUARE = [[0.16, 0.18], [0.16, -0.18], [-0.16, 0.18], [-0.16, -0.18]]
 
 
-def bound(hazards, level=1, vases=(), heading=0.0, speed_up=0, **options):
-    """A filtered car at the origin after `speed_up` steps of full drive without the filter, and its constraint."""
+def bound(hazards, level=1, vases=(), heading=0.0, speed_up=0, idle=0, **options):
+    """A filtered car at the origin after full drive and idle steps without the filter, and its constraint."""
     options = {
         "keep_out": [sw.constraints.Discs("hazard_positions", 0.2)],
         "robot_model_attr": "robot_model",
@@ -29,8 +30,8 @@ def bound(hazards, level=1, vases=(), heading=0.0, speed_up=0, **options):
     )
     layout = {"agent": [0.0, 0.0, heading], "goal": [9.0, 9.0], "hazards": hazards, "vases": list(vases)}
     env.reset(seed=0, options={"layout": layout})
-    for _ in range(speed_up):
-        env.unwrapped.step(FULL)
+    for control in speed_up * [FULL] + idle * [NONE]:
+        env.unwrapped.step(control)
     constraint = Asked(env.constraints[0], env.plant)
     env.plant.observe()
     return env, constraint, env.plant
@@ -51,40 +52,39 @@ def least_way(env, control, point=(0.0, 0.0), steps=25):
     return least
 
 
-def ahead_of(env, distance):
-    """The place at a distance along x from the car."""
-    x, y = env.unwrapped.agent_position
-    return np.array([x + distance, y])
+@cache
+def place_after(speed_up, idle):
+    return bound([[5.0, 0.0]], speed_up=speed_up, idle=idle)[0].unwrapped.agent_position
 
 
-@pytest.mark.parametrize("gap", [0.01, *np.linspace(0.02, 0.16, 8), 0.2])
+def beside(gap, speed_up=0, side=1.0, idle=0):
+    """A car with this gap to a hazard before it, or behind it, its constraint, and where the hazard is."""
+    x, y = place_after(speed_up, idle)
+    hazard = [x + side * (0.2 + gap), y]
+    return *bound([hazard], speed_up=speed_up, idle=idle)[:2], hazard
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])  # what it rolls away from is as near as now; and before it
 @pytest.mark.parametrize("speed_up", [0, 6, 30])
-def test_a_control_is_admitted_iff_its_way_to_rest_keeps_the_margin(gap, speed_up):
+def test_a_control_is_admitted_iff_its_way_to_rest_keeps_the_margin(speed_up, side):
     """Independent: the env's own data, stepped on without any control."""
-    env, constraint, plant = bound([[5.0, 0.0]], speed_up=speed_up)
-    for side in (-1.0, 1.0):  # behind the car: what it rolls away from is as near as now; and before it
-        hazard = ahead_of(env, side * (0.2 + gap))
-        env.unwrapped._hazards[:] = hazard
-        plant.observe()
+    for gap in (0.01, 0.02, 0.05, 0.1, 0.15, 0.2):
+        env, constraint, hazard = beside(gap, speed_up, side)
         at_rest = least_way(env, NONE, hazard) - 0.2
         assert constraint.value() == pytest.approx(min(at_rest, gap), abs=1e-3)
-    for control in (FULL, BACK, NONE, np.array([1.0, -1.0]), np.array([0.006, 0.0])):
-        way = least_way(env, control, hazard) - 0.2
-        if abs(way - 0.005) < 1e-3 or at_rest < 0.006:
-            continue  # too close to call, or already inside the margin
-        assert constraint.admits(control) == (way > 0.005)
+        for control in (FULL, BACK, NONE, np.array([1.0, -1.0]), np.array([0.006, 0.0])):
+            way = least_way(env, control, hazard) - 0.2
+            if abs(way - 0.005) > 1e-3 and at_rest >= 0.006:  # else too close to call, or inside the margin
+                assert constraint.admits(control) == (way > 0.005)
 
 
 def test_no_control_is_admitted_where_nothing_leaves_more_and_the_state_is_unsafe_where_it_is_not_clear():
-    env, constraint, plant = bound([[5.0, 0.0]], speed_up=30)
-    stop = 5.0 - env.unwrapped.agent_position[0]
-    way = stop - least_way(env, NONE, [5.0, 0.0])
+    env = bound([[5.0, 0.0]], speed_up=30)[0]
+    way = 5.0 - place_after(30, 0)[0] - least_way(env, NONE, [5.0, 0.0])
     for slack in (0.002, -0.002):  # less than the margin, but clear; not clear
-        env.unwrapped._hazards[:] = ahead_of(env, 0.2 + way + slack)
-        plant.observe()
+        constraint = beside(way + slack, 30)[1]
         assert constraint.least == pytest.approx(slack, abs=1e-4)
-        assert constraint.admits(NONE)
-        assert constraint.admits(-NONE)  # minus zero is no control, too
+        assert constraint.admits(NONE) and constraint.admits(-NONE)  # minus zero is no control, too
         assert not constraint.admits(FULL) and not constraint.admits(BACK)
 
 
@@ -100,24 +100,17 @@ def test_far_from_everything_nothing_is_forecast():
     assert constraint.value() == pytest.approx(room - 0.13 * np.hypot(*env.unwrapped.data.qvel[:2]), abs=1e-6)
 
 
-def test_a_reach_that_is_broken_is_dropped_with_a_warning():
-    _, constraint, _ = bound([[0.2055, 0.0]], max_decrease=0.001)
-    with pytest.warns(UserWarning, match=r"farther than the declared max_decrease of 0\.001 m"):
-        assert not constraint.admits(FULL)
-    with warnings.catch_warnings(action="error"):
-        for share in (1.0, 0.018):  # of the torque, which acts up to 0.02
-            assert not constraint.admits(share * np.array(FULL))
-
-
-def test_a_reach_that_is_broken_from_outside_brings_more_discs_into_play():
+def test_a_reach_that_is_broken_is_dropped_with_a_warning_and_more_discs_come_into_play():
     hazards = [
         [0.203, 0.0],
         [-0.2035, 0.0],
         [0.0, 0.2105],
     ]  # two inside the margin, one beyond the declared reach
     _, constraint, _ = bound(hazards, max_decrease=0.001)
-    with pytest.warns(UserWarning, match="farther than the declared max_decrease"):
-        assert [constraint.admits(u) for u in (FULL, NONE)] == [False, True]
+    with pytest.warns(UserWarning, match=r"farther than the declared max_decrease of 0\.001 m"):
+        assert not constraint.admits(FULL)
+    with warnings.catch_warnings(action="error"):
+        assert constraint.admits(NONE) and not constraint.admits(0.018 * FULL)  # the torque acts up to 0.02
 
 
 def test_the_outline_counts_where_it_should():
@@ -150,9 +143,8 @@ def test_from_inside_the_best_way_out_is_admitted_and_the_way_in_is_not():
     assert constraint.slack(out) > constraint.value()
 
 
-def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
-    _, constraint, _ = bound([[0.28, 0.02]], detour=True)
-    limit = constraint.bound
+def test_a_detour_keeps_its_side_and_else_passes_on_the_right_what_is_on_the_left():
+    limit = bound([[0.28, 0.02]], detour=True)[1].bound
 
     def turns(memory):
         """The first way around: which way it turns."""
@@ -160,15 +152,10 @@ def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
         first, second = limit.candidates(FULL)[0]
         return float(np.sign(first - second))
 
-    first_turns = {side: turns({"detour": (side, 1)}) for side in (1.0, -1.0)}
-    assert first_turns[1.0] == -first_turns[-1.0] != 0.0  # what is being made goes on
-    assert turns({}) == first_turns[-1.0]  # what is on the left is passed on the right
-    # So is it when the other side has not been needed for long.
-    assert turns({"detour": (1.0, 0)}) == first_turns[-1.0]
-    memory = limit.executed(FULL)
-    assert memory["detour"] == (-1.0, 25)
-    limit.observe(memory)  # not needed in this step
-    assert limit.executed(FULL)["detour"] == (-1.0, 24)
+    left, right = (turns({"detour": (side, 1)}) for side in (1.0, -1.0))
+    assert left == -right != 0.0
+    assert turns({}) == turns({"detour": (1.0, 0)}) == right  # the other side has not been needed for long
+    assert limit.executed(FULL)["detour"] == (-1.0, 25)
 
 
 def test_a_car_that_is_wedged_between_obstacles_turns_the_other_way():
@@ -192,13 +179,9 @@ def test_what_does_not_rest_within_the_horizon_is_refused_however_far_it_stays_a
             assert far - 0.3 < slack < far if rests else slack == -np.inf
 
 
-@pytest.mark.parametrize("gap", [0.001, 0.003, 0.0045])
-def test_parked_inside_the_margin_only_the_way_out_is_open(gap):
-    for side, out in ((1.0, BACK), (-1.0, FULL)):
-        env, limit, plant = bound([[5.0, 0.0]])
-        for _ in range(20):
-            env.unwrapped.step(NONE)  # it settles on its wheels
-        env.unwrapped._hazards[:] = ahead_of(env, side * (0.2 + gap))
-        plant.observe()
-        assert 0.0 < float(limit.value()[0]) < 0.005
-        assert limit.admits(out) and not limit.admits(-out)
+@pytest.mark.parametrize("gap", [0.001, 0.0045])
+@pytest.mark.parametrize(("side", "out"), [(1.0, BACK), (-1.0, FULL)])
+def test_parked_inside_the_margin_only_the_way_out_is_open(gap, side, out):
+    limit = beside(gap, side=side, idle=20)[1]  # it settles on its wheels
+    assert 0.0 < float(limit.value()[0]) < 0.005
+    assert limit.admits(out) and not limit.admits(-out)

@@ -9,7 +9,6 @@ import pytest
 from asking import Asked
 
 import safe_wrappers as sw
-from safe_wrappers.errors import ConfigurationError
 
 HOLD, RADIUS, CAR, PILLAR, MARGIN = 0.04, 0.2, 0.4, 0.35, 0.05
 TRUE_CARS = sw.constraints.TrackedDiscs(CAR, 0.0, attribute="car_tracks")
@@ -131,25 +130,39 @@ def test_what_is_left_is_what_mujoco_leaves():
     assert agreed > 8 and refused > 2, (agreed, refused)
 
 
-def test_discs_that_move_go_straight_on_and_standing_ones_stay():
-    class Published(gym.Wrapper):
-        balls = np.array([[0.0, 0.0, 7.0]])
-        rolling = np.array([[0.0, -1.0, 7.0]])
-        __slots__ = ()
+class Rolling(gym.Wrapper):
+    """A large ball rolls across the place of the robot, below a wall; it is published."""
 
-    def met(y, **options):
-        obstacle = sw.constraints.Discs("balls", 0.3, **options)
-        raw, plant, clearance = bound([obstacle], env=Published(gym.make("OccludedCrossing-v0")))
-        anew(raw, plant, clearance, [0, y, 0, *[9] * 6], np.zeros(9))
-        return clearance
+    rolling = np.array([[2.0, 0.0]])
 
-    far = met(-2.0, velocity_attribute="rolling")
-    assert far.value()[0] == pytest.approx(2.0 - 0.3 - RADIUS) and far.admits(np.zeros(3))
-    near = met(-0.7, velocity_attribute="rolling")
-    forward, aside = (near.slack(np.array(u, float)) for u in ([0, 1, 0], [1, 0, 0]))
-    assert forward < aside  # it does not stand still: away to the side is the way
-    with pytest.raises(ConfigurationError, match="3-dimensional obstacles cannot meet a 2-dimensional point"):
-        met(-2.0).value()  # a ball that stands somewhere in the air
+    def step(self, action):
+        self.balls = self.balls + HOLD * self.rolling
+        return super().step(action)
+
+
+def test_a_way_out_that_was_begun_stays_open_until_its_end():
+    """21 holds up and then braking lead between ball and wall; one hold more or less is too much or too little."""
+    env = Rolling(gym.make("OccludedCrossing-v0"))
+    path = Played(env.unwrapped.model).positions(np.zeros(9), np.zeros(9), np.array([0, 1]), (0, 1, 20), 40)
+    end = path[-1, 1]
+    radius = end - RADIUS - MARGIN - 0.003
+    env.balls = np.array([[-radius - 0.25 - 1.7 * 2.0, 0.0]])
+    ball = sw.constraints.Discs("balls", radius, velocity_attribute="rolling")
+    wall = sw.constraints.Plane([0.0, end + RADIUS + MARGIN + 0.003], [0.0, -1.0])
+    raw, plant, clearance = bound([ball, wall], env=env)
+    anew(raw, plant, clearance, np.zeros(9), np.zeros(9))
+    up = np.array([0.0, 1.0, 0.0])
+    forgotten = []
+    for k in range(21):
+        kept = clearance.memory
+        clearance.start()  # without the memory of what was begun there are ways of 8 and of 20 holds alone
+        forgotten.append(clearance.admits(up))
+        clearance.memory, clearance.seen = kept, None
+        assert clearance.admits(up), k
+        clearance.executed(up)
+        env.step(up)
+        plant.observe()
+    assert clearance.admits(clearance.backup()) and not clearance.admits(up) and sum(forgotten) < 8
 
 
 def test_of_the_proposals_the_nearest_comes_first_and_one_is_admitted():
@@ -208,7 +221,7 @@ def test_the_backup_stands_still_where_that_is_safe_and_goes_where_it_is_not():
     assert kinds == {True, False}
 
 
-@pytest.mark.parametrize(("speed", "admitted"), [(-1.5, False), (-1.2, False), (0.7, True), (1.5, True)])
+@pytest.mark.parametrize(("speed", "admitted"), [(-1.2, False), (0.7, True)])
 def test_a_deep_violation_must_shrink_exponentially_and_need_not_be_gone_at_once(speed, admitted):
     """15 cm inside a wall, coming or leaving: what full drive away leaves at every second hold, on the env itself."""
     raw, plant, limit = bound([sw.constraints.Plane([0.0, 0.0], [0.0, -1.0])])

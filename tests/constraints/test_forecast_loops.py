@@ -20,7 +20,6 @@ from judged_loops import (
     inside_the_hull,
     manipulability,
     noisy,
-    pulse,
     seeking,
     slider,
     table,
@@ -29,7 +28,7 @@ from judged_loops import (
 import safe_wrappers as sw
 from safe_wrappers import constraints as of
 
-ANY = (at_random, bang_bang, pulse, seeking)
+ANY = (at_random, bang_bang, seeking)
 
 
 class Loop(NamedTuple):
@@ -76,10 +75,6 @@ def out_of_the_disc(model, data):
     return np.linalg.norm(data.geom("fingertip").xpos[:2] - [0.0, 0.15]) - 0.07
 
 
-def reacher_manipulability(model, data):
-    return 0.011 * abs(np.sin(data.qpos[1])) / 0.0033 - 1.0
-
-
 ARM_JOINTS = "r_shoulder_pan_joint", "r_shoulder_lift_joint", "r_upper_arm_roll_joint", "r_elbow_flex_joint"
 
 
@@ -87,10 +82,10 @@ def pusher_manipulability(model, data):
     return manipulability(model, data, "body", "tips_arm", ARM_JOINTS) / 0.05 - 1.0
 
 
-def impact(mass, stiffness, horizon, steps, **fine):
+def impact(mass, stiffness, horizon, steps):
     """At full throttle it arrives with what is allowed, and then holds it."""
     limit = of.ImpactSpeedLimit(["cart"], ["wall"], 140.0, stiffness, margin=2.0, horizon=horizon)
-    make = lambda: cart_before_a_wall(mass, stiffness, **fine)  # noqa: E731
+    make = lambda: cart_before_a_wall(mass, stiffness)  # noqa: E731
     return Loop(make, [limit], below_force(140.0), (full,), steps, used=14.0, judge=ForceJudge)
 
 
@@ -100,52 +95,16 @@ def feet(env_id, *drivers, steps):
     return Loop(task(env_id), limits, room, drivers, steps, 0.95, np.inf, judge=ForceJudge)
 
 
-PUSHER_LOW = np.array([-2.2854, -0.5236, -1.5, -2.3213, -1.5, -1.094, -1.5])
-PUSHER_HIGH = np.array([1.714602, 1.3963, 1.7, 0.0, 1.5, 0.0, 1.5])
 FINGER_LOW, FINGER_HIGH = [-0.22, -0.15], [0.22, 0.15]
-TABLE_LOW, TABLE_HIGH = [0.3, -0.8, -0.3], [0.9, 0.0, 0.3]
 LOOPS = {
     "joint speed of Reacher": Loop(
         task("Reacher-v5"), [of.JointSpeedLimit(4.0)], below_speed([0, 1], 4.0), (*ANY, full), 200, used=0.2
-    ),
-    # Its pole falls; the cart's limit holds on. Past what its motor can do it says so.
-    "joint speed of InvertedPendulum": Loop(
-        task("InvertedPendulum-v5"),
-        [of.JointSpeedLimit(0.5)],
-        below_speed([0], 0.5),
-        (*ANY, full),
-        150,
-        0.1,
-        0.5,
-        used=0.025,
-    ),
-    "joint speed with a margin": Loop(
-        task("Reacher-v5"),
-        [of.JointSpeedLimit(4.0, margin=0.5)],
-        below_speed([0, 1], 3.5),
-        (bang_bang,),
-        200,
-        used=0.2,
     ),
     # Infeasible steps, too fast to stop within the horizon, may take it out, by a hair.
     "joint position of Reacher": Loop(
         task("Reacher-v5"),
         [of.JointPositionLimit(-1.5, 1.5, ["joint0", "joint1"], horizon=10)],
         in_range([0, 1], -1.5, 1.5),
-        most_flagged=0.4,
-        deepest=1e-3,
-    ),
-    "joint position of InvertedPendulum": Loop(
-        task("InvertedPendulum-v5"),
-        [of.JointPositionLimit(-0.2, 0.2, ["slider"], horizon=8)],
-        in_range([0], -0.2, 0.2),
-        used=0.1,
-    ),
-    "joint position of Pusher": Loop(
-        task("Pusher-v5"),
-        [of.JointPositionLimit(horizon=6)],
-        in_range(np.arange(7), PUSHER_LOW, PUSHER_HIGH),
-        steps=15,
         most_flagged=0.4,
         deepest=1e-3,
     ),
@@ -169,25 +128,7 @@ LOOPS = {
         most_flagged=0.1,
         deepest=5e-3,
     ),
-    "a box on Pusher": Loop(
-        task("Pusher-v5"),
-        [of.Workspace(TABLE_LOW, TABLE_HIGH, bodies=["tips_arm"], horizon=8)],
-        in_box("tips_arm", TABLE_LOW, TABLE_HIGH),
-        most_flagged=0.1,
-        deepest=5e-3,
-    ),
-    # These arms start stretched, and braking from full speed takes Reacher's far longer than any sensible look-ahead.
-    "singularity of Reacher": Loop(
-        task("Reacher-v5"),
-        [
-            of.JointSpeedLimit(10.0, margin=0.01),
-            of.SingularityMargin(0.0033, body="fingertip", directions="xy", horizon=5),
-        ],
-        reacher_manipulability,
-        steps=45,
-        most_flagged=0.1,
-        deepest=1.0,
-    ),
+    # It starts stretched.
     "singularity of Pusher": Loop(
         task("Pusher-v5"),
         [of.SingularityMargin(0.05, body="tips_arm", horizon=8)],
@@ -199,8 +140,6 @@ LOOPS = {
     "feet of Ant": feet("Ant-v5", bang_bang, noisy, steps=12),
     "feet of Humanoid": feet("Humanoid-v5", at_random, steps=30),
     "feet of HalfCheetah": feet("HalfCheetah-v5", at_random, bang_bang, noisy, steps=40),
-    "feet of Hopper": feet("Hopper-v5", at_random, steps=60),
-    "feet of Walker2d": feet("Walker2d-v5", bang_bang, steps=60),
     "a table that is pushed over": Loop(
         table,
         [of.SupportMargin(0.05)],
@@ -211,9 +150,7 @@ LOOPS = {
         np.inf,
         judge=ForceJudge,
     ),
-    "a light cart": impact(0.5, 6e4, 8, 30, timestep=2.5e-4, frame_skip=40, gap=0.05),
     "a cart": impact(5.0, 8e3, 12, 70),
-    "a heavy cart": impact(40.0, 6e4, 40, 70),
 }
 """Limits in the room's own unit, all of them on the model itself."""
 
@@ -231,7 +168,7 @@ def test_no_step_that_is_not_flagged_breaks_it(name, driver):
     assert seen["intervened"] > 0 or driver not in (bang_bang, full, noisy), seen  # the others may stay away
     assert seen["flagged"] <= loop.most_flagged * loop.steps, seen
     assert seen["least"] >= -loop.deepest, seen
-    assert seen["least"] <= loop.used or driver in (at_random, pulse), seen
+    assert seen["least"] <= loop.used or driver is at_random, seen
 
 
 @pytest.mark.parametrize("name", LOOPS)
@@ -257,8 +194,7 @@ OUTSIDE = {
     "farther than both ends": ("joint position of Reacher", ([1.7, 0.5], [0.0, 0.0]), [1.0, 1.0], 12, 1e-3),
     "both joints": ("joint position of Reacher", ([-1.7, -1.65], [0.0, 0.0]), [-1.0, -1.0], 12, 1e-3),
     "too fast": ("joint speed of Reacher", ([0.0, 0.0], [9.0, -7.0]), [1.0, -1.0], 30, 1e-6),
-    "Reacher": ("singularity of Reacher", STRETCHED, [0.0, 0.0], 25, 1e-6),
-    "Pusher": ("singularity of Pusher", STRETCHED, [0.0] * 7, 25, 1e-6),
+    "stretched": ("singularity of Pusher", STRETCHED, [0.0] * 7, 25, 1e-6),
 }
 
 
@@ -285,48 +221,3 @@ def test_from_outside_it_comes_back_says_so_and_stays(case):
     back = int(np.argmax(np.array(rooms) >= -hair))
     assert 0 < back <= soon and min(rooms[30:]) >= -1e-6
     assert all(unsafe[: back - 1]) and not any(unsafe[30:])
-
-
-# Far from it --------------------------------------------------------------------------------------------------
-
-
-def reacher_bent():
-    env = gym.make("Reacher-v5").unwrapped
-    env.init_qpos[1] = 1.5
-    return env
-
-
-FAR = {
-    "joint position": (task("Reacher-v5"), of.JointPositionLimit(-6.0, 6.0, ["joint0"]), 0.2),
-    "joint speed": (task("Reacher-v5"), of.JointSpeedLimit(500.0), 1.0),
-    "workspace": (
-        task("Pusher-v5"),
-        of.Workspace([-9.0] * 3, [9.0] * 3, [of.Sphere([9.0, 0.0, 0.0], 1.0)], bodies=["tips_arm"]),
-        2.0,
-    ),
-    "manipulability": (reacher_bent, of.SingularityMargin(1e-4, body="fingertip", directions="xy"), 0.2),
-    "impact": (
-        lambda: cart_before_a_wall(5.0, 2e4, gap=50.0),
-        of.ImpactSpeedLimit(["cart"], ["wall"], 140.0, 2e4),
-        1.0,
-    ),
-    # In the model's own cone all forces are.
-    "feet of HalfCheetah": (task("HalfCheetah-v5"), of.ContactFeasibility(1.0, 0.0), 1.0),
-    "feet of Ant": (task("Ant-v5"), of.ContactFeasibility(1.0, 0.0), 1.0),
-    "feet of Humanoid": (task("Humanoid-v5"), of.ContactFeasibility(1.0, 0.0), 0.4),
-}
-
-
-@pytest.mark.parametrize("case", FAR)
-def test_far_from_it_actions_pass_bit_for_bit(case):
-    make, limit, largest = FAR[case]
-    bare, filtered = make(), sw.CBFActionFilter(make(), [limit])
-    rng = np.random.default_rng(0)
-    a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
-    for k in range(25):
-        assert a.tobytes() == b.tobytes()
-        action = rng.uniform(-largest, largest, bare.action_space.shape)
-        action = (largest * np.sign(action) if k % 2 else action).astype(bare.action_space.dtype)
-        a, reward, *_ = bare.step(action)
-        b, same, _, _, info = filtered.step(action)
-        assert reward == same and not info["cbf/intervened"] and not info["cbf/refused"].any()

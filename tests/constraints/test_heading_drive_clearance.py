@@ -59,47 +59,40 @@ def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
     assert (by_all & ~by_one).any()
 
 
-@pytest.mark.parametrize(("beside", "side"), [(0.05, -1.0), (-0.05, 1.0)])
-def test_a_disc_ahead_on_the_left_is_passed_on_the_right(beside, side):
-    env, limit = filtered(detour=True)
-    start(env, [[0.26, beside]])
-    tried = [[1.0, side], [0.0, side], [-1.0, side], [-1.0, 0.0]]  # around, turning, backing out
-    np.testing.assert_array_equal(list(limit.candidates(np.array([1.0, 0.1]))), tried)
-
-
 def test_who_drives_straight_at_goals_seldom_stands_before_a_disc():
     """Without backing out 41 % of the steps."""
     env = sw.StuckEscape(sw.protect(gym.make("SafePointGoal1-v0")), progress=0.1, escape_s=0)
     task, stuck = env.unwrapped, 0
-    for seed in range(4):
+    for seed in range(2):
         env.reset(seed=1_000_000 + seed)
         for _ in range(600):
             x, y = task.goal_position - task.agent_position
             off = math.remainder(math.atan2(y, x) - task.agent_heading, math.tau)
             action = np.array([1.0 if abs(off) < 1.2 else 0.1, np.clip(3.0 * off, -1.0, 1.0)], np.float32)
             stuck += env.step(action)[4]["cbf/stuck"]
-    assert stuck < 0.25 * 4 * 600
+    assert stuck < 0.25 * 2 * 600
 
 
-def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_disc_ahead_is_passed_on_its_other_side_which_is_kept_for_fifty_steps(side):
     env, limit = filtered(detour=True)
-    start(env, [[0.26, 0.05]])
+    start(env, [[0.26, -0.05 * side]])
     drive = np.array([1.0, 0.1])
 
-    def side(memory):
+    def tried(memory):
         limit.observe(memory)
-        return limit.candidates(drive)[0][1]
+        return list(limit.candidates(drive))
 
-    assert side({}) == -1.0  # on the left: passed on the right
-    assert side({"detour": (1.0, 1)}) == 1.0  # but a detour on the left goes on
-    assert limit.executed(drive)["detour"] == (1.0, 50)
-    assert side({"detour": (1.0, 0)}) == -1.0  # until it has not been needed for long
+    # Around, turning, backing out.
+    np.testing.assert_array_equal(tried({}), [[1.0, side], [0.0, side], [-1.0, side], [-1.0, 0.0]])
+    assert tried({"detour": (-side, 1)})[0][1] == -side  # but a detour on the other side goes on
+    assert limit.executed(drive)["detour"] == (-side, 50)
+    assert tried({"detour": (-side, 0)})[0][1] == side  # until it has not been needed for long
     memory = limit.executed(drive)
-    assert memory["detour"] == (-1.0, 50)
     limit.observe(memory)  # not needed in this step
-    assert limit.executed(drive)["detour"] == (-1.0, 49)
-    limit.observe({"detour": (-1.0, 20)})
-    assert limit.spec.surroundings(2)[0] == -0.4  # of its time
+    assert limit.executed(drive)["detour"] == (side, 49)
+    limit.observe({"detour": (side, 20)})
+    assert limit.spec.surroundings(2)[0] == 0.4 * side  # of its time
 
 
 # At the boundary of its safe set -----------------------------------------------------------------------------
@@ -155,7 +148,7 @@ def test_the_rest_of_an_admitted_trajectory_is_the_backup_of_the_next_step(pairs
 
 
 @given(pairs=DRIVEN, direction=ANGLE)
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_a_control_that_is_not_looked_at_leaves_the_margin(pairs, direction):
     env, limit = filtered()
     drive, margin = limit.spec.drive, limit.spec.margin

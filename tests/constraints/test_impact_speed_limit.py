@@ -67,7 +67,7 @@ def closing(model, qpos, qvel, normal, point):
     return float(normal @ jacobian @ qvel)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_the_peak_is_that_of_the_moving_arms_speed_mass_and_push(seed):
     env, rng = Scene(ARM), np.random.default_rng(seed)
     env.data.qpos[:3], env.data.qvel[:3] = rng.uniform(-0.8, 0.8, 3), rng.uniform(-3.0, 3.0, 3)
@@ -184,53 +184,36 @@ ARM_GAPS = """<mujoco><option timestep="0.005" gravity="0 0 0"/><worldbody>
 </actuator></mujoco>"""
 
 
-@pytest.fixture(scope="module")
-def plant():
-    return bound(Scene(ARM_GAPS))
-
-
-def brute(plant, gaps, forecast, pair):
-    """Distance of a pair at every instant."""
-    m, data, found = plant.model, mujoco.MjData(plant.model), []
-    for q in forecast.qpos:
-        data.qpos[:] = q
-        mujoco.mj_kinematics(m, data)
-        found.append(gaps.nearest(m, data, pair)[0])
-    return np.array(found)
-
-
-def test_nothing_that_touches_is_skipped(plant):
+def test_nothing_that_touches_is_skipped():
+    env = Scene(ARM_GAPS)
+    plant = bound(env)
     gaps = GeomGaps(plant, ["lower", "bone"], ["post", "floor", "block", "ball"])
-    rng, data, touches, looked = np.random.default_rng(0), mujoco.MjData(plant.model), 0, 0
+    rng, data, touches, looked = np.random.default_rng(0), mujoco.MjData(plant.model), 0, []
     honest = mujoco.mj_geomDistance
-    for _ in range(120):
-        raw = plant._raw
-        raw.data.qpos[:3], raw.data.qvel[:3] = rng.uniform(-1.5, 1.5, 3), rng.uniform(-6.0, 6.0, 3)
+    for _ in range(60):
+        env.data.qpos[:3], env.data.qvel[:3] = rng.uniform(-1.5, 1.5, 3), rng.uniform(-6.0, 6.0, 3)
         plant.observe()
         forecast = plant.rollout(rng.uniform(-9.0, 9.0, 3), 8)
-        for pair in range(len(gaps.pairs)):
-            distance, touch = brute(plant, gaps, forecast, pair), gaps.touch[pair]
-            if np.abs(distance - touch).min() < 1e-9:
+        k, distances = len(forecast.qpos), []
+        for data.qpos[:] in forecast.qpos:
+            mujoco.mj_kinematics(plant.model, data)
+            distances.append([gaps.nearest(plant.model, data, pair)[0] for pair in range(len(gaps.pairs))])
+        for pair, distance in enumerate(np.transpose(distances)):
+            if np.abs(distance - gaps.touch[pair]).min() < 1e-9:
                 continue  # rounding decides
-            there, k = distance <= touch, len(distance)
-            again = [
-                i for i in range(2, k) if there[i - 2] and distance[i - 2] < distance[i - 1] > distance[i]
-            ]
-            wanted = [
-                i
-                for i in range(k)
-                if there[i] and (i == 0 or not there[i - 1] or (i + 1) % plant.substeps == 0 or i in again)
-            ]
-            calls = []
+            there = distance <= gaps.touch[pair]
+            again = np.zeros(k, bool)
+            again[2:] = there[:-2] & (distance[:-2] < distance[1:-1]) & (distance[1:-1] > distance[2:])
+            ends, begins = np.arange(1, k + 1) % plant.substeps == 0, ~np.concatenate([[False], there[:-1]])
+            wanted = np.flatnonzero(there & (ends | begins | again)).tolist()
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(
-                    mujoco, "mj_geomDistance", lambda *a, calls=calls: calls.append(0) or honest(*a)
+                    mujoco, "mj_geomDistance", lambda *a, pair=pair: looked.append(pair) or honest(*a)
                 )
                 assert list(gaps.touched(plant, forecast, data, pair)) == wanted
             touches += len(wanted)
-            looked += len(calls) / k
-    assert touches > 100
-    assert looked < 0.5 * 120 * len(gaps.pairs)  # and most of what cannot touch is
+    assert touches > 50
+    assert len(looked) < 0.5 * 60 * k * len(gaps.pairs)  # and most of what cannot touch is
 
 
 def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
@@ -241,7 +224,7 @@ def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
     plant = bound(env)
     m, data = plant.model, mujoco.MjData(plant.model)
     gaps, rng, wrong, apart = GeomGaps(plant, ["b"], ["a"]), np.random.default_rng(0), 0, 0
-    for _ in range(2500):
+    for _ in range(1000):
         quat = rng.normal(size=4)
         data.qpos[:] = [*rng.uniform(-0.4, 0.4, 3), *quat / np.linalg.norm(quat)]
         mujoco.mj_kinematics(m, data)
@@ -255,5 +238,5 @@ def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
             apart += 1
             assert gaps.nearest(m, data, 0)[0] == pytest.approx(distance, abs=2e-7)
             wrong += mujoco.mj_geomDistance(m, data, 1, 0, 9.0, None) == 0.0
-    assert apart > 1500
-    assert wrong == 0 if mujoco.mj_version() >= 3_012_000 else wrong > 10
+    assert apart > 600
+    assert wrong == 0 if mujoco.mj_version() >= 3_012_000 else wrong > 4

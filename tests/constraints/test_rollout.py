@@ -102,7 +102,7 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
             filtered.step(np.ones(1))
 
 
-# Numbers that are none, and machines that cannot be forecast --------------------------------------------------
+# Machines that cannot be forecast --------------------------------------------------
 
 
 def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monkeypatch):
@@ -113,27 +113,6 @@ def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monk
     assert limit.admits(np.array([1.0]))
     assert not limit.admits(np.array([1e9]))
     assert limit.admits(np.array([2.0]))  # and the next one is a forecast again
-
-
-LIMITS = {
-    "speed": sw.constraints.SpeedLimit(0.8, "b0", "x", "substep", max_decrease=0.1),
-    "joint position": sw.constraints.JointPositionLimit(-1.0, 1.0, max_decrease=0.1),
-    "joint speed": sw.constraints.JointSpeedLimit(0.8, max_decrease=0.1),
-    "workspace": sw.constraints.Workspace([-1.0, None, None], bodies=["b0"], max_decrease=0.1),
-}
-
-
-@pytest.mark.parametrize("kind", LIMITS)
-def test_a_reading_that_is_no_number_runs_the_fallback(kind):
-    scene = slider()
-    filtered = sw.CBFActionFilter(scene, [LIMITS[kind]])
-    filtered.reset(seed=0)
-    filtered.step(np.array([0.5]))
-    scene.data.qvel[0] = np.nan
-    with pytest.warns(sw.UnsafeStateWarning):
-        info = filtered.step(np.array([1.0]))[4]
-    assert info["cbf/fallback"] and info["cbf/unsafe"] and not info["cbf/refused"].any()
-    np.testing.assert_array_equal(info["executed_action"], [0.0])
 
 
 # Where controls are displacements: how long slopes are kept ----------------------------------------------------

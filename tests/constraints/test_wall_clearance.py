@@ -94,11 +94,9 @@ def placed(env, at, velocity=(0.0, 0.0)):
 
 ENVS = {
     "clip known": (5.0, dict(velocity_clip=5.0), 1),
-    "clip not known": (5.0, {}, 1),
-    "any clip": (1.3, {}, 1),
-    "no clip": (None, {}, 1),
+    "clip not known": (1.3, {}, 1),
     "four physics steps": (5.0, dict(velocity_clip=5.0), 4),
-    "four, not known": (None, {}, 4),
+    "no clip": (None, {}, 4),
 }
 
 
@@ -162,7 +160,7 @@ def test_the_nearest_admitted_control_is_found():
     grid = np.array([(x, y) for x in np.linspace(-1, 1, 41) for y in np.linspace(-0.8, 1, 37)])
     rng = np.random.default_rng(0)
     checked = 0
-    while checked < 60:
+    while checked < 40:
         action = rng.choice([-1.0, 1.0], 2) * [1.0, 0.8]
         for _ in range(15):
             env.plant.observe()
@@ -177,53 +175,12 @@ def test_the_nearest_admitted_control_is_found():
 
 
 @pytest.mark.parametrize("options", [{"velocity_clip": 5.0}, {}])
-@pytest.mark.parametrize("asked", [(1.0, 0.0), (0.0, 0.0), (-1.0, 0.3)])
-@pytest.mark.parametrize(
-    ("gap", "lost"), [(0.03, False), (0.001, True)], ids=["inside the margin", "at the wall"]
-)
-def test_from_outside_it_comes_back_and_stays(options, asked, gap, lost):
+@pytest.mark.parametrize(("gap", "asked", "lost"), [(0.03, (-1.0, 0.3), False), (0.001, (1.0, 0.0), True)])
+def test_from_inside_the_margin_and_from_the_wall_it_comes_back_and_stays(options, gap, asked, lost):
     env = filtered(margin=0.05, **options)
     placed(env, (2.0 - RADIUS - gap, -1.2))
     with warnings.catch_warnings(action="ignore"):
         infos = [env.step(np.array(asked, np.float32))[4] for _ in range(200)]
     margins = np.array([info["cbf/margin"] for info in infos])
     assert infos[0]["cbf/unsafe"] == lost and not infos[-1]["cbf/unsafe"]
-    assert margins.min() >= margins[0] - 1e-9 and margins[-1] >= 0.05 - 1e-6
-    back = int(np.argmax(margins >= 0.05 - 1e-6))
-    assert back < 120 and margins[back:].min() >= 0.05 - 1e-6
-
-
-# WallClearance where a path passes a corner closely: the path fits, the rectangle around it does not
-
-
-def moved(limit, control, axis, asked):
-    """A control moved along one axis towards the one asked for, in small steps, while that is admitted."""
-    found = control
-    for share in np.linspace(0.0, 1.0, 401):
-        tried = np.array(control)
-        tried[axis] += share * (asked[axis] - control[axis])
-        if not limit.admits(tried):
-            break
-        found = tried
-    return found
-
-
-@pytest.mark.parametrize(
-    ("at", "velocity", "asked", "first"),
-    [
-        ((-0.06, 0.05), (4.4, -3.6), (0.6, -0.5), 1),
-        ((-0.35, -0.54), (-3.4, 4.3), (-0.3, 0.7), 1),
-        ((0.43, -0.26), (-4.6, 2.7), (-0.7, 0.4), 0),
-        ((0.21, -0.16), (-2.0, 1.7), (0.0, 0.6), 0),
-    ],
-)
-def test_beside_a_corner_the_nearer_of_both_ways_back_to_the_proposal_is_taken(at, velocity, asked, first):
-    """From braking along x and then along y, and the other way round, by small steps instead of by halving."""
-    limit, asked = placed(filtered(velocity_clip=5.0), at, velocity), np.array(asked)
-    assert limit.least > limit.spec.margin and not limit.admits(asked)
-    ways = [moved(limit, moved(limit, limit.backup(), i, asked), 1 - i, asked) for i in (0, 1)]
-    away = [float(np.linalg.norm(way - asked)) for way in ways]
-    assert away[first] < away[1 - first] - 0.1
-    nearest = limit.candidates(asked)[0]
-    step = np.abs(asked - limit.backup()).sum() / 32  # as finely as it halves, along both
-    assert np.linalg.norm(nearest - asked) <= away[first] + step
+    assert margins.min() >= margins[0] - 1e-9 and margins[120:].min() >= 0.05 - 1e-6

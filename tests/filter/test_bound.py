@@ -125,8 +125,9 @@ def test_inside_the_margin_a_refused_control_may_keep_the_limit_and_lose_nothing
     assert bound.keeps_limit(np.full(2, shift)) == keeps
 
 
-def test_a_state_that_is_not_a_number_admits_nothing():
-    safety, go = filtered(0.5)
+@pytest.mark.parametrize("max_decrease", [None, 0.1])
+def test_a_state_that_is_not_a_number_admits_nothing(max_decrease):
+    safety, go = filtered(0.5, max_decrease=max_decrease)
     assert safety.admits(np.zeros(2))
     go(np.nan)
     assert not safety.admits(np.zeros(2))
