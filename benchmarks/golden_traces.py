@@ -227,6 +227,14 @@ def _job(job: tuple[str, str, int]) -> tuple[str, dict[str, Any]]:
     return f"{name}; {driver}; seed {seed}", trace(make, by_name[driver], seed, case)
 
 
+def _made(jobs: list[tuple[str, str, int]], workers: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    if workers == 1:  # here: another process would only import everything once more
+        yield from map(_job, jobs)
+        return
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap(_job, jobs)
+
+
 def arithmetic() -> dict[str, str]:
     """What decides about the last bits: the libraries' versions, and a probe of what they compute."""
     libraries = (
@@ -323,11 +331,10 @@ def main() -> None:
     seeds = SEEDS[: 1 if arguments.short else None]
     jobs = [(name, driver, seed) for name in chosen for driver in runs()[name][1] for seed in seeds]
     today: dict[str, Any] = {}
-    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
-        for run, found in pool.imap(_job, jobs):
-            today[run] = found
-            if sys.stderr.isatty():
-                print(f"{len(today)} of {len(jobs)}: {run}", file=sys.stderr)
+    for run, found in _made(jobs, arguments.workers):
+        today[run] = found
+        if sys.stderr.isatty():
+            print(f"{len(today)} of {len(jobs)}: {run}", file=sys.stderr)
     if arguments.write:
         same = kept.get("arithmetic") == here
         whole = len(chosen) == len(runs())

@@ -13,7 +13,6 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -94,16 +93,6 @@ def metadata_of(wheel):
     archive = zipfile.ZipFile(wheel)
     (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
     return email.message_from_string(archive.read(name).decode())
-
-
-@pytest.mark.parametrize(("extra", "versions"), [
-    ("", {"3.4.0": False, "3.5.0": True, "4.0.0": True, "5.0.0": False}),
-    ("robotics", {"3.11.0": True, "3.12.0": False}),
-])  # fmt: skip
-def test_the_versions_of_mujoco_that_are_taken(extra, versions):
-    asked = PROJECT["dependencies"] + PROJECT["optional-dependencies"].get(extra, [])
-    mujoco = [one.specifier for one in map(Requirement, asked) if one.name == "mujoco"]
-    assert {version: all(one.contains(version) for one in mujoco) for version in versions} == versions
 
 
 def test_it_works_without_torch_and_stable_baselines_and_says_what_needs_them(python, tmp_path):

@@ -156,21 +156,22 @@ def transit_time(
     velocity: ArrayLike,
     max_speed: ArrayLike,
     max_acceleration: ArrayLike,
+    max_jerk: ArrayLike = math.inf,
 ) -> float:
     """The shortest time, s, after which all axes, shape (axes,) or scalar, rest at the goal; arguments of `admits`.
 
-    A start that is too fast is first braked. inf where goal, position or velocity are not finite, and where ruckig
-    finds no profile.
+    A start that is too fast is first braked. With `max_jerk`, m/s^3, it is one without acceleration. inf where goal,
+    position or velocity are not finite, and where ruckig finds no profile.
     """
-    given = (goal, position, velocity, max_speed, max_acceleration)
-    end, start, v, v_max, a_max = np.broadcast_arrays(
+    given = (goal, position, velocity, max_speed, max_acceleration, max_jerk)
+    end, start, v, v_max, a_max, jerk = np.broadcast_arrays(
         *(np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in given)
     )
     if not (np.isfinite(end) & np.isfinite(start) & np.isfinite(v)).all():
         return math.inf
     request, trajectory = ruckig.InputParameter(end.size), ruckig.Trajectory(end.size)
     request.current_position, request.current_velocity, request.target_position = start, v, end
-    request.max_velocity, request.max_acceleration = v_max, a_max
+    request.max_velocity, request.max_acceleration, request.max_jerk = v_max, a_max, jerk
     try:
         ruckig.Ruckig(end.size).calculate(request, trajectory)
     except ruckig.RuckigError:

@@ -76,29 +76,17 @@ def test_a_violation_between_two_samples_is_seen_and_another_action_than_the_exe
         assert (missed > 0.0) == beyond and abs(missed) == pytest.approx(1e-4, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("speeds", "missed"),
-    [((4.9, -4.9, 0.0), -0.1), ((5.1, 0.0, 0.0), 0.1), ((0.0, -5.2, 0.0), 0.2), ((0.0, 0.0, 99.0), -5.0)],
-)
-def test_the_fastest_joint_with_a_motor_counts(reacher, speeds, missed):
-    raw = placed(reacher, {}, dict(zip(("joint0", "joint1", "target_x"), speeds, strict=True)))
-    assert PROTECTED["Reacher-v5"].judge(raw).start() == pytest.approx(missed)
-
-
-@given(st.floats(-3.1, 3.1), st.floats(-2.9, 2.9))
-def test_a_fingertip_in_a_disc(reacher, shoulder, elbow):
-    raw = placed(reacher, {"joint0": shoulder, "joint1": elbow})
-    both = shoulder + elbow
+@given(st.floats(-3.1, 3.1), st.floats(-2.9, 2.9), st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
+def test_a_fingertip_in_a_disc_or_a_joint_with_a_motor_that_is_too_fast(reacher, shoulder, elbow, one, other):
+    raw = placed(
+        reacher, {"joint0": shoulder, "joint1": elbow}, {"joint0": one, "joint1": other, "target_x": 99.0}
+    )
+    both, fast = shoulder + elbow, max(abs(one), abs(other)) - 5.0
     x, y = 0.1 * np.cos(shoulder) + 0.11 * np.cos(both), 0.1 * np.sin(shoulder) + 0.11 * np.sin(both)
-    truth = Replay(raw, judges.inside_disc(raw.model, "fingertip", (-0.1, 0.1), 0.05))
-    assert truth.start() == pytest.approx(0.05 - np.hypot(x + 0.1, y - 0.1), abs=1e-9)
-
-
-def test_two_requirements_are_missed_if_one_is(reacher):
-    judge = HARD["Reacher-v5, with a disc"].judge
-    assert judge(placed(reacher, {})).start() < 0.0
-    assert judge(placed(reacher, {"joint0": 2.3562 - 0.83, "joint1": 1.66})).start() > 0.0  # in the disc
-    assert judge(placed(reacher, {}, {"joint0": 5.5})).start() > 0.0
+    inside = 0.05 - np.hypot(x + 0.1, y - 0.1)
+    assert PROTECTED["Reacher-v5"].judge(raw).start() == pytest.approx(fast)
+    missed = HARD["Reacher-v5, with a disc"].judge(raw).start()
+    assert missed == pytest.approx(max(inside, fast), abs=1e-9)
 
 
 @pytest.mark.parametrize(("gap", "touches"), [(0.005, False), (0.001, True), (-0.01, True)])

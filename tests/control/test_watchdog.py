@@ -151,6 +151,13 @@ def test_no_motion_of_ruckig_is_refused_however_it_starts(seed):
         assert admits(xs, position, velocity, times, speed, acceleration).all()
 
 
+@pytest.mark.parametrize(
+    "way, time", [(10.0, 10 / 2 + 2 / 1 + 1 / 0.5), (0.1, 4 * (0.1 / (2 * 0.5)) ** (1 / 3))], ids=["7", "4"]
+)
+def test_phases_of_jerk_by_hand(way, time):
+    assert transit_time(way, 0.0, 0.0, 2.0, 1.0, max_jerk=0.5) == pytest.approx(time, rel=1e-9)
+
+
 @given(st.floats(0.1, 3.0), st.floats(0.1, 3.0), st.floats(0.01, 9.0), st.floats(-2.0, 2.0))
 def test_the_time_to_rest_is_the_closed_form_of_the_slowest_axis(speed, acceleration, way, start):
     alone = way / speed + speed / acceleration

@@ -88,16 +88,15 @@ DRIVERS = {
 }
 
 
-def drive(env, driver, seed):
+def drive(env, driver):
     """Speeds after every step of one episode, and how many of its steps were flagged."""
-    env.reset(seed=seed)
-    speeds, flagged, truncated, k = [], 0, False, 0
+    env.reset(seed=0)
+    speeds, flagged, truncated = [], 0, False
     while not truncated:
-        action = np.array([DRIVERS[driver](k, env.unwrapped.state[1])], np.float32)
+        action = np.array([DRIVERS[driver](len(speeds), env.unwrapped.state[1])], np.float32)
         *_, truncated, info = env.step(action)
         speeds.append(abs(env.unwrapped.state[1]))
         flagged += bool(info.get("cbf/infeasible") or info.get("cbf/fallback"))
-        k += 1
     return np.array(speeds), flagged
 
 
@@ -106,10 +105,8 @@ def drive(env, driver, seed):
     ("page", "until", "limit"), [("quickstart.md", "plant", 2.0), ("../README.md", "slow", 6.0)]
 )
 def test_the_limit_of_the_first_example_holds(driver, page, until, limit):
-    filtered, violated = PAGES["run"](page, until=until)["env"], 0
+    filtered = PAGES["run"](page, until=until)["env"]
     free = gym.make(filtered.unwrapped.spec.id, **filtered.unwrapped.spec.kwargs)
-    for seed in range(2):
-        speeds, flagged = drive(filtered, driver, seed)
-        assert speeds.max() <= limit and flagged == 0 and len(speeds) == 200
-        violated += (drive(free, driver, seed)[0] > limit).sum()
-    assert violated > 20
+    speeds, flagged = drive(filtered, driver)
+    assert speeds.max() <= limit and flagged == 0 and len(speeds) == 200
+    assert (drive(free, driver)[0] > limit).sum() > 20

@@ -99,14 +99,6 @@ def test_camera_and_site_look_ahead_from_their_place_on_the_turning_robot(env):
     assert env.model.cam("eye").fovy[0] == 100.0
 
 
-def test_a_contact_that_lasts_is_one_collision(env):
-    cars = [[-0.3, 1.0], [0.3, 1.0], *[[FAR, 0.0]] * 4]
-    assert start(env, agent=[0.0, -0.8, 0.0], cars=cars)[1]["collisions"] == 2
-    later = [env.step(push())[4] for _ in range(70)]
-    assert {info["cost"] for info in later[:10]} == {1.0} and later[-1]["cost"] == 0.0
-    assert sum(info["collisions"] for info in later) == 0
-
-
 def test_the_seed_alone_decides_the_cars_way(env):
     """Whatever the robot does, and where the physics is asked substep by substep."""
     paths, goals = [], []

@@ -1,4 +1,4 @@
-"""The rover: its control step against a second writing from its docstrings, drives against closed forms."""
+"""The rover: its control step against a second writing from its docstrings, and what it says of it."""
 
 import math
 
@@ -6,14 +6,11 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.optimize import minimize_scalar
 
-from safe_wrappers.envs.ground import MagicFormula
+import safe_wrappers  # noqa: F401  (registers its envs)
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-RADIUS, SLOWEST, SUBSTEPS, WHEELBASE, G = 0.1, 0.5, 5, 0.5, 9.81
+RADIUS, SLOWEST, SUBSTEPS = 0.1, 0.5, 5
 EMPTY = {"agent": [0.0, 0.0, 0.0], "goal": [3.5, 3.5], "hazards": [], "patches": []}
 
 
@@ -109,7 +106,10 @@ def simulate(model, state, control, loads, ground_at):
     """One control step by `mj_step`: the data at its end, the slips there, and the largest of any loaded wheel."""
     data, largest = mujoco.MjData(model), 0.0
     mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-    data.ctrl[:], data.xfrc_applied[:] = control, 0.0
+    data.ctrl[:], data.xfrc_applied[:] = (
+        np.clip(control, -1.0, 1.0),
+        0.0,
+    )  # beyond its box it acts as its edge
     for _ in range(SUBSTEPS):
         data.qfrc_applied[:] = joint_forces(model, data.qpos, data.qvel, loads, ground_at)[0]
         mujoco.mj_step(model, data)
@@ -165,7 +165,7 @@ def test_a_control_step_from_any_state(env, kind):
         mujoco.mj_forward(env.model, still)
         np.testing.assert_allclose(loads_of(env.model, still), loads, rtol=1e-5, atol=1e-4)  # an equilibrium
         for _ in range(3):
-            control = rng.uniform(-1, 1, 5)
+            control = rng.uniform(-1.3, 1.3, 5)
             lifted += 0.0 in loads and loads.any()
             expected, slips, largest = simulate(env.model, whole_state(env), control, loads, env.ground.at)
             info = env.step(control)[4]
@@ -182,16 +182,6 @@ def test_a_control_step_from_any_state(env, kind):
         assert lifted > 3
 
 
-def test_actions_beyond_the_box_act_as_its_edge(env):
-    ends = []
-    for size in (1.0, 50.0):
-        start(env)
-        for _ in range(10):
-            env.step(size * np.array([1.0, -1.0, 1.0, -1.0, 1.0]))
-        ends.append(np.concatenate([env.data.qpos, env.data.qvel]))
-    np.testing.assert_array_equal(*ends)
-
-
 def test_patches_are_sampled_in_the_field(env):
     kinds = set()
     for seed in range(30):
@@ -203,23 +193,7 @@ def test_patches_are_sampled_in_the_field(env):
     assert kinds == {"dry", "wet", "ice"}
 
 
-# Closed forms, and what is said of a step --------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("ground", ["dry", "ice"])
-def test_locked_wheels_stop_in_the_sliding_frictions_distance(env, ground):
-    speed, mu = 4.0, friction(ground, 1.0)
-    start(env, ground=ground, speed=speed, agent=[0, 0, 0.7])
-    env.model.dof_armature[RATES] = 1e9  # rotors too heavy to turn
-    qvel = env.data.qvel.copy()
-    qvel[RATES] = 0.0
-    env.set_state(env.data.qpos.copy(), qvel)
-    for _ in range(1500):
-        env.step(throttle(0.0))
-        if env.forward_speed < 0.02:
-            break
-    assert np.hypot(*env.agent_position) == pytest.approx(speed**2 / (2 * mu * G), rel=0.02)
-    assert env.agent_heading == pytest.approx(0.7, abs=0.01)
+# Rest, and what is said of a step ----------------------------------------------------------------------------
 
 
 def test_it_comes_to_rest_and_stays_there(env):
@@ -279,11 +253,3 @@ def test_rolled_over_is_the_end_and_no_tyre_pushes(env, height, turned, pressed)
     assert not env.data.xfrc_applied.any()
     assert env.step(throttle(1.0))[2]
     assert not env.data.xfrc_applied.any()
-
-
-@given(st.floats(0.05, 1.5), st.floats(0.02, 0.3), st.floats(1.2, 1.9))
-def test_the_peak_against_scipy(friction, slip, shape):
-    curve = MagicFormula(friction, slip, shape)
-    found = minimize_scalar(lambda s: -curve.at(s), bounds=(0.0, 1.0), method="bounded")
-    assert found.x == pytest.approx(slip, abs=1e-4)
-    assert -found.fun == pytest.approx(friction, rel=1e-6)

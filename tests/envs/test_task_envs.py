@@ -3,7 +3,6 @@
 import copy
 import itertools
 import math
-import os
 import pickle
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from episodes import plain
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
-import safe_wrappers.envs
 from safe_wrappers.envs import goal_env, safe_rover
 from safe_wrappers.envs.layout import place_goal_beside, place_objects
 from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
@@ -328,25 +326,7 @@ def test_a_state_that_is_not_finite_is_said(env_id, tmp_path, monkeypatch):
     assert np.isfinite(env.reset(seed=0)[0]).all()
 
 
-# Imports and frames ----------------------------------------------------------------------------------------------
-
-
-def test_registering_imports_no_physics_and_stepping_needs_no_gl():
-    # Loaded by its file, because the package around it may import MuJoCo for its plants.
-    code = """
-import sys, importlib.util as u
-spec = u.spec_from_file_location('alone', sys.argv[1])
-module = u.module_from_spec(spec); spec.loader.exec_module(module); module.register_envs()
-assert 'mujoco' not in sys.modules
-import gymnasium as gym
-env = gym.make('SafeCarGoal2-v0', render_mode='rgb_array'); env.reset(seed=0)
-env.step(env.action_space.sample())
-"""
-    command = [sys.executable, "-c", code, safe_wrappers.envs.__file__]
-    environ = os.environ | {"MUJOCO_GL": "disabled"}
-    done = subprocess.run(command, env=environ, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
+# Frames -----------------------------------------------------------------------------------------------------------
 
 FRAME = """
 import sys

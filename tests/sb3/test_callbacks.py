@@ -12,6 +12,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_replay_buffers import GoalLine
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -158,21 +159,6 @@ class Toll(gym.Env):
         return np.zeros(1, np.float32), taken, False, self.steps == LENGTH, info
 
 
-class Goals(Toll):
-    """With goals, as hindsight replay needs them."""
-
-    observation_space = gym.spaces.Dict(
-        {key: Toll.observation_space for key in ("observation", "achieved_goal", "desired_goal")}
-    )
-
-    def reset(self, *, seed=None, options=None):
-        observation, info = super().reset(seed=seed)
-        return dict.fromkeys(self.observation_space, observation), info
-
-    def compute_reward(self, achieved, desired, info):
-        return np.zeros(len(achieved))
-
-
 def expected(made, limit, rate, multiplier=0.0):
     """What is stored of each step, and the multiplier after the last one, from the definition."""
     stored, total = [], 0.0
@@ -247,7 +233,7 @@ def test_sac_replays_what_was_stored_at_the_multiplier_of_that_time():
         (None, {"rate": 0.0}, "rate"),
         (lambda: ppo(Toll(cost=None)), {}, "CostFunction"),
         (lambda: ppo(Toll(cost=np.nan)), {}, "must be finite"),
-        (lambda: sac(Goals(), "MultiInputPolicy", replay_buffer_class=HerReplayBuffer), {}, "hindsight"),
+        (lambda: sac(GoalLine(), "MultiInputPolicy", replay_buffer_class=HerReplayBuffer), {}, "hindsight"),
         (lambda: sac(VecNormalize(DummyVecEnv([Toll]))), {}, "VecNormalize"),
     ],
 )

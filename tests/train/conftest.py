@@ -1,3 +1,4 @@
+import os
 import shutil
 from pathlib import Path
 
@@ -8,6 +9,10 @@ from running import evaluated, trained
 
 from safe_wrappers.train.config import parse_experiment, read_config
 
+# JAX compiles for most of the time that a test with sbx takes.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+)
 torch.set_num_threads(1)  # as in the workers; two threads on two busy cores only wait for each other
 
 HERE = Path(__file__).parent

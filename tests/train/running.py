@@ -12,7 +12,7 @@ from safe_wrappers.train.files import read_rows, write_rows
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, resume
 from safe_wrappers.train.run.stack import make_vec_env
-from safe_wrappers.train.run.training import EPISODE_COLUMNS, CheckpointCallback
+from safe_wrappers.train.run.training import EPISODE_COLUMNS
 
 SILENT = Progress(lambda steps: None, pytest.fail)
 """Of runs that have nothing to say."""
@@ -41,31 +41,24 @@ def evaluated(experiment, arm=1, seed=0, progress=SILENT):
     return evaluation_folder(folder)
 
 
-def killed_after(experiment, checkpoints, monkeypatch, arm=1):
-    """Trains until some checkpoints are there, and 64 steps more, as a kill would leave it."""
+def killed_after(experiment, checkpoints, arm=1):
+    """Trains until some checkpoints are there and episodes beyond the last one, as a kill would leave it."""
 
     class Killed(BaseException):
         pass
 
-    saved, step, start = [], CheckpointCallback._on_step, CheckpointCallback._on_rollout_start
+    folder, seen = experiment.run_folder(experiment.arms[arm], 0), set()
 
-    def stepping(self):
-        if len(saved) == checkpoints and self.num_timesteps - saved[-1] >= 64:
+    def stopping():
+        found = latest_checkpoint(folder / "checkpoints")
+        seen.update([found.timesteps] if found else [])
+        if len(seen) == checkpoints and episodes(folder)[-1]["timesteps"] > found.timesteps:
             raise Killed
-        return step(self)
+        return False
 
-    def saving(self):
-        before = self._last
-        start(self)
-        if self._last != before:
-            saved.append(self._last)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(CheckpointCallback, "_on_step", stepping)
-        patch.setattr(CheckpointCallback, "_on_rollout_start", saving)
-        with pytest.raises(Killed):
-            trained(experiment, arm)
-    return experiment.run_folder(experiment.arms[arm], 0)
+    with pytest.raises(Killed):
+        trained(experiment, arm, progress=Progress(SILENT.steps, SILENT.say, stopping))
+    return folder
 
 
 def resumed(arm, folder):

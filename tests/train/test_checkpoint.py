@@ -14,23 +14,22 @@ import fake_task
 import numpy as np
 import pytest
 import torch
-from rich.console import Console
 from running import resumed, trained
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.acting import enjoy_command
 from safe_wrappers.train.config.algorithms import algorithm_class
-from safe_wrappers.train.files import only_writer
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model, resume, save_checkpoint
 from safe_wrappers.train.run.data_pickles import read_pickle
 from safe_wrappers.train.run.model_files import write_model
 
 
-@pytest.mark.parametrize("algorithm", ["SAC", "PPO", "sbx.SAC", "sbx.PPO"])
+@pytest.mark.parametrize(
+    "algorithm", ["SAC", "PPO", "sbx.SAC", pytest.param("sbx.PPO", marks=pytest.mark.slow)]
+)
 def test_a_model_that_was_stored_learns_on_as_if_it_were_not(tmp_path, algorithm):
     if algorithm.startswith("sbx."):
         pytest.importorskip("sbx")
@@ -98,7 +97,7 @@ def reached(root):
     return found.timesteps
 
 
-@pytest.mark.parametrize(("before", "final"), [((), False), ((64, 128), False), ((64, 128), True)])
+@pytest.mark.parametrize(("before", "final"), [((), False), ((64, 128), True)])
 def test_a_kill_at_any_file_operation_loses_no_checkpoint(tmp_path, model, before, final):
     whole, step = tmp_path / "whole", 192
     whole.mkdir()
@@ -122,17 +121,6 @@ def test_a_kill_at_any_file_operation_loses_no_checkpoint(tmp_path, model, befor
         if not killed:
             break
     assert operation > 10
-
-
-def test_a_killed_process_holds_no_folder(tmp_path):
-    hold = only_writer(tmp_path)
-    child = os.fork()
-    if not child:
-        hold.__enter__()
-        os.kill(os.getpid(), signal.SIGKILL)
-    os.waitpid(child, 0)
-    with only_writer(tmp_path):
-        pass
 
 
 # Pickles that would run something: it is not run, by no way in which they are read --------------------------------
@@ -178,18 +166,13 @@ def poison(checkpoint, name, payload):
 def test_a_checkpoint_that_would_run_something_is_refused(finished, fake_experiment, tmp_path, name):
     experiment, longer = finished(), finished("total_steps=640")  # the run would go on
     folder = experiment.run_folder(experiment.arms[1], 0)
-    (checkpoint,) = (folder / "checkpoints").iterdir()
-    uses = [
-        lambda: load_policy(folder),
-        lambda: enjoy_command(str(folder), 1, "trained", False, None, Console(quiet=True)),
-        lambda: trained(longer),
-    ]
+    uses = [lambda: load_policy(folder), lambda: trained(longer)]
     if name == "replay_buffer.pkl":
         learner = "hyperparameters={learning_starts: 16, batch_size: 8, policy_kwargs: {net_arch: [8]}}"
         sac = fake_experiment("name=sac", "algorithm=SAC", learner, "total_steps=32")
         folder = trained(sac)
-        (checkpoint,) = (folder / "checkpoints").iterdir()
         uses = [lambda: resumed(sac.arms[1], folder)]
+    (checkpoint,) = (folder / "checkpoints").iterdir()
     poison(checkpoint, name, Touch(tmp_path / "made"))
     for use in uses:
         with pytest.raises(RunStateError, match=rf"{name}' is refused: its pickle names pathlib\.Path"):
@@ -199,16 +182,15 @@ def test_a_checkpoint_that_would_run_something_is_refused(finished, fake_experim
     assert (tmp_path / "made").exists()  # it would have been
 
 
-@pytest.mark.parametrize("content", [b"", b"\x80", b"\x82\xa5model\x80\xa6policy\x80"])
-def test_arrays_of_no_such_network_are_refused(tmp_path, content):
+def test_arrays_of_no_such_network_are_refused(tmp_path):
     sbx = pytest.importorskip("sbx")
     write_model(sbx.SAC("MlpPolicy", fake_task.FakeGoal(), buffer_size=1), tmp_path / "model.zip")
-    assert load_model(tmp_path, "sbx.SAC", "cpu").num_timesteps == 0
     with pytest.raises(ValueError, match=r"Policy \(its arrays are .*load_policy\) unknown"):
         sbx.SAC.load(tmp_path / "model.zip")
-    rewrite(tmp_path / "model.zip", "jax.msgpack", lambda _: content)
-    with pytest.raises(RunStateError, match=r"model\.zip' cannot be read"):
-        load_model(tmp_path, "sbx.SAC", "cpu")
+    for content in (b"", b"\x80", b"\x82\xa5model\x80\xa6policy\x80"):
+        rewrite(tmp_path / "model.zip", "jax.msgpack", lambda _, content=content: content)
+        with pytest.raises(RunStateError, match=r"model\.zip' cannot be read"):
+            load_model(tmp_path, "sbx.SAC", "cpu")
 
 
 @pytest.mark.parametrize(

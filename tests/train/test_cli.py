@@ -99,20 +99,9 @@ def test_compare_from_nothing_to_the_report_in_processes_of_their_own(tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_stopped_or_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path, start):
-    overrides = [f"output={tmp_path}", "total_steps=24000", "seeds=[0]", FILTERED]
+def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path, start):
+    overrides = [f"output={tmp_path}", "total_steps=24000", "seeds=[0]", "checkpoint_every=1000", FILTERED]
     folder = tmp_path / "fake" / "filtered" / "seed_0"
-    process = start("train", *overrides, "checkpoint_every=1000000")
-    wait_for(lambda: len(episodes(folder)) > 20)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate()
-    assert process.returncode == 130
-    assert err == "Stopped. The same command goes on.\n"
-    (checkpoint,) = (folder / "checkpoints").iterdir()
-    at = int(checkpoint.name.removeprefix("step_"))
-    assert f"training filtered seed 0: stopped; goes on from step {at:,}" in out
-    assert not held(folder / ".lock")
-    overrides.append("checkpoint_every=1000")
     process = start("train", *overrides)
     wait_for(lambda: len(list(folder.glob("checkpoints/step_*/state.json"))) >= 2)
     process.send_signal(signal.SIGKILL)
@@ -120,9 +109,14 @@ def test_a_stopped_or_killed_comparison_leaves_no_process_behind_and_goes_on(tmp
     # The workers notice and end: the rows stop growing, and the folder is free again.
     wait_for(lambda: not held(folder / ".lock"))
     at = max(int(path.name[5:]) for path in (folder / "checkpoints").glob("step_*"))
-    assert 1000 <= at < 24000
     early = [row for row in episodes(folder) if row["timesteps"] <= at]
-    assert not (folder / "finished.json").exists()
+    assert 1000 <= at < 24000 and not (folder / "finished.json").exists()
+    process = start("train", *overrides)
+    wait_for(lambda: len(episodes(folder)) > len(early) + 20)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    assert (process.returncode, err) == (130, "Stopped. The same command goes on.\n")
+    assert "training filtered seed 0: stopped; goes on from step " in out and not held(folder / ".lock")
     out, err = start("train", *overrides).communicate(timeout=600)
     assert "training filtered seed 0: done" in out, err
     rows = episodes(folder)

@@ -1,6 +1,5 @@
 """Jobs side by side, on this machine and on a Ray cluster: what is shown of them, how they fail, and signals."""
 
-import importlib.util
 import io
 import multiprocessing
 import os
@@ -8,7 +7,6 @@ import re
 import signal
 import threading
 import time
-from pathlib import Path
 
 import fake_task
 import pytest
@@ -17,14 +15,10 @@ from running import episodes, finish
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.train.config import read_config
 from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
 from safe_wrappers.train.processes import Interrupted, Job, work
 from safe_wrappers.train.processes.on_ray import check_place
 from safe_wrappers.train.processes.parallel import RunsFailedError, run_jobs
-from safe_wrappers.train.sweep import sweep_experiment
-
-FAKE = Path(__file__).parent / "fake.yaml"
 
 
 def job(name, call, *arguments):
@@ -119,15 +113,10 @@ def learned(experiment):
     """All that was learned and what it came to, of every run."""
     found = {}
     for arm in experiment.arms:
-        for seed in experiment.seeds:
-            folder = experiment.run_folder(arm, seed)
-            found[arm.name, seed] = (
-                load_from_zip_file(folder / "policy" / "model.zip")[1]["policy"][
-                    "action_net.weight"
-                ].tolist(),
-                (folder / "episodes.csv").read_text(),
-                (folder / "evaluation" / "filter_on.csv").read_text(),
-            )
+        folder = experiment.run_folder(arm, 0)
+        weights = load_from_zip_file(folder / "policy" / "model.zip")[1]["policy"]["action_net.weight"]
+        tables = [folder / "episodes.csv", folder / "evaluation" / "filter_on.csv"]
+        found[arm.name] = weights.tolist(), [table.read_text() for table in tables]
     return found
 
 
@@ -180,26 +169,7 @@ def test_failures_and_messages_come_back(cluster):
     assert "good: done" in told.file.getvalue()
 
 
-@pytest.mark.slow
-def test_a_sweep_tries_on_a_cluster_what_it_tries_here(cluster, tmp_path):
-    pytest.importorskip("optuna", reason="optuna is not installed: pip install 'safe-wrappers[sweep]'")
-    overrides = ["total_steps=128", "seeds=[0]", "evaluation.episodes=1", "workers=2"]
-    rate = {"hyperparameters.learning_rate": {"low": 1e-5, "high": 1e-2, "log": True}}
-    searched = {
-        **read_config(FAKE, overrides),
-        "sweep": {"parameters": rate, "trials": 4, "at_once": 2},
-    }
-    tables = []
-    for name, on in (("there", "ray"), ("here", None)):
-        sweep_experiment({**searched, "output": str(tmp_path / name)}, FAKE, (), console(), on)
-        tables.append((tmp_path / name / "fake" / "sweep" / "sweep.csv").read_text())
-    assert tables[0] == tables[1] and tables[0].count("at cost zero") == 4
-
-
-def test_places_that_cannot_be_are_refused(monkeypatch):
+def test_places_that_cannot_be_are_refused():
     for on in ("slurm", "ray:", "rays"):
         with pytest.raises(ConfigurationError, match="--on: expected ray or ray:ADDRESS"):
             check_place(on)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(ConfigurationError, match=r"pip install 'safe-wrappers\[ray\]'"):
-        check_place("ray")

@@ -1,10 +1,13 @@
-"""One run in this process: where it resumes, what it refuses, what it leaves behind."""
+"""One run in this process: where it resumes, what it refuses, what it leaves behind and sends to trackers."""
 
 import json
 import os
 import random
 import resource
 import shutil
+import signal
+import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,11 +18,11 @@ from running import Reports, episodes, evaluated, finish, killed_after, resumed,
 from stable_baselines3.common.vec_env import VecNormalize
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.config.algorithms import algorithm_class
 from safe_wrappers.train.files import append_row, only_writer, read_rows, write_rows
 from safe_wrappers.train.processes import Job, Progress, RunStoppedError, work
 from safe_wrappers.train.run.checkpoint import latest_checkpoint, load_model
 from safe_wrappers.train.run.data_pickles import read_pickle
+from safe_wrappers.train.run.trackers import run_logger
 from safe_wrappers.train.run.training import finished_checkpoint
 
 SAC = ("algorithm=SAC", "hyperparameters={learning_starts: 50, batch_size: 16, train_freq: 8}", "n_envs=1")
@@ -89,7 +92,7 @@ def test_neither_neighbouring_seeds_nor_the_parts_of_a_run_share_an_episode(fake
     monkeypatch.setattr(FakeGoal, "reset", noted)
     experiment, parts = fake_experiment(), []
     for train in (
-        lambda: killed_after(experiment, 2, monkeypatch),
+        lambda: killed_after(experiment, 2),
         lambda: trained(experiment),
         lambda: trained(experiment, seed=1),
     ):
@@ -111,7 +114,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypa
     experiment = fake_experiment(
         "total_steps=768", "normalize.reward=true", "hyperparameters.learning_rate=linear_1e-3"
     )
-    folder = killed_after(experiment, 2, monkeypatch)
+    folder = killed_after(experiment, 2)
     rows = episodes(folder)
     assert latest_checkpoint(folder / "checkpoints").timesteps == 256
     assert [row for row in rows if row["timesteps"] > 256]  # whose rows must not be counted twice
@@ -132,18 +135,14 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypa
     assert len(after) == 2 * (128 // 20) + 2 * (256 // 20)
     # New episodes after the restart, not the first ones again; and the schedule goes on.
     assert not {row["return"] for row in after if row["timesteps"] > 256} & {row["return"] for row in kept}
-    assert [steps for steps, _ in rates] == list(range(128, 769, 128))
+    assert [steps for steps, _ in rates] == [128, 256, 384, 384, 512, 640, 768]
     assert [rate for _, rate in rates] == pytest.approx([1e-3 * (1 - steps / 768) for steps, _ in rates])
     assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == ["step_000000000768"]
 
 
-@pytest.mark.parametrize("algorithm", ["SAC", "sbx.SAC"])
-def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment, monkeypatch, algorithm):
-    if algorithm == "sbx.SAC":
-        pytest.importorskip("sbx")
-    settings = (*SAC, f"algorithm={algorithm}")
-    experiment = fake_experiment(*settings, "total_steps=320")
-    folder = killed_after(experiment, 1, monkeypatch)
+def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment, monkeypatch):
+    experiment = fake_experiment(*SAC, "total_steps=320")
+    folder = killed_after(experiment, 1)
     buffer = resumed(experiment.arms[1], folder).replay_buffer
     assert buffer.size() == latest_checkpoint(folder / "checkpoints").timesteps == 128
     assert buffer.buffer_size == 320  # not a million: it would be saved with every checkpoint
@@ -163,15 +162,15 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     np.testing.assert_equal(vars(read_pickle(scaling).obs_rms), before)
 
     # Raised, it fills a new buffer before it learns.
-    kind = algorithm_class(algorithm)
-    trained_at, train = [], kind.train
-    monkeypatch.setattr(
-        kind,
-        "train",
-        lambda self, **given: (trained_at.append(self.num_timesteps), train(self, **given)),
-    )
+    trained_at, train = [], stable_baselines3.SAC.train
+
+    def noting(self, **given):
+        trained_at.append(self.num_timesteps)
+        train(self, **given)
+
+    monkeypatch.setattr(stable_baselines3.SAC, "train", noting)
     reports = Reports()
-    trained(fake_experiment(*settings, "total_steps=400"), progress=reports.progress)
+    trained(fake_experiment(*SAC, "total_steps=400"), progress=reports.progress)
     (line,) = reports.lines
     assert line.startswith("goes on from step 320 with an empty replay buffer") and "50 steps" in line
     assert 370 < trained_at[0] <= 384 and finish(folder)["timesteps"] == 400
@@ -274,10 +273,10 @@ def test_a_start_that_fails_leaves_the_folder_to_the_corrected_command(fake_expe
 
 
 def test_a_checkpoint_that_cannot_be_read_is_named_and_without_it_the_one_before_counts(
-    fake_experiment, monkeypatch
+    fake_experiment,
 ):
-    experiment = fake_experiment("total_steps=512")
-    folder = killed_after(experiment, 3, monkeypatch)
+    experiment = fake_experiment("total_steps=640")
+    folder = killed_after(experiment, 3)
     older, newer = sorted((folder / "checkpoints").glob("step_*"))
     model = newer / "model.zip"
     model.write_bytes(model.read_bytes()[:-100])
@@ -287,17 +286,21 @@ def test_a_checkpoint_that_cannot_be_read_is_named_and_without_it_the_one_before
     shutil.rmtree(newer)
     assert latest_checkpoint(folder / "checkpoints").folder == older
     trained(experiment)
-    assert finish(folder)["timesteps"] == 512
+    assert finish(folder)["timesteps"] == 640
 
 
-def test_two_processes_do_not_train_one_run(fake_experiment, monkeypatch):
+def test_two_processes_do_not_train_one_run_and_a_killed_one_holds_no_folder(fake_experiment, monkeypatch):
     monkeypatch.setattr("safe_wrappers.train.files._PATIENCE_S", 0.0)
-    experiment = fake_experiment()
-    with (
-        only_writer(experiment.run_folder(experiment.arms[1], 0)),
-        pytest.raises(RunStateError, match="Another process is working in"),
-    ):
+    experiment = fake_experiment("total_steps=128")
+    hold = only_writer(experiment.run_folder(experiment.arms[1], 0))
+    with hold, pytest.raises(RunStateError, match="Another process is working in"):
         trained(experiment)
+    child = os.fork()
+    if not child:
+        only_writer(experiment.run_folder(experiment.arms[1], 0)).__enter__()
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    trained(experiment)
 
 
 def test_a_file_that_cannot_be_written_is_named_and_the_last_checkpoint_stays(fake_experiment):
@@ -322,3 +325,64 @@ def test_a_file_that_cannot_be_written_is_named_and_the_last_checkpoint_stays(fa
     assert named >= 2
     trained(longer, progress=Reports().progress)
     assert finish(folder)["timesteps"] == 192
+
+
+# Curves and interventions in Weights & Biases and MLflow: by a fake, and where it is installed ----------------------
+
+SENT = {"rollout/ep_rew_mean", "interventions/rate", "evaluation_filter_on/return"}
+
+
+@pytest.fixture
+def tracked(fake_experiment):
+    return lambda tracker, steps=128: fake_experiment(
+        f"total_steps={steps}", f"trackers=[{tracker}]", "evaluation.episodes=2"
+    )
+
+
+@pytest.fixture
+def wandb(monkeypatch):
+    """As if it were installed: `init` returns the run."""
+    fake = Mock()
+    fake.init.return_value = fake
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    return fake
+
+
+def test_curves_and_interventions_of_training_and_evaluation_arrive(tracked, wandb):
+    folder = trained(tracked("wandb"))
+    evaluated(tracked("wandb"))
+    assert SENT | {"timesteps"} <= {key for call in wandb.log.call_args_list for key in call.args[0]}
+    made = [call.kwargs for call in wandb.init.call_args_list]
+    assert {(one["project"], one["name"]) for one in made} == {("fake", "filtered seed 0")}
+    assert wandb.finish.call_count == len(made) == 2
+    # One run there: after a raised total, too; of another config another one.
+    for seed in (0, 1):
+        logger = run_logger(tracked("wandb", 256).arms[1], seed, folder)
+        assert len({call.kwargs["id"] for call in wandb.init.call_args_list}) == 1 + seed
+    # Nothing that is no finite number is sent.
+    wandb.log.reset_mock()
+    for key, value in (("a", float("nan")), ("b", "text"), ("c", 2.0)):
+        logger.record(key, value)
+    logger.record("d", 1.0, exclude="tensorboard")
+    logger.dump(7)
+    wandb.log.assert_called_once_with({"c": 2.0, "timesteps": 7})
+
+
+def test_a_tracker_that_is_lost_stops_no_training(tracked, wandb):
+    wandb.log.side_effect = OSError("no network")
+    with pytest.warns(UserWarning, match="wandb: what follows is not tracked: no network") as said:
+        folder = trained(tracked("wandb"))
+    assert sum("wandb" in str(each.message) for each in said) == 1
+    assert (folder / "finished.json").exists()
+
+
+def test_mlflow_takes_it_in_a_folder(tracked, tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", (tmp_path / "mlruns").as_uri())
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+    trained(tracked("mlflow"))
+    evaluated(tracked("mlflow"))
+    client = mlflow.MlflowClient()
+    (run,) = client.search_runs([client.get_experiment_by_name("fake").experiment_id])
+    assert run.data.metrics.keys() >= SENT
+    assert run.data.params["algorithm"] == "PPO" and run.info.status == "FINISHED"

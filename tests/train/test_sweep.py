@@ -82,8 +82,9 @@ def test_the_command_searches_and_its_trials_are_ordinary_experiments(tmp_path, 
     trial = tmp_path / "fake" / "sweep" / "trial_0001"
     assert main(["report", str(trial / "config.yaml")]) == 0
     assert (trial / "report.html").exists()
-    tried = yaml.safe_load((trial / "config.yaml").read_text())["hyperparameters"]["learning_rate"]
-    assert tried == float(found[1][RATE])
+    tried = yaml.safe_load((trial / "config.yaml").read_text())
+    assert tried["hyperparameters"]["learning_rate"] == float(found[1][RATE])
+    assert [*tried["arms"]] == ["filtered"] and "sweep" not in tried  # the ranked arm
     assert main(["sweep", str(config)]) == 0  # all is done
     assert rows(tmp_path) == found
 
@@ -155,12 +156,3 @@ def test_a_violation_ranks_below_every_return_at_cost_zero():
 def test_parameters_that_do_not_exist_or_are_refused(tmp_path, parameters, said):
     with pytest.raises(ConfigurationError, match=said):
         Space(settings(tmp_path, parameters=parameters))
-
-
-def test_a_trial_is_the_ranked_arm(tmp_path):
-    space = Space(settings(tmp_path, parameters={MARGIN: {"low": 0.0, "high": 0.2}}))
-    written, trial = space.trial("trial_0003", {MARGIN: 0.125})
-    assert [arm.name for arm in trial.arms] == ["filtered"]
-    assert trial.arms[0].filter.kwargs == {"margin": 0.125}
-    assert trial.folder == tmp_path / "fake" / "sweep" / "trial_0003"
-    assert "sweep" not in written

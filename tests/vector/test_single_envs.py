@@ -30,7 +30,6 @@ SEEN = {
     "reacher": ["cbf/intervened", "cbf/nonfinite"],
     "rover": ["cbf/intervened", "cbf/nonfinite"],
     "commanded_cart": ["lease/braking", "fault/active", "handover/refused"],
-    "leased_pendulum": ["lease/braking", "lease/refused", "fault/active"],
     "occluded": ["cbf/intervened", "cbf/nonfinite"],
 }
 """Flags that the episodes by hand must raise at times, and at others not."""

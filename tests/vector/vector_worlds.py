@@ -146,15 +146,6 @@ def commanded_cart(index=0):
     return RepeatedCommands(Outages(env, 0.6, 0.3), 0.2)
 
 
-def leased_pendulum(index=0):
-    """Lease and faults alone, no filter; the pole falls by itself."""
-    rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
-    clearance = sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0)
-    env = gym.make("InvertedPendulum-v5", max_episode_steps=8 + index)
-    env = sw.LeaseExpiry(env, sw.StoppingBudget(clearance, acceleration=20.0), max_lease_s=0.12)
-    return Outages(sw.RecordInterventions(env), 0.12, 0.3)
-
-
 def occluded(index=0):
     """Estimates and sensor noise."""
     cars = sw.occlusion.Track(
@@ -172,7 +163,6 @@ TASKS = {
     "reacher": reacher,
     "rover": rover,
     "commanded_cart": commanded_cart,
-    "leased_pendulum": leased_pendulum,
     "occluded": occluded,
 }
 
