@@ -33,14 +33,19 @@ OFFSET, SCALE = np.array([0.5, -0.5]), np.array([-3.0, 1.5])
 
 
 class Machine(gym.Env):
-    """A slide with a motor and a hinge with a position servo; an action is `(control - OFFSET) / SCALE`."""
+    """A slide with a motor and a hinge with a position servo; an action is `(control - OFFSET) / SCALE`.
+
+    `how` is what it does instead with its actions.
+    """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float64)
     dt, frame_skip = 0.02, 4
 
-    def __init__(self, offset=OFFSET, scale=SCALE, push='ctrlrange="-2.5 3.5"', servo="", low=-1.0, high=1.0):
+    push = 'ctrlrange="-2.5 3.5"'
+
+    def __init__(self, offset=OFFSET, scale=SCALE, push=push, servo="", low=-1.0, high=1.0, how=""):
         self.model = mujoco.MjModel.from_xml_string(MACHINE.format(push=push, servo=servo))
-        self.data = mujoco.MjData(self.model)
+        self.data, self.how = mujoco.MjData(self.model), how
         self.offset, self.scale = np.broadcast_to(offset, 2), np.broadcast_to(scale, 2)
         low, high = (np.broadcast_to(end, 2) for end in (low, high))
         self.action_space = gym.spaces.Box(low, high, (2,), np.float64)
@@ -56,12 +61,16 @@ class Machine(gym.Env):
         return np.concatenate([self.data.qpos, self.data.qvel])
 
     def step(self, action):
-        self.act(self.offset + self.scale * np.clip(action, self.action_space.low, self.action_space.high))
-        return self.observed(), 0.0, False, False, {}
-
-    def act(self, control):
+        control = self.offset + self.scale * np.clip(action, self.action_space.low, self.action_space.high)
+        if self.how == "relative":
+            control = self.data.qpos + 0.1 * action
+        elif self.how == "squared":
+            control = np.sign(control) * control**2
+        elif self.how == "frozen":
+            raise RuntimeError("no robot is connected")
         self.data.ctrl[:] = control
         mujoco.mj_step(self.model, self.data, self.frame_skip)
+        return self.observed(), 0.0, False, False, {}
 
 
 class Plain(Machine):
@@ -269,48 +278,28 @@ def test_a_filter_decides_as_on_the_twin(constraint):
     assert changed >= 5  # the speed limit on impact acts while the arm approaches, then it rests
 
 
-class Relative(Machine):
-    def step(self, action):
-        self.act(self.data.qpos + 0.1 * action)
-        return self.observed(), 0.0, False, False, {}
-
-
-class Squared(Machine):
-    def act(self, control):
-        super().act(np.sign(control) * control**2)
-
-
-class Frozen(Machine):
-    def step(self, action):
-        raise RuntimeError("no robot is connected")
-
-
-class OneForBoth(Machine):
-    """Has one action for its two controls."""
-
-    def __init__(self):
-        super().__init__()
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
-
-
 def fetch():
     gym.register_envs(pytest.importorskip("gymnasium_robotics"))
     return gym.make("FetchReach-v4")
 
 
-def renamed():
-    """A wrapper that has another action space than the env in it."""
-    env = gym.Wrapper(Machine())
-    env.action_space = gym.spaces.Box(-2.0, 2.0, (2,))
+def taking(size, wrapped=False):
+    """A machine with another action space, or in a wrapper that has one."""
+    env = gym.Wrapper(Machine()) if wrapped else Machine()
+    env.action_space = gym.spaces.Box(-2.0, 2.0, (size,))
     return env
 
 
 REFUSED = {
-    Relative: r"control = offset \+ scale \* action: in 100 steps .* up to \d.* away .*'(push|servo)'",
-    Squared: r"not by control = offset \+ scale \* action.*AnalyticPlant",
-    Frozen: r"no copy of it can be stepped .* \(RuntimeError: no robot is connected\).*AnalyticPlant\(",
-    OneForBoth: "has not one action for each control. Use AnalyticPlant",
-    renamed: "a wrapper of .* changes its action space; the filter must be inside",
+    lambda: Machine(
+        how="relative"
+    ): r"control = offset \+ scale \* action: in 100 steps .* up to \d.* away .*'(push|servo)'",
+    lambda: Machine(how="squared"): r"not by control = offset \+ scale \* action.*AnalyticPlant",
+    lambda: Machine(
+        how="frozen"
+    ): r"no copy of it can be stepped .* \(RuntimeError: no robot is connected\).*AnalyticPlant\(",
+    lambda: taking(1): "has not one action for each control. Use AnalyticPlant",
+    lambda: taking(2, wrapped=True): "a wrapper of .* changes its action space; the filter must be inside",
     fetch: r"moves its gripper by displacements: take DisplacementPlant\(\)",
     lambda: gym.make("Pendulum-v1"): r"has no MuJoCo .model and .data; .*AnalyticPlant.*MujocoPlant\(model=",
 }

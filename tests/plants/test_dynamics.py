@@ -13,6 +13,7 @@ from oracles import damping_ratios, in_cone
 from scenes import Scene
 
 from safe_wrappers.control.whole_body import WholeBodyProblem, solve_cone, solve_pyramid
+from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants import rigid_model_check
 from safe_wrappers.plants.mujoco.dynamics import MomentumReader, equations_of_motion
 
@@ -111,6 +112,16 @@ def test_they_hold_for_servos_limits_equalities_dry_friction_and_pushes_from_out
     right = terms.actuation @ [1.0, 0.3] + pushed(terms, terms.contacts.force)
     assert terms.inertia @ data.qacc + terms.bias == pytest.approx(right, abs=1e-8)
     assert terms.contacts.force.any() and (condim == 3 or not terms.contacts.friction.any())
+
+
+def test_something_flexible_in_contact_is_refused():
+    cloth = 'name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" radius=".02" pos="0 0 .01" mass="1"'
+    world = f'<geom type="plane" size="1 1 1"/><flexcomp {cloth}/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{world}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with pytest.raises(UnsupportedEnvError, match="something flexible is in contact"):
+        equations_of_motion(model, data)
 
 
 def momentum(model, data):
