@@ -188,25 +188,26 @@ def test_what_is_not_affine_is_refused_by_name(xml, says):
         bound(scene(xml))
 
 
-def test_clamped_sums_of_forces_and_an_integrator_of_whole_steps_are_refused():
-    env = scene('<motor joint="hinge" ctrlrange="-1 1"/>')
+SPOILT = {
+    r"integrator is 'discrete'.*AnalyticPlant": lambda m: setattr(m.opt, "integrator", 4),  # from 3.13 on
+    r"joint 'hinge' clamps the sum .*actuatorfrcrange": lambda m: m.jnt_actfrclimited.fill(True),
+    r"tendon 'both' clamps the sum": lambda m: m.tendon_actfrclimited.fill(True),
+    r"actuator 'push' is disabled .*enable it": lambda m: setattr(m.opt, "disableactuator", 1 << 3),
+    r"actuator 'push' is disabled": lambda m: setattr(m.opt, "disableflags", DISABLED),
+}
+DISABLED = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+
+
+@pytest.mark.parametrize("says", SPOILT)
+def test_a_model_whose_forces_are_others_than_its_actuators_is_refused(says):
+    env = scene('<motor name="push" group="3" joint="hinge" ctrlrange="-1 1"/>')
+    env.model.opt.disableactuator = 1 << 2  # another group's
     for integrator in range(4):
         env.model.opt.integrator = integrator
         bound(env)
-    env.model.opt.integrator = 4  # "discrete", from 3.13 on
-    with pytest.raises(UnsupportedEnvError, match=r"integrator is 'discrete'.*AnalyticPlant"):
+    SPOILT[says](env.model)
+    with pytest.raises(UnsupportedEnvError, match=says):
         bound(env)
-    env.model.opt.integrator = 0
-    env.model.jnt_actfrclimited[0] = True
-    with pytest.raises(UnsupportedEnvError, match=r"'hinge' clamps the sum .*actuatorfrcrange"):
-        bound(env)
-    nameless = Scene(
-        env.xml.replace('name="slide"', 'actuatorfrcrange="-1 1"').replace(
-            '<joint joint="slide" coef="-1"/>', ""
-        )
-    )
-    with pytest.raises(UnsupportedEnvError, match="joint '#1' clamps"):
-        bound(nameless)
 
 
 CARRIED = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="shelf"><geom size=".1"/></body>
