@@ -92,7 +92,7 @@ class Nested(gym.Env):
 
     def __init__(self, inner):
         self.sim = SimpleNamespace(
-            model=SimpleNamespace(_model=inner.model), data=SimpleNamespace(_data=inner.data)
+            model=SimpleNamespace(ptr=inner.model), data=SimpleNamespace(ptr=inner.data)
         )
         self.inner, self.action_space = [inner], inner.action_space
 
@@ -107,7 +107,7 @@ class Nested(gym.Env):
 @pytest.mark.parametrize("machine", [Plain, Machine], ids=["control", "mapped"])
 def test_a_filter_keeps_a_limit_of_a_machine_two_levels_down(machine):
     plant = sw.MujocoPlant(
-        model=lambda env: env.sim.model._model, data=lambda env: env.sim.data._data, control_dt=0.02
+        model=lambda env: env.sim.model.ptr, data=lambda env: env.sim.data.ptr, control_dt=0.02
     )
     limit = sw.constraints.JointSpeedLimit(limit=1.2, joints=["x"], margin=0.01)
     env = Nested(machine())
