@@ -195,6 +195,8 @@ def test_the_hold_of_a_maze_is_the_inner_env_s(env_id, substeps, control_dt):
 )
 def test_a_control_step_that_is_no_whole_number_of_physics_steps_is_refused(frame_skip, control_dt, got):
     env = Plain()
+    env.frame_skip = None  # it says it by dt alone
+    assert bound(env).substeps == 4
     env.frame_skip = env.dt = frame_skip
     with pytest.raises(ConfigurationError, match=rf"steps of 0\.005 s.*got {got} .*: leave control_dt"):
         bound(env, control_dt=control_dt)
