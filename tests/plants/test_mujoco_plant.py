@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 from asking import bound
-from scenes import Scene
+from scenes import Legs, Scene
 
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
@@ -210,16 +210,11 @@ def test_a_model_whose_forces_are_others_than_its_actuators_is_refused(says):
         bound(env)
 
 
-CARRIED = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="shelf"><geom size=".1"/></body>
-<body name="hand" mocap="true"><geom size=".1" mass="50"/><body name="ring"><geom size=".1" mass="50"/></body></body>
-<body name="held" pos="0 0 1"><joint name="swing" type="hinge"/><geom size=".1" mass="1"/>
-<body name="tip"><geom size=".1" mass="2"/></body></body></worldbody></mujoco>"""
-
-
 def test_the_world_mocap_bodies_and_what_is_welded_to_either_are_fixed_and_no_weight():
-    model = mujoco.MjModel.from_xml_string(CARRIED)
+    ring = '<body name="hand" mocap="true"><body name="ring"><geom size=".1" mass="50"/></body></body>'
+    model = Legs(more=ring).model
     fixed = {model.body(int(body)).name for body in np.flatnonzero(fixed_bodies(model))}
-    assert fixed == {"world", "shelf", "hand", "ring"}
-    assert weight_n(model) == pytest.approx(3.0 * 9.81)
+    assert fixed == {"world", "step", "lift", "hand", "ring"}
+    assert weight_n(model) == pytest.approx((4.0 + 0.6 + 0.6 + 1.0) * 9.81)
     model.opt.gravity[:] = 0.0
-    assert weight_n(model) == pytest.approx(3.0)
+    assert weight_n(model) == pytest.approx(4.0 + 0.6 + 0.6 + 1.0)
