@@ -95,39 +95,17 @@ def test_rows_are_the_second_derivative_of_the_distance(surface):
     assert compared > 10
 
 
-def hunter(env, k):
-    offsets = np.array([d.center for d in DISCS]) - env.data.qpos
-    return np.clip(3.0 * offsets[np.argmin(np.linalg.norm(offsets, axis=1))], -1, 1)
-
-
-def orbit(env, k):
-    offset = np.array(DISCS[2].center) - env.data.qpos
-    away = offset / np.linalg.norm(offset)
-    return np.clip(2.0 * offset - 1.5 * env.data.qvel + 3.0 * np.array([-away[1], away[0]]), -1, 1)
-
-
-DRIVERS = {
-    "bang-bang": lambda env, k: np.sign(np.random.default_rng(k // 40).normal(size=2)),
-    "hunter": hunter,
-    "orbit": orbit,
-}
-
-
-@pytest.mark.parametrize(
-    ("driver", "frame_skip"), [("bang-bang", 25), ("hunter", 25), ("hunter", 5), ("orbit", 25)]
-)
-def test_a_mujoco_point_mass_never_enters_a_disc(driver, frame_skip):
+@pytest.mark.parametrize("frame_skip", [25, 5])
+def test_a_mujoco_point_mass_that_drives_at_the_nearest_disc_never_enters_one(frame_skip):
     # 2 N along any direction is 2 m/s^2 at least; braking is declared below it. The margin is for the turn of
     # the direction within a hold.
     env = PointMass(frame_skip=frame_skip)
     filtered = sw.CBFActionFilter(env, [of.Clearance(DISCS, braking=1.5, margin=0.01, **BALL)])
     filtered.reset(seed=0)
-    intervened = sum(
-        filtered.step(DRIVERS[driver](env, k))[4]["cbf/intervened"] for k in range(int(8.0 / env.dt))
-    )
-    closest = gap(env.path)
-    assert closest > 0.0 and intervened > 0
-    assert driver != "hunter" or closest < 0.05  # and it is not kept away for nothing
+    for _ in range(int(8.0 / env.dt)):
+        away = np.array([d.center for d in DISCS]) - env.data.qpos
+        filtered.step(np.clip(3.0 * min(away, key=np.linalg.norm), -1, 1))
+    assert 0.0 < gap(env.path) < 0.05  # and it is not kept away for nothing
 
 
 def test_radius_margin_and_state_error_add_up():

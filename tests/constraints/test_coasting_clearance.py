@@ -159,13 +159,11 @@ def test_a_detour_keeps_its_side_and_else_passes_on_the_right_what_is_on_the_lef
 
 
 def test_a_car_that_is_wedged_between_obstacles_turns_the_other_way():
-    """Without that it stands there in 658 of these steps."""
+    """Without that it stands there in 248 of these steps."""
     env = sw.StuckEscape(sw.protect(gym.make("SafeCarGoal2-v0")), progress=0.1, escape_s=0)
-    driver, stuck = goal_seeking(env.unwrapped, np.random.default_rng(0)), 0
-    for seed in (2, 3):
-        env.reset(seed=1_000_000 + seed)
-        stuck += sum(env.step(driver())[4]["cbf/stuck"] for _ in range(600))
-    assert stuck < 450
+    driver = goal_seeking(env.unwrapped, np.random.default_rng(0))
+    env.reset(seed=1_000_002)
+    assert sum(env.step(driver())[4]["cbf/stuck"] for _ in range(400)) < 180
 
 
 def test_what_does_not_rest_within_the_horizon_is_refused_however_far_it_stays_away():

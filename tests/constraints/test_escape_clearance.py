@@ -133,7 +133,7 @@ def test_what_is_left_is_what_mujoco_leaves():
 class Rolling(gym.Wrapper):
     """A large ball rolls across the place of the robot, below a wall; it is published."""
 
-    rolling = np.array([[2.0, 0.0]])
+    rolling = np.array([[2.0, 0.0, 9.0]])
 
     def step(self, action):
         self.balls = self.balls + HOLD * self.rolling
@@ -146,7 +146,7 @@ def test_a_way_out_that_was_begun_stays_open_until_its_end():
     path = Played(env.unwrapped.model).positions(np.zeros(9), np.zeros(9), np.array([0, 1]), (0, 1, 20), 40)
     end = path[-1, 1]
     radius = end - RADIUS - MARGIN - 0.003
-    env.balls = np.array([[-radius - 0.25 - 1.7 * 2.0, 0.0]])
+    env.balls = np.array([[-radius - 0.25 - 1.7 * 2.0, 0.0, 7.0]])  # its height does not count
     ball = sw.constraints.Discs("balls", radius, velocity_attribute="rolling")
     wall = sw.constraints.Plane([0.0, end + RADIUS + MARGIN + 0.003], [0.0, -1.0])
     raw, plant, clearance = bound([ball, wall], env=env)
@@ -167,7 +167,7 @@ def test_a_way_out_that_was_begun_stays_open_until_its_end():
 
 def test_of_the_proposals_the_nearest_comes_first_and_one_is_admitted():
     raw, plant, clearance = bound([TRUE_CARS, PILLARS])
-    tried = 0
+    tried, most = 0, 0
     for qpos, qvel, control in random_states(300, seed=1):
         anew(raw, plant, clearance, qpos, qvel)
         if clearance.value().min() < MARGIN or clearance.admits(control):
@@ -182,7 +182,8 @@ def test_of_the_proposals_the_nearest_comes_first_and_one_is_admitted():
             tried += 1
             assert any(clearance.admits(candidate) for candidate in found)
             assert clearance.admits(clearance.backup())
-    assert tried > 8
+            most = max(most, len(found))
+    assert tried > 8 and most > 5  # not only braking and full drive along an axis
 
 
 def test_under_a_delay_all_are_where_they_will_be():

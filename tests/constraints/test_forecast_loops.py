@@ -15,7 +15,6 @@ from judged_loops import (
     cart_before_a_wall,
     cone_room,
     drive,
-    flagged,
     full,
     inside_the_hull,
     manipulability,
@@ -185,39 +184,3 @@ def test_without_the_filter_one_of_them_breaks_it(name):
         return min(left)
 
     assert any(least(driver) < -1e-3 for driver in reversed(loop.drivers))
-
-
-# From outside -------------------------------------------------------------------------------------------------
-
-STRETCHED = None
-OUTSIDE = {
-    "farther than both ends": ("joint position of Reacher", ([1.7, 0.5], [0.0, 0.0]), [1.0, 1.0], 12, 1e-3),
-    "both joints": ("joint position of Reacher", ([-1.7, -1.65], [0.0, 0.0]), [-1.0, -1.0], 12, 1e-3),
-    "too fast": ("joint speed of Reacher", ([0.0, 0.0], [9.0, -7.0]), [1.0, -1.0], 30, 1e-6),
-    "stretched": ("singularity of Pusher", STRETCHED, [0.0] * 7, 25, 1e-6),
-}
-
-
-@pytest.mark.parametrize("case", OUTSIDE)
-def test_from_outside_it_comes_back_says_so_and_stays(case):
-    name, start, action, soon, hair = OUTSIDE[case]
-    loop = LOOPS[name]
-    env = sw.CBFActionFilter(loop.make(), loop.limits)
-    judge, rooms, unsafe = Judge(env, loop.room), [], []
-    with pytest.warns(sw.UnsafeStateWarning):
-        env.reset(seed=0)
-        data = env.unwrapped.data
-        if start is not STRETCHED:
-            qpos, qvel = data.qpos.copy(), 0.0 * data.qvel
-            qpos[:2], qvel[:2] = start
-            env.unwrapped.set_state(qpos, qvel)
-        rooms.append(judge.at(data))
-        assert rooms[0] < -0.1
-        for _ in range(60):
-            least, end, _, info = judge.step(env, np.array(action, np.float32))
-            assert least >= min(rooms[-1], 0.0) - 1e-6 or flagged(info)  # never farther out
-            rooms.append(end)
-            unsafe.append(info["cbf/unsafe"])
-    back = int(np.argmax(np.array(rooms) >= -hair))
-    assert 0 < back <= soon and min(rooms[30:]) >= -1e-6
-    assert all(unsafe[: back - 1]) and not any(unsafe[30:])

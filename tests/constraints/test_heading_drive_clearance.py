@@ -1,15 +1,12 @@
-"""HeadingDriveClearance: the corners of the uncertainty, the side of a `Detour`, and what holds at the boundary."""
+"""HeadingDriveClearance: the corners of the uncertainty, the side of a `Detour`, and the way out of a disc."""
 
 import math
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.control.backup.heading_drive import Motion, advance, brake_control, clearances
 
 RADIUS = 0.2
 # A reset stands still among the hazards of a moving state.
@@ -93,75 +90,6 @@ def test_a_disc_ahead_is_passed_on_its_other_side_which_is_kept_for_fifty_steps(
     assert limit.executed(drive)["detour"] == (side, 49)
     limit.observe({"detour": (side, 20)})
     assert limit.spec.surroundings(2)[0] == 0.4 * side  # of its time
-
-
-# At the boundary of its safe set -----------------------------------------------------------------------------
-
-
-def driven(drive, pairs):
-    """The motion after controls, (drive, turn, holds) each, from rest at the origin."""
-    motion, places = Motion(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), np.empty((drive.substeps, 2))
-    for push, turn, holds in pairs:
-        for _ in range(holds):
-            motion = advance(drive, motion, push, turn, places)
-    return motion
-
-
-def touching(drive, motion, direction, clearance):
-    """The centre of a disc in that direction of which braking leaves this much."""
-    models, start = np.array([drive], dtype=np.float64), np.array(motion)
-    brake = brake_control(drive, motion)
-    near, far = 0.0, 4.0
-    for _ in range(50):
-        middle = 0.5 * (near + far)
-        there = motion.x + middle * math.cos(direction), motion.y + middle * math.sin(direction)
-        left = clearances(models, start, brake, 0.0, np.array([[*there, RADIUS]]), False)[0, 0]
-        near, far = (middle, far) if left < clearance else (near, middle)
-    return [motion.x + far * math.cos(direction), motion.y + far * math.sin(direction)]
-
-
-EXTREME = st.tuples(
-    st.sampled_from([-1.0, 0.0, 1.0]), st.sampled_from([-1.0, -0.3, 0.0, 1.0]), st.integers(1, 60)
-)
-DRIVEN = st.lists(EXTREME, min_size=1, max_size=8)
-ANGLE = st.floats(-math.pi, math.pi)
-
-
-@given(pairs=DRIVEN, directions=st.lists(ANGLE, min_size=1, max_size=3), control=st.tuples(ANGLE, ANGLE))
-@settings(max_examples=30)
-def test_the_rest_of_an_admitted_trajectory_is_the_backup_of_the_next_step(pairs, directions, control):
-    """The step of the proof, in MuJoCo: what was left of a control, its successor's backup leaves."""
-    env, limit = filtered()
-    spec = limit.spec
-    motion = driven(spec.drive, pairs)
-    start(env, [touching(spec.drive, motion, d, 0.03) for d in directions], motion[:3], motion[3:])
-    control = (np.clip(np.array(control) * [0.03, 0.5], -1.0, 1.0)).astype(np.float32).astype(np.float64)
-    before = spec.h_along(limit.model.rollout(control)).min(initial=1.0)
-    env.env.step(control)
-    env.filter.observe()
-    assert limit.value().min(initial=1.0) >= before - spec.rounding
-    for _ in range(50):
-        before = limit.least
-        env.env.step(limit.backup().astype(np.float32))
-        env.filter.observe()
-        assert limit.least >= before - spec.rounding
-
-
-@given(pairs=DRIVEN, direction=ANGLE)
-@settings(max_examples=15)
-def test_a_control_that_is_not_looked_at_leaves_the_margin(pairs, direction):
-    env, limit = filtered()
-    drive, margin = limit.spec.drive, limit.spec.margin
-    motion = driven(drive, pairs)
-    looked, unseen = margin, margin + 0.3
-    for _ in range(12):  # as near as it can be without being looked at
-        middle = 0.5 * (looked + unseen)
-        start(env, [touching(drive, motion, direction, middle)], motion[:3], motion[3:])
-        looked, unseen = (middle, unseen) if limit.slacks(np.zeros(2)).size else (looked, middle)
-    discs = np.array([[*touching(drive, motion, direction, unseen), RADIUS]])
-    for control in ([1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, 0.0], [-1.0, 0.0]):
-        assert clearances(limit.spec.models, np.array(motion), *control, discs, False).min() >= margin
-    assert looked > margin
 
 
 @pytest.mark.parametrize("alone", [False, True])

@@ -56,69 +56,54 @@ stiffness="3"/><geom name="fist" size=".05" pos=".05 .02 0"/></body></body></bod
 <motor joint="c" gear="2" ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
-def closing(model, qpos, qvel, normal, point):
-    """Speed along a fixed direction of the point of the hand that is at `point` (in its frame)."""
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = qpos, qvel
-    mujoco.mj_forward(model, data)
-    hand = data.body("hand")
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jac(model, data, jacobian, None, hand.xpos + hand.xmat.reshape(3, 3) @ point, hand.id)
-    return float(normal @ jacobian @ qvel)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_the_peak_is_that_of_the_moving_arms_speed_mass_and_push(seed):
     env, rng = Scene(ARM), np.random.default_rng(seed)
     env.data.qpos[:3], env.data.qvel[:3] = rng.uniform(-0.8, 0.8, 3), rng.uniform(-3.0, 3.0, 3)
-    constraint = asked(
-        env, sw.constraints.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4)
-    )
-    m, data, control = env.model, mujoco.MjData(env.model), rng.uniform(-1.0, 1.0, 3)
+    constraint = asked(env, sw.constraints.ImpactSpeedLimit(["hand"], ["wall"], 100.0, 1e4))
     constraint.value()
+    m, data, control = env.model, mujoco.MjData(env.model), rng.uniform(-1.0, 1.0, 3)
     qpos, qvel = env.data.qpos.copy(), env.data.qvel.copy()
-    constraint.place(qpos, qvel, control)
-    contact = constraint.contact(0)
+
+    def at(q, v, u=control):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, u
+        mujoco.mj_forward(m, data)
+        return data.body("hand").xpos, data.body("hand").xmat.reshape(3, 3)
 
     # The distance and the point by hand: the wall's normal, the fist's lowest point above it.
-    data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, control
-    mujoco.mj_forward(m, data)
+    place, axes = at(qpos, qvel)
     into = -data.geom("wall").xmat.reshape(3, 3)[:, 2]
     fist = data.geom("fist").xpos + 0.05 * into
-    assert contact.gap == pytest.approx(float(into @ (data.geom("wall").xpos - fist)))
-    hand = data.body("hand")
-    point = hand.xmat.reshape(3, 3).T @ (fist - hand.xpos)
+    gap, point = float(into @ (data.geom("wall").xpos - fist)), axes.T @ (fist - place)
 
-    def moving(q, v):
-        return closing(m, q, v, into, point)
+    def closing(q, v):
+        """Speed along the normal of the point of the hand that is there now."""
+        place, axes = at(q, v)
+        jacobian = np.zeros((3, m.nv))
+        mujoco.mj_jac(m, data, jacobian, None, place + axes @ point, m.body("hand").id)
+        return float(into @ jacobian @ v)
 
-    speed = moving(qpos, qvel)
-    row = np.array([moving(qpos, unit) for unit in np.eye(m.nv)])
-    inertia = np.array([np.zeros(m.nv) for _ in range(m.nv)])
-    for column, unit in zip(inertia, np.eye(m.nv), strict=True):
-        mujoco.mj_mulM(m, data, column, unit)
-    mass = 1.0 / float(row @ np.linalg.solve(inertia, row))
-
+    speed, row = closing(qpos, qvel), np.array([closing(qpos, unit) for unit in np.eye(m.nv)])
+    given = np.zeros((1, m.nv))
+    mujoco.mj_solveM(m, data, given, row[None])
+    mass = 1.0 / float(row @ given[0])
     # The push: how fast the closing speed grows, in motion (by differences along it) and once it has stopped.
-    h = 1e-6
-    ahead = qpos.copy()
+    h, ahead = 1e-6, qpos.copy()
     mujoco.mj_integratePos(m, ahead, qvel, h)
-    growing = (moving(ahead, qvel + h * data.qacc_smooth) - speed) / h
-    data.qvel[:] = 0.0
-    mujoco.mj_forward(m, data)
-    resting = float(row @ data.qacc_smooth)
-    push, deep = mass * max(growing, resting, 0.0), max(-contact.gap, 0.0)
+    at(qpos, qvel)
+    growing = (closing(ahead, qvel + h * data.qacc_smooth) - speed) / h
+    at(qpos, 0.0 * qvel)
+    push, deep = mass * max(growing, float(row @ data.qacc_smooth), 0.0), max(-gap, 0.0)
+    constraint.place(qpos, qvel, control)
+    assert constraint.contact(0).gap == pytest.approx(gap)
     for k in (1e-6, 1e4, 1e9):  # the push decides, both, and the speed
         constraint.spec.stiffness = k
-        struck = max(speed, 0.0) * np.sqrt(k * mass)
-        expected = push + np.hypot(k * deep - push, struck)
+        expected = push + np.hypot(k * deep - push, max(speed, 0.0) * np.sqrt(k * mass))
         assert constraint.contact(0).peak == pytest.approx(expected, rel=1e-4, abs=1e-4)
+    at(qpos, 0.0 * qvel, 0.0)  # without the motors
     constraint.spec.stiffness = 1e-6
     constraint.place(qpos, qvel, None)
-    data.ctrl[:] = 0.0
-    mujoco.mj_forward(m, data)
-    resting = float(row @ data.qacc_smooth)  # without the motors
-    assert constraint.contact(0).peak >= 2.0 * mass * max(resting, 0.0) - 1e-6
+    assert constraint.contact(0).peak >= 2.0 * mass * max(float(row @ data.qacc_smooth), 0.0) - 1e-6
 
 
 def test_what_cannot_move_along_the_normal_is_not_pressed():
@@ -216,24 +201,22 @@ def test_nothing_that_touches_is_skipped():
     assert len(looked) < 0.5 * 60 * k * len(gaps.pairs)  # and most of what cannot touch is
 
 
+BOXES = """<mujoco><worldbody><geom name="a" type="box" size=".1 .05 .2"/>
+<body><freejoint/><geom name="b" type="box" size=".12 .04 .02"/></body></worldbody></mujoco>"""
+
+
 def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
     # MuJoCo alone says 0 of some that are far apart, up to 3.11; 3.12 has another algorithm for two boxes.
-    boxes = """<mujoco><worldbody><geom name="a" type="box" size=".1 .05 .2"/>
-    <body><freejoint/><geom name="b" type="box" size=".12 .04 .02"/></body></worldbody></mujoco>"""
-    env = Scene(boxes)
-    plant = bound(env)
-    m, data = plant.model, mujoco.MjData(plant.model)
+    env = Scene(BOXES)
+    plant, m, data = bound(env), env.model, mujoco.MjData(env.model)
     gaps, rng, wrong, apart = GeomGaps(plant, ["b"], ["a"]), np.random.default_rng(0), 0, 0
+    bounds = np.concatenate([m.geom_size[1], m.geom_size[0]])
     for _ in range(1000):
-        quat = rng.normal(size=4)
-        data.qpos[:] = [*rng.uniform(-0.4, 0.4, 3), *quat / np.linalg.norm(quat)]
+        data.qpos[:] = [*rng.uniform(-0.4, 0.4, 3), *rng.normal(size=4)]
         mujoco.mj_kinematics(m, data)
-        axes = [data.geom_xmat[g].reshape(3, 3) for g in (1, 0)]
-        sizes = np.concatenate([m.geom_size[1], m.geom_size[0]])
-        nearest = lsq_linear(
-            np.hstack([axes[0], -axes[1]]), data.geom_xpos[0] - data.geom_xpos[1], (-sizes, sizes), "bvls"
-        )
-        distance = np.linalg.norm(nearest.fun)
+        one, other = data.geom_xmat.reshape(2, 3, 3)
+        way = data.geom_xpos[0] - data.geom_xpos[1]
+        distance = np.linalg.norm(lsq_linear(np.hstack([other, -one]), way, (-bounds, bounds), "bvls").fun)
         if distance > 1e-4:  # the solver ends near 0 where they overlap
             apart += 1
             assert gaps.nearest(m, data, 0)[0] == pytest.approx(distance, abs=2e-7)

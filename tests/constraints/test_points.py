@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from judged_loops import slider
 from scenes import Scene
 
-import safe_wrappers as sw
 from safe_wrappers import constraints as of
 from safe_wrappers.envs import SPEED_LIMITS
 
@@ -77,11 +76,9 @@ def measured(direction, velocity):
 def velocities(v, u, timestep, substeps):
     """Of both bodies after each substep of a held control, shape (substeps, 2, 3), by hand."""
     t = timestep * np.arange(1, substeps + 1)
-    out = np.zeros((substeps, 2, 3))
-    out[:, 0] = v[:3]
-    out[:, 0, 0] += t * u[0] / WEIGHTS[0]
-    out[:, 1, 0] = v[3] + t * u[1] / WEIGHTS[1]
-    return out
+    still = 0.0 * t
+    first = np.stack([v[0] + t * u[0] / WEIGHTS[0], v[1] + still, v[2] + still], axis=1)
+    return np.stack([first, np.stack([v[3] + t * u[1] / WEIGHTS[1], still, still], axis=1)], axis=1)
 
 
 @given(
@@ -184,63 +181,19 @@ def test_every_bound_that_there_is_and_every_obstacle_counts_by_itself():
     env = Scene(ARM)
     env.data.qpos[:] = [0.4, -0.7, 0.2]
     mujoco.mj_forward(env.model, env.data)
-    (x, y, z), (p, q, r) = tip, bone = env.data.site("tip").xpos.copy(), env.data.geom("bone").xpos.copy()
+    both = np.array([env.data.site("tip").xpos, env.data.geom("bone").xpos])
 
     def left(**arguments):
         return asked(env, of.Workspace(sites=["tip"], geoms=["bone"], **arguments)).value()
 
-    np.testing.assert_allclose(left(low=[-1.0, None, None]), [x + 1.0, p + 1.0])
-    np.testing.assert_allclose(
-        left(low=[None, -1.0, None], high=[2.0, None, 3.0], radius=0.1),
-        np.array([y + 1.0, q + 1.0, 2.0 - x, 3.0 - z, 2.0 - p, 3.0 - r]) - 0.1,
-    )
-    disc, ball = of.Disc([0.1, 0.2], 0.05), of.Sphere([0.1, 0.2, 0.9], 0.05)
-    wall, block = (
-        of.Plane([0.0, 0.0, 0.5], [0.0, 3.0, 4.0]),
-        of.Box([9.0, 0.0, 0.0], [1.0, 99.0, 99.0]),
-    )
-    np.testing.assert_allclose(
-        left(keep_out=[disc, ball, wall, block], radius=0.01),
-        np.concatenate(
-            [
-                [np.hypot(a - 0.1, b - 0.2) - 0.05 for a, b in (tip[:2], bone[:2])],
-                [np.linalg.norm(each - [0.1, 0.2, 0.9]) - 0.05 for each in (tip, bone)],
-                [0.6 * each[1] + 0.8 * (each[2] - 0.5) for each in (tip, bone)],
-                [8.0 - x, 8.0 - p],
-            ]
-        )
-        - 0.01,
-    )
-
-
-# A robot that pitches: what its body does after the wheels have stopped is not up to the actuators ---------------
-
-PITCHING = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="9 9 .1"/>
-<body name="chassis" pos="0 0 .145"><freejoint/><geom type="box" size=".15 .12 .03" mass="2"/>
-<geom type="capsule" fromto="0 0 0 0 0 .45" size=".03" mass=".8"/>
-<geom type="sphere" pos=".13 0 -.1" size=".045" friction="0 0 0" mass=".05"/>
-<geom type="sphere" pos="-.13 0 -.1" size=".045" friction="0 0 0" mass=".05"/>
-<body pos="0 .15 -.05"><joint name="left" axis="0 1 0"/>
-<geom type="cylinder" size=".1 .02" euler="90 0 0" mass=".2"/></body>
-<body pos="0 -.15 -.05"><joint name="right" axis="0 1 0"/>
-<geom type="cylinder" size=".1 .02" euler="90 0 0" mass=".2"/></body>
-</body></worldbody><actuator><velocity joint="left" kv="1" ctrlrange="-12 12" forcerange="-.6 .6"/>
-<velocity joint="right" kv="1" ctrlrange="-12 12" forcerange="-.6 .6"/></actuator></mujoco>"""
-
-
-@pytest.mark.parametrize("action", [0.0, 12.0])
-def test_a_robot_parked_inside_the_margin_is_not_infeasible(action):
-    env = Scene(PITCHING, frame_skip=10)
-    env.reset()
-    for _ in range(40):
-        env.step(np.zeros(2))  # it settles on its springy contacts
-    env.start = env.data.qpos.copy(), env.data.qvel.copy()
-    limit = of.Workspace(
-        high=[float(env.data.body("chassis").xpos[0]) + 0.01, None, None], bodies=["chassis"], margin=0.02
-    )
-    filtered = sw.CBFActionFilter(env, [limit])
-    filtered.reset()
-    for _ in range(60):
-        info = filtered.step(np.full(2, action))[4]
-        assert not info["cbf/infeasible"] and not info["cbf/unsafe"]
-        assert info["cbf/margin"] > 0.0099
+    np.testing.assert_allclose(left(low=[-1.0, None, None]), both[:, 0] + 1.0)
+    expected = np.concatenate([both[:, 1] + 1.0, ([2.0, 3.0] - both[:, [0, 2]]).ravel()]) - 0.1
+    np.testing.assert_allclose(left(low=[None, -1.0, None], high=[2.0, None, 3.0], radius=0.1), expected)
+    obstacles = [
+        (of.Disc([0.1, 0.2], 0.05), np.linalg.norm(both[:, :2] - [0.1, 0.2], axis=1) - 0.05),
+        (of.Sphere([0.1, 0.2, 0.9], 0.05), np.linalg.norm(both - [0.1, 0.2, 0.9], axis=1) - 0.05),
+        (of.Plane([0.0, 0.0, 0.5], [0.0, 3.0, 4.0]), 0.6 * both[:, 1] + 0.8 * (both[:, 2] - 0.5)),
+        (of.Box([9.0, 0.0, 0.0], [1.0, 99.0, 99.0]), 8.0 - both[:, 0]),
+    ]
+    keep_out, distances = zip(*obstacles, strict=True)
+    np.testing.assert_allclose(left(keep_out=keep_out, radius=0.01), np.concatenate(distances) - 0.01)

@@ -95,8 +95,7 @@ def placed(env, at, velocity=(0.0, 0.0)):
 ENVS = {
     "clip known": (5.0, dict(velocity_clip=5.0), 1),
     "clip not known": (1.3, {}, 1),
-    "four physics steps": (5.0, dict(velocity_clip=5.0), 4),
-    "no clip": (None, {}, 4),
+    "four physics steps": (None, {}, 4),
 }
 
 
@@ -129,20 +128,6 @@ def test_from_every_safe_state_any_actions_stay_clear_in_mujoco(world, at, veloc
             assert limit.least >= limit.spec.margin - 1e-7
 
 
-@given(PLACES, SPEEDS, st.tuples(st.floats(-1, 1), st.floats(-0.8, 1)))
-def test_the_backup_loses_nothing_and_proposals_are_admitted_and_no_farther_away(world, at, velocity, asked):
-    limit = placed(world, at, velocity)
-    before, backup = limit.least, limit.backup()
-    assume(before >= limit.spec.margin + 1e-6)
-    asked = np.array(asked)
-    away = [float(np.linalg.norm(control - asked)) for control in limit.candidates(asked)]
-    assert all(limit.admits(control) for control in (*limit.candidates(asked), backup)) and len(away) == 2
-    assert away == sorted(away) and away[-1] <= np.linalg.norm(backup - asked) + 1e-12
-    world.unwrapped.step(backup)
-    limit.plant.observe()
-    assert limit.least >= before - 1e-9
-
-
 @pytest.mark.parametrize("options", [{"velocity_clip": 5.0}, {}])
 def test_a_hair_lost_to_rounding_is_no_reason_to_refuse_braking(options):
     limit = placed(filtered(**options), (2.0 - ROOM + 5e-8, -1.2), (0.0, 1.0))
@@ -165,7 +150,9 @@ def test_the_nearest_admitted_control_is_found():
         for _ in range(15):
             env.plant.observe()
             if not limit.admits(action) and rng.random() < 0.2:
-                best = limit.candidates(action)[0]
+                best, other = limit.candidates(action)
+                assert limit.admits(best) and limit.admits(other)
+                assert np.linalg.norm(best - action) <= np.linalg.norm(other - action)
                 distance = np.linalg.norm(grid - action, axis=1)
                 order = np.argsort(distance)
                 found = next(k for k in order if limit.admits(grid[k]))

@@ -8,23 +8,13 @@ from hypothesis.extra.numpy import arrays
 
 from safe_wrappers.control.barriers import (
     manipulability,
-    numerical_gradient,
     relative_degree,
     validated_threshold,
     worst_joint_rates,
 )
 from safe_wrappers.errors import ConfigurationError
 
-
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_numerical_gradient(scale):
-    x, y, z = at = np.array([0.3, -0.7, 1.2])
-    h = lambda v: 2.0 - v[0] ** 2 - v[0] * v[1] - 0.5 * v[1] ** 2 + np.sin(v[2])  # noqa: E731
-    found = numerical_gradient(lambda v: h(v / scale), scale * at)
-    np.testing.assert_allclose(scale * found, [-2 * x - y, -x - y, np.cos(z)], rtol=1e-5, atol=1e-8)
-
-
-SIZES = [1e-12, 1e-9, 1e-3, 1.0, 1e3, 1e9, 1e12]
+SIZES = [1e-12, 1e-3, 1.0, 1e9]
 
 
 @pytest.mark.parametrize("scale", SIZES)

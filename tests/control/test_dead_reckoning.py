@@ -68,7 +68,7 @@ def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
     np.testing.assert_allclose(to_sensor(points[2], rotation, origin), seen[2], atol=1e-14)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_mujocos_readings_lead_to_mujocos_motion(seed):
     """Thrown, and pushed anew every 0.2 s; the readings are MuJoCo's alone."""
     model = mujoco.MjModel.from_xml_string(THROWN)
@@ -85,19 +85,16 @@ def test_mujocos_readings_lead_to_mujocos_motion(seed):
     for k in range(400):
         if k % 40 == 0:
             data.xfrc_applied[1] = rng.normal(size=6) * [3, 3, 3, 0.1, 0.1, 0.1]
-        readings, axes = [], []
-        for physics_step in range(EVERY + 1):
-            if physics_step:
-                mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        readings, axes = [data.sensordata[:6].copy()], [data.site_xmat[0].reshape(3, 3).copy()]
+        for _ in range(EVERY):
+            mujoco.mj_step(model, data)
             mujoco.mj_forward(model, data)
             readings.append(data.sensordata[:6].copy())
             axes.append(data.site_xmat[0].reshape(3, 3).copy())
-        readings, axes = np.array(readings), np.array(axes)
-        turned = Rotation.identity()
-        for rate in (
-            0.5 * (readings[1:] + readings[:-1])[:, 3:]
-        ):  # what the unit integrates, from its gyroscope alone
-            turned = turned * Rotation.from_rotvec(step_s * rate)
+        readings, turned = np.array(readings), Rotation.identity()
+        for rate in 0.5 * (readings[1:] + readings[:-1])[:, 3:]:
+            turned = turned * Rotation.from_rotvec(step_s * rate)  # as the unit does from its gyroscope alone
         in_world = np.einsum("kij,kj->ki", axes, readings[:, :3])
         middle = axes[0] @ Rotation.from_rotvec(0.5 * turned.as_rotvec()).as_matrix()
         force = (0.5 * (in_world[1:] + in_world[:-1])).mean(axis=0) @ middle
@@ -113,23 +110,3 @@ def test_mujocos_readings_lead_to_mujocos_motion(seed):
     assert np.linalg.norm(without.position - data.qpos[:3]) > 0.5
     assert np.linalg.norm(without.velocity - data.qvel[:3]) > 0.1
     assert (without.orientation.inv() * end).magnitude() < 1e-4
-
-
-def test_it_takes_the_rate_between_two_readings_for_the_parabola_with_their_mean():
-    """A unit that spins up as w = 3 s - 2 s^2 within one interval: only its arm moves."""
-    arm, time_s = np.array([0.5, 0.0, 0.0]), 0.2
-    s = np.linspace(0.0, 1.0, 2001)
-    rate = 3.0 * s - 2.0 * s * s
-    angle = time_s * (1.5 * s**2 - 2.0 / 3.0 * s**3)
-    alpha = (3.0 - 4.0 * s) / time_s
-    outwards = np.stack([np.cos(angle), np.sin(angle), 0 * s], axis=1)
-    sideways = np.stack([-np.sin(angle), np.cos(angle), 0 * s], axis=1)
-    acceleration = 0.5 * (alpha[:, None] * sideways - (rate**2)[:, None] * outwards)
-    mean = np.trapezoid(acceleration, s, axis=0)
-    reckoning = DeadReckoning(rigid_transform(np.eye(3), arm), np.zeros(3))
-    reckoning.fix(np.zeros(3), np.zeros(3), Rotation.identity(), np.zeros(3))
-    middle = Rotation.from_rotvec([0, 0, 0.5 * angle[-1]])
-    turn, end = np.array([0, 0, angle[-1]]), np.array([0, 0, rate[-1]])
-    reckoning.advance(middle.apply(mean, inverse=True), turn, end, time_s)
-    np.testing.assert_allclose(reckoning.velocity, 0.0, atol=1e-4)
-    assert np.linalg.norm(time_s * mean) > 0.4

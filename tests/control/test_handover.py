@@ -1,6 +1,5 @@
-"""Blends: every length by brute force, curves and peaks by SciPy's splines, the shortest one in exact fractions."""
+"""Blends: curves and peaks by SciPy's splines, the shortest one in exact fractions (streams: ChunkHandover's)."""
 
-import math
 from fractions import Fraction
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicHermiteSpline
-from slow_handover import Slow, smooth
 
 from safe_wrappers.control.handover import (
     SMOOTHSTEP_PEAKS,
@@ -43,52 +41,6 @@ def test_the_shortest_blend_of_latched_commands_keeps_the_limit_and_no_shorter_o
     assert needed <= found <= needed * (1 + Fraction(1e-10))
 
 
-@st.composite
-def seams(draw):
-    """Random streams; numbers from a generator, so that ties are accidents."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    m = draw(st.integers(1, 3))
-    sent = rng.uniform(-1, 1, (draw(st.integers(1, 5)), m))
-    prior = rng.uniform(-1, 1, (draw(st.integers(0, 8)), m))
-    new = rng.uniform(-1, 1, (draw(st.integers(1, 9)), m))
-    if draw(st.booleans()):  # streams that move slowly, with one jump between them
-        sent, prior, new = (np.cumsum(0.05 * x, axis=0) for x in (sent, prior, new))
-        new = new + draw(st.floats(-1, 1))
-    fewest = draw(st.integers(0, 9))
-    step = draw(st.one_of(st.just(math.inf), st.floats(1e-3, 2.0)))
-    return sent, prior, new, fewest, step
-
-
-@given(seams())
-def test_the_shortest_blend_that_keeps_the_limit_by_brute_force(drawn):
-    sent, prior, new, fewest, step = drawn
-    slow = Slow(1.0, fewest, step, sent=list(sent))
-    wanted = slow.shortest(list(prior), list(new))
-    assume(not slow.close_calls)
-    plan, steps = join(sent, prior, new, step, fewest)
-    assert steps == wanted[0]
-    np.testing.assert_allclose(plan, np.array(wanted[1]), atol=1e-12)
-    assert plan.shape == new.shape and plan[steps:].tobytes() == new[steps:].tobytes()
-
-
-def test_nothing_to_blend_where_nothing_was_sent():
-    new = np.array([[3.0], [3.2], [3.1]])
-    plan, steps = join(np.zeros((0, 1)), np.zeros((0, 1)), new, 0.1, fewest=2)
-    assert steps == 0 and plan.tobytes() == new.tobytes()
-    # A step that is too large is blended, also where the next one is worse.
-    assert join(np.array([[-0.25]]), np.zeros((0, 1)), np.array([[0.25], [5.0]]), 0.1)[1] == 1
-
-
-def test_a_left_over_is_never_padded():
-    """Three commands left: a blend of three moves along them, one of four starts from the last command."""
-    sent, prior, new = np.array([[0.0]]), np.array([[0.1], [0.2], [0.3]]), np.full((8, 1), 2.0)
-    three, _ = join(sent, prior, new, fewest=3)
-    alpha = np.array([smooth(i / 4) for i in (1, 2, 3)])
-    np.testing.assert_allclose(three[:3, 0], (1 - alpha) * [0.1, 0.2, 0.3] + alpha * 2.0, atol=1e-15)
-    four, _ = join(sent, prior, new, fewest=4)
-    np.testing.assert_allclose(four[:4, 0], [2.0 * smooth(i / 5) for i in (1, 2, 3, 4)], atol=1e-15)
-
-
 # By quintics ------------------------------------------------------------------------------------------------------
 
 
@@ -118,8 +70,9 @@ def test_without_a_bridge_that_keeps_the_step_there_is_none():
 
 @st.composite
 def streams(draw):
-    sent, _, new, *_ = draw(seams())
-    assume(len(new) > 1)
+    """What was sent, what is new, and where to join it; numbers from a generator, so that ties are accidents."""
+    rng, m = np.random.default_rng(draw(st.integers(0, 2**32 - 1))), draw(st.integers(1, 3))
+    sent, new = (rng.uniform(-1, 1, (draw(st.integers(*sizes)), m)) for sizes in ((1, 5), (2, 9)))
     return sent, new, draw(st.integers(0, len(new) - 1))
 
 

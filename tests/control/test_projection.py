@@ -54,7 +54,7 @@ def problems(draw):
     return nominal, normals, offsets, lower, np.where(open_ended, np.inf, upper)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(problems(), SCALES, st.booleans())
 def test_it_is_the_closest_admissible_control_or_violates_least_in_any_unit(problem, scale, in_the_rows):
     u, normals, offsets, lower, upper = problem
@@ -280,16 +280,6 @@ def test_daqp_is_not_believed(monkeypatch, lie, lies):
         np.testing.assert_allclose(answer.control, truth.control, atol=1e-8)
     after = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)  # and the next call knows nothing of it
     assert truth.status == "projected" and after.control.tobytes() == truth.control.tobytes()
-
-
-def test_an_infeasible_solve_does_not_poison_the_next_and_arguments_are_not_written_to():
-    arguments = [NOMINAL.copy(), NORMALS.copy(), OFFSETS.copy(), -np.ones(2), np.ones(2)]
-    expected = project(*arguments)
-    for _ in range(3):
-        assert project(NOMINAL, NORMALS, [-9.0, -9.0], -1.0, 1.0).status == "infeasible"
-        assert project(*arguments).control.tobytes() == expected.control.tobytes()
-    for array, kept in zip(arguments, (NOMINAL, NORMALS, OFFSETS, -np.ones(2), np.ones(2)), strict=True):
-        np.testing.assert_array_equal(array, kept)
 
 
 @given(st.integers(0, 6), st.integers(0, 6), SEEDS, SCALES)

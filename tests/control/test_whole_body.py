@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import daqp
 import numpy as np
 import pytest
 import qpsolvers
@@ -37,22 +36,6 @@ def nearest(point, **parts):
     none, zero = np.zeros((0, n)), np.zeros(0)
     fields = {"equal": none, "values": zero, "rows": none, "limits": zero, "cones": np.zeros((0, 3, n))}
     return Program(np.ones(n), -np.array(point), **(fields | parts))
-
-
-@given(st.integers(0, 300))
-def test_another_solver_of_another_kind_has_the_same_answer(seed):
-    rng = np.random.default_rng(seed)
-    n, k = int(rng.integers(2, 7)), int(rng.integers(0, 9))
-    inside, weights = rng.uniform(-0.5, 0.5, n), rng.uniform(0.1, 3.0, n)
-    rows, equal = rng.normal(size=(k, n)), rng.normal(size=(1, n))
-    limits, values = rows @ inside + rng.uniform(0.0, 0.5, k), equal @ inside
-    linear = rng.normal(size=n)
-    program = Program(weights, linear, equal, values, rows, limits, np.zeros((0, 3, n)))
-    above, below = np.concatenate([values, limits]), np.concatenate([values, np.full(k, -1e30)])
-    senses = np.array([5] + [0] * k, dtype=np.int32)  # the first is an equality
-    other, _, flag, _ = daqp.solve(np.diag(weights), linear, np.vstack([equal, rows]), above, below, senses)
-    assert flag > 0
-    np.testing.assert_allclose(by_clarabel(program), other, atol=1e-6)
 
 
 ROWS, LIMITS = np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0])
@@ -258,15 +241,12 @@ def test_a_contact_that_opens_gives_no_force_and_moves_away(solve):
 @by_both
 def test_a_frictionless_contact_holds_along_its_normal_alone(solve):
     found = solve(foot([4.0, 0.0, -1.0], friction=0.0))
-    assert found.status == "inactive"
+    assert found.status == "inactive" and found.contact_error < 1e-12
     assert found.forces[0] == pytest.approx([0.0, 0.0, 20.62])
     assert found.acceleration == pytest.approx([2.0, 0.0, 0.0])
-    assert found.contact_error < 1e-12
-    pulled = foot([0.0, 0.0, 25.0], friction=0.0)
-    found = solve(pulled)
-    assert found.status == "projected"
-    assert found.control == pytest.approx([0.0, 0.0, 19.62], abs=1e-5)
-    assert found.forces[0, 2] >= -1e-6
+    pulled = solve(foot([0.0, 0.0, 25.0], friction=0.0))
+    assert pulled.status == "projected" and pulled.forces[0, 2] >= -1e-6
+    assert pulled.control == pytest.approx([0.0, 0.0, 19.62], abs=1e-5)
 
 
 @pytest.mark.parametrize("lie", ["zeros", "huge", "nothing", "claims infeasible"])

@@ -10,11 +10,15 @@ import daqp
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 import safe_wrappers as sw
 from safe_wrappers.filter import engine
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.filter.fallback import Fallback
+from safe_wrappers.filter.linearize import Tangents, differences
 from safe_wrappers.filter.search import SafeActionSearch, Stage
 
 LAST = np.zeros(2)
@@ -208,13 +212,8 @@ def test_the_first_stage_that_finds_an_admitted_control_answers(first):
 
 
 def test_an_admitted_proposal_is_executed_bit_for_bit():
-    proposal = np.array([0.1, -0.2])
-    decision = search(Predicting(lambda u: 1.0), LEFT, Rows(((1.0, 1.0), 1.0))).decide(proposal, LAST)
-    keeps(decision, 0.0, -0.2)
-    assert decision.stage is Stage.ROWS
-    proposal = np.array([-0.1, -0.2])
-    decision = search(Predicting(lambda u: 1.0), LEFT, Rows(((1.0, 1.0), 1.0))).decide(proposal, LAST)
-    np.testing.assert_array_equal(decision.control, proposal)
+    decision = decide((-0.1, -0.2), Predicting(lambda u: 1.0), LEFT, Rows(((1.0, 1.0), 1.0)))
+    np.testing.assert_array_equal(decision.control, [-0.1, -0.2])
     assert decision.stage is Stage.PROPOSAL and not decision.changed and decision.refused is None
 
 
@@ -263,11 +262,11 @@ def creeping(slack):
 
 @pytest.mark.parametrize("steps", [1, 5, 6, 7])
 def test_a_refused_control_is_linearised_up_to_six_times(steps):
-    found, made = search(creeping(lambda u: 1.0001 - 0.1 * steps - u[0])), min(steps, 6)
-    admitted, control, rows = found.relinearize(np.ones(2), np.ones(2), NONE, NONE)
-    assert admitted == (steps <= 6) and len(rows[1]) == made
-    np.testing.assert_allclose(control, [1.0 - 0.1 * made, 1.0])
-    assert found.decide(np.ones(2), LAST).infeasible != admitted
+    decision = decide((1.0, 1.0), creeping(lambda u: 1.0001 - 0.1 * steps - u[0]))
+    assert decision.infeasible == (steps > 6)
+    if steps <= 6:
+        assert decision.stage is Stage.RELINEARIZED
+        keeps(decision, 1.0 - 0.1 * steps, 1.0)
 
 
 def test_provisional_tangents_give_way_to_the_next_ones():
@@ -277,12 +276,9 @@ def test_provisional_tangents_give_way_to_the_next_ones():
         def linearize(self, control):
             return sw.HalfSpaces(np.array([[1.0, 0.0]]), np.array([next(limits)]), next(provisional))
 
-    admitted, control, rows = search(Guessing(only((0.6, 1.0)))).relinearize(
-        np.ones(2), np.ones(2), NONE, NONE
-    )
-    assert admitted
-    np.testing.assert_allclose(control, [0.6, 1.0])
-    np.testing.assert_allclose(rows[1], [0.9, 0.6])
+    decision = decide((1.0, 1.0), Guessing(only((0.6, 1.0))))
+    assert decision.stage is Stage.RELINEARIZED
+    keeps(decision, 0.6, 1.0)
 
 
 # Shortening -------------------------------------------------------------------------------------------------------
@@ -307,18 +303,11 @@ def test_more_of_a_correction_that_contradicts_the_rows_is_no_overshoot():
 # The least violation of "at most 0" and "at least 0.5" is 0.25. A prediction that asks for 0.2 would let it through.
 
 
-def contradicting(asked):
-    return Predicting(lambda u: u[0] - 0.2, tangents=lambda u: at_least(next(asked)))
-
-
 @pytest.mark.parametrize("before", [0, 2, 5])
 def test_tangents_against_rows_let_nothing_through_that_breaks_the_rows(before):
-    asked = [0.1] * before + [0.5] * 9
-    least = search(contradicting(iter(asked)), LEFT)
-    admitted, control, _ = least.relinearize(np.zeros(2), np.zeros(2), STRICT, STRICT)
-    assert control[0] == pytest.approx(0.25, abs=0.03)
-    assert not admitted
-    decision = decide((0.0, 0.0), contradicting(iter(asked)), LEFT, fallback="zero")
+    asked = iter([0.1] * before + [0.5] * 9)
+    contradicting = Predicting(lambda u: u[0] - 0.2, tangents=lambda u: at_least(next(asked)))
+    decision = decide((0.0, 0.0), contradicting, LEFT, fallback="zero")
     assert decision.stage is Stage.FALLBACK and decision.infeasible and decision.fallback
     keeps(decision, 0.0, 0.0)
 
@@ -478,3 +467,66 @@ def test_a_fallback_in_place_of_a_proposal_is_filtered_like_one():
     assert decision.refused is None and not decision.infeasible
     # A state that is not a number says nothing about any control: then it is not.
     keeps(found.unreadable(LAST), 0.7, 0.3)
+
+
+# Tangents: by differences, and by secants that explain what was seen ----------------------------------------------
+
+NUMBERS = st.floats(-3.0, 3.0)
+
+
+def tangents(slacks, made=None, rows=None):
+    """Of slacks of two controls; `made` counts the differences, of which the first `rows` are given."""
+
+    def slopes(control):
+        if made is not None:
+            made.append(control)
+        return differences(slacks, control, -np.ones(2), np.ones(2))[:rows]
+
+    return Tangents(slacks, slopes)
+
+
+def curved(u):
+    return np.array([-1.0 - u[0] ** 2, -2.0 + u[0] * u[1]])
+
+
+def test_after_two_secants_differences_are_made_anew_and_not_five_times_nor_for_the_same_control():
+    made, rng = [], np.random.default_rng(0)
+    found = tangents(curved, made)
+    rows = [found.about(u) for u in rng.uniform(-1.0, 1.0, (14, 2))]
+    assert [r.provisional for r in rows[:12]] == [False, True, True] * 4
+    assert len(made) == 4 and not rows[12].offsets.size and not rows[13].offsets.size
+    again = tangents(curved)
+    assert [again.about(np.array([0.1, 0.2])).offsets.size for _ in range(2)] == [2, 0]
+
+
+@given(first=arrays(float, 2, elements=NUMBERS), second=arrays(float, 2, elements=NUMBERS))
+def test_a_secant_explains_the_change_and_leaves_other_directions_alone(first, second):
+    step = second - first
+    assume(np.linalg.norm(step) > 1e-2)
+    found = tangents(curved)
+    before, after = -found.about(first).normals, -found.about(second).normals
+    np.testing.assert_allclose(after @ step, curved(second) - curved(first), atol=1e-9)
+    np.testing.assert_allclose((after - before) @ [-step[1], step[0]], 0.0, atol=1e-9)
+
+
+def test_the_rows_pass_a_little_inside_of_where_the_slopes_say():
+    found = tangents(lambda u: 3.0 * u - 1.0)
+    for u, share in (([0.2, -0.3], 0.01), ([-0.9, -0.8], 0.1)):  # by differences, and by a secant
+        rows = found.about(np.array(u))
+        np.testing.assert_allclose(rows.normals, -3.0 * np.eye(2), atol=1e-9)
+        np.testing.assert_allclose(rows.offsets, -1.0 - share * (1.0 - 3.0 * np.array(u)), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("slacks", "rows", "other"),
+    [
+        (lambda u: np.array([-1.0 if u[0] < 0.5 else -np.inf, -1.0]), None, 0.6),
+        (lambda u: np.array([0.2 - u[0], u[0] - 0.7]), 1, 0.1),  # the slopes of the second are not asked for
+    ],
+)
+def test_secants_that_say_nothing_are_differences_again(slacks, rows, other):
+    made = []
+    found = tangents(slacks, made, rows)
+    with np.errstate(invalid="ignore"):
+        provisional = [found.about(np.array([u, 0.0])).provisional for u in (0.3, other)]
+    assert len(made) == 2 and not any(provisional)
