@@ -18,11 +18,7 @@ ENVS = (
 ROBOTICS = ("FetchPush-v4", "PointMaze_UMaze-v3", "AntMaze_UMaze-v5", "HandReach-v3", "AdroitHandDoor-v1")
 CHANGES = {
     "gravity": lambda m: m.opt.gravity.__imul__(0.4),
-    "mass": lambda m: (
-        m.body_mass.__imul__(1.3),
-        m.body_inertia.__imul__(1.3),
-        mujoco.mj_setConst(m, mujoco.MjData(m)),
-    ),
+    "mass": lambda m: (m.body_mass.__imul__(1.3), m.body_inertia.__imul__(1.3)),
     "damping": lambda m: m.dof_damping.__imul__(1.3),
     "friction": lambda m: m.geom_friction.__imul__(0.5),
     "gear": lambda m: m.actuator_gear.__imul__(1.5),
