@@ -216,4 +216,5 @@ def test_a_spring_that_servos_share_out_among_all_vibrations_is_one():
     check = rigid_model_check(env)  # no vibration has half of its energy in the spring
     assert check.resonances and not check.rigid_is_good_enough
     env.model.jnt_stiffness[:] = 0.0
-    assert not rigid_model_check(env).resonances
+    check = rigid_model_check(env)
+    assert not check.resonances and check.boundary_layer_s == 0.0 and check.rigid_is_good_enough

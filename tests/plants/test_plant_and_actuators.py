@@ -1,4 +1,4 @@
-"""MujocoPlant: f and g against MuJoCo itself, actuators of every kind, points."""
+"""MujocoPlant: f and g against MuJoCo itself, actuators of every kind, points, its own model."""
 
 import gymnasium as gym
 import mujoco
@@ -7,7 +7,8 @@ import pytest
 from asking import bound
 from scenes import Legs, Scene
 
-from safe_wrappers.errors import UnsupportedEnvError
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 
 ENVS = ("InvertedDoublePendulum-v5", "Pusher-v5", "Swimmer-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5")
@@ -208,6 +209,36 @@ def test_a_model_whose_forces_are_others_than_its_actuators_is_refused(says):
     SPOILT[says](env.model)
     with pytest.raises(UnsupportedEnvError, match=says):
         bound(env)
+
+
+# Its own model ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("perturbed", [False, True])
+def test_a_plant_that_is_declared_to_be_another_says_so_once_and_leaves_the_env_as_it_is(perturbed):
+    heavier = gym.make("Hopper-v5").unwrapped.model
+    heavier.body_mass[:] *= 1.1
+    plant = sw.MujocoPlant(model=None if perturbed else heavier)
+    if perturbed:
+        plant.perturb(mass=1.1, damping=0.5)
+    env = sw.CBFActionFilter(gym.make("Hopper-v5"), [sw.constraints.SpeedLimit(9.0)], plant=plant)
+    own = gym.make("Hopper-v5").unwrapped.model
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match=r"model is not the env's: they differ in .*body_mass") as caught:
+        infos = [env.step(np.zeros(3, np.float32))[4] for _ in range(5)]
+    assert len(caught) == 1 and all(info["cbf/mismatch"] for info in infos)
+    for name, factor in (("body_mass", 1.1), ("dof_damping", 0.5 if perturbed else 1.0)):
+        np.testing.assert_array_equal(getattr(own, name), getattr(env.unwrapped.model, name))
+        np.testing.assert_allclose(getattr(plant.model, name), factor * getattr(own, name))
+    effect = plant.acceleration[1].copy()
+    plant.perturb(mass=2.0)  # now, as it has a model already
+    for wrong in ({"mass": 0.0}, {"damping": -0.1}):
+        with pytest.raises(ConfigurationError, match="factors must be positive"):
+            plant.perturb(**wrong)
+    plant.observe()
+    if perturbed:
+        np.testing.assert_allclose(plant.model.body_subtreemass, 2.2 * own.body_subtreemass)
+        assert not np.allclose(plant.acceleration[1], effect)
 
 
 def test_the_world_mocap_bodies_and_what_is_welded_to_either_are_fixed_and_no_weight():
