@@ -87,18 +87,8 @@ TASKS = (
 )
 METRICS = ("return", "return_decile", "cost", "violations", "stuck", "infeasible", "intervention_rate")
 COLUMNS = (
-    "task",
-    "algorithm",
-    "control_steps",
-    "action_repeat",
-    "arm",
-    "seed",
-    "condition",
-    "episodes",
-    "steps",
-    *METRICS,
-    "versions",
-    "commit",
+    *("task", "algorithm", "control_steps", "action_repeat", "arm", "seed", "condition", "episodes", "steps"),
+    *(*METRICS, "versions", "commit"),
 )
 KEY = ("task", "algorithm", "control_steps", "action_repeat", "arm", "seed", "condition")
 ARMS = ("unfiltered", "filtered", "lagrangian")
