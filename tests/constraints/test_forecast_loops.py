@@ -20,14 +20,13 @@ from judged_loops import (
     manipulability,
     noisy,
     seeking,
-    slider,
     table,
 )
 
 import safe_wrappers as sw
 from safe_wrappers import constraints as of
 
-ANY = (at_random, bang_bang, seeking)
+ANY = (bang_bang, seeking)
 
 
 class Loop(NamedTuple):
@@ -106,12 +105,6 @@ LOOPS = {
         in_range([0, 1], -1.5, 1.5),
         most_flagged=0.4,
         deepest=1e-3,
-    ),
-    "speed of a slider": Loop(
-        lambda: slider(10.0),
-        [of.SpeedLimit(0.8, "b0", "x", "substep")],
-        below_speed([0], 0.8),
-        used=0.02,
     ),
     "a box on Reacher": Loop(
         task("Reacher-v5"),
