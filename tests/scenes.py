@@ -34,3 +34,32 @@ class Scene(gym.Env):
         self.data.ctrl[:] = action
         mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
         return np.zeros(1), 0.0, False, False, {}
+
+
+class Legs(Scene):
+    """A trunk on two driven legs beside other things that move; the action is the control."""
+
+    XML = """<mujoco><option timestep="0.002" integrator="{integrator}" cone="{cone}"/>
+    <default><geom condim="{condim}" friction="0.6 0.01 0.002"/></default>
+    <worldbody>
+      <geom name="floor" type="plane" size="5 5 .1"/>
+      <body name="step" pos=".35 0 0"><geom name="step" type="box" size=".1 .3 .06"/></body>
+      <body name="lift" mocap="true" pos="-.35 0 0"><geom name="lift" type="box" size=".1 .3 .05"/></body>
+      <body name="trunk" pos="0 0 .42"><freejoint/>
+        <geom name="trunk" type="box" size=".3 .1 .05" mass="4"/>
+        <body name="front" pos=".3 0 0"><joint name="hip" axis="0 1 0" range="-40 40" damping=".5"/>
+          <geom name="front" type="capsule" fromto="0 0 0 0 0 -.3" size=".05" mass=".6"/></body>
+        <body name="back" pos="-.3 0 0"><joint name="tail" axis="0 1 0" range="-40 40" damping=".5"/>
+          <geom name="back" type="capsule" fromto="0 0 0 0 0 -.3" size=".05" mass=".6"/></body>
+      </body>
+      <body name="load" pos="0 0 .55"><freejoint/><geom name="load" type="box" size=".1 .1 .06" mass="1"/></body>
+      {more}
+    </worldbody>
+    <actuator><motor name="hip" joint="hip" gear="40" ctrllimited="true" ctrlrange="-1 1"/>
+      <motor name="tail" joint="tail" gear="40" ctrllimited="true" ctrlrange="-1 1"/>{act}</actuator>
+    {end}</mujoco>"""
+
+    def __init__(self, integrator="Euler", cone="pyramidal", condim=3, more="", act="", end=""):
+        super().__init__(
+            self.XML.format(integrator=integrator, cone=cone, condim=condim, more=more, act=act, end=end)
+        )

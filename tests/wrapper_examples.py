@@ -139,23 +139,15 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
                 "weight": 0.1,
             },
         ),
-        "some bodies, and nothing added to the observation": (
-            TASK,
-            lambda: {
-                "tracks": [sw.occlusion.Track("hazard[0-3]", acceleration_noise=0.1)],
-                "sensor": {"site": "agent", "position_std": 0.1},
-                "tolerance": 0.3,
-                "sigmas": 2.0,
-                "observe": False,
-            },
-        ),
-        "bodies in space": (
+        "bodies in space, and nothing added to the observation": (
             "HalfCheetah-v5",
             lambda: {
                 "tracks": [sw.occlusion.Track("?foot", acceleration_noise=100.0)],
-                "sensor": sw.occlusion.Sensor("track", velocity_std=0.1),
+                "sensor": {"camera": "track", "position_std": 0.1, "velocity_std": 0.1},
                 "tolerance": 0.1,
+                "sigmas": 2.0,
                 "axes": "xyz",
+                "observe": False,
             },
         ),
     },

@@ -12,7 +12,7 @@ FILES = [path for folder in ("safe_wrappers", "envs", "train") for path in (ROOT
 
 def compared(text):
     """Comparisons, and tuples and sets that are kept to be searched in, with a member as it is."""
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(ast.parse(text if "mjt" in text else "")):
         kept = isinstance(node, ast.Assign) and isinstance(node.value, ast.Set | ast.Tuple)
         if kept or isinstance(node, ast.Compare):
             left, calls = ast.unparse(node), 1

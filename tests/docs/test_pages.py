@@ -1,15 +1,22 @@
-"""Every page's code runs and prints what the page says, what it promises holds, and every link leads somewhere."""
+"""Every page's code runs and prints what it says, what it promises holds, and the site is whole by itself."""
 
+import html
+import inspect
+import os
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from unittest import mock
+from urllib.parse import unquote, urlsplit
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import safe_wrappers as sw
+from safe_wrappers import info as interventions
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -110,3 +117,62 @@ def test_the_limit_of_the_first_example_holds(driver, page, until, limit):
     speeds, flagged = drive(filtered, driver)
     assert speeds.max() <= limit and flagged == 0 and len(speeds) == 200
     assert (drive(free, driver)[0] > limit).sum() > 20
+
+
+# The built site and its pictures: complete, without warnings, and nothing in them comes from elsewhere --------------
+
+LOADED = r"<(?:script|img|iframe|source)\b[^>]*\ssrc=\"([^\"]+)\"|<link\b[^>]*\shref=\"([^\"]+)\""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    for needed in ("sphinx", "furo", "myst_parser", "latex2mathml", "matplotlib", "stable_baselines3"):
+        pytest.importorskip(needed)
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-b", "html", "-E", "-W", "--keep-going", "-q", DOCS, folder],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "MUJOCO_GL": "disabled"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert all("compiling for this machine" in line for line in done.stderr.splitlines()), done.stderr
+    return folder, {path: path.read_text(encoding="utf-8") for path in folder.rglob("*.html")}
+
+
+@pytest.mark.slow
+def test_nothing_is_loaded_from_elsewhere(site):
+    folder, pages = site
+    for path, page in pages.items():
+        for address in (html.unescape(a or b) for a, b in re.findall(LOADED, page)):
+            assert not urlsplit(address).scheme and not address.startswith("//"), (path, address)
+            assert (path.parent / unquote(urlsplit(address).path)).exists(), (path, address)
+    for sheet in folder.rglob("*.css"):
+        text = sheet.read_text(encoding="utf-8")
+        assert "@import" not in text and "url(http" not in text and "url(//" not in text, sheet
+
+
+@pytest.mark.slow
+def test_every_info_key_and_every_public_name_is_explained(site):
+    folder, pages = site
+    constants = {k: v for k, v in vars(interventions).items() if k.isupper() and isinstance(v, str)}
+    keys = {v for k, v in constants.items() if not k.endswith("PREFIX")}
+    assert {key for key in keys if f">{key}<" not in pages[folder / "info.html"]} == set()
+    things = {name: getattr(sw, name) for name in sw.__all__}
+    for topic in filter(inspect.ismodule, [*things.values()]):
+        things |= {name: getattr(topic, name) for name in topic.__all__}
+    documented = {
+        name for page in pages.values() for name in re.findall(r'id="safe_wrappers\.(?:\w+\.)*(\w+)"', page)
+    }
+    assert {name for name, thing in things.items() if callable(thing)} - documented == set()
+
+
+def test_every_picture_is_shown_and_every_shown_picture_exists():
+    pytest.importorskip("matplotlib")
+    drawing = runpy.run_path(str(DOCS / "figures" / "draw.py"))
+    shown = {
+        name
+        for page in DOCS.rglob("*.md")
+        for name in re.findall(r"^```\{drawn\} (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert set(drawing["names"]()) == shown

@@ -85,7 +85,7 @@ def of_crossing(env):
     def touching(qpos):
         return np.hypot(qpos[3:9] - qpos[0], lanes - qpos[1]) <= 0.6
 
-    was = touching(env.data.qpos)
+    was = np.zeros(6, dtype=bool)
 
     def judge(states, action):
         nonlocal was
@@ -141,6 +141,19 @@ DRIVES = {
 }  # fmt: skip
 
 
+STARTS = {
+    "SafePointGoal1-v0": {"agent": [0, 0, 0], "hazards": [[0.1, 0.0]], "vases": [[0.22, 0.0]]},
+    "SafePointGoal2-v0": {
+        "agent": [0, 0, 0],
+        "hazards": [],
+        "vases": [[0.22, 0.0]],
+    },  # the nose's tip is at 0.15
+    "OccludedCrossing-v0": {"agent": [0.0, -0.8, 0.0], "cars": [[-0.3, 1.0], [0.3, 1.0], *[[60.0, 0.0]] * 4]},
+    "SafeRover-v0": {"agent": [1, 1, 0], "hazards": [[1.2, 1.0]], "speed": 2.0},
+}
+"""Starts that cost, which reset says."""
+
+
 @pytest.mark.parametrize("env_id", DRIVES)
 def test_costs_count_every_substep(env_id, monkeypatch):
     drive, env = DRIVES[env_id], gym.make(env_id).unwrapped
@@ -151,49 +164,39 @@ def test_costs_count_every_substep(env_id, monkeypatch):
         starts.append((data.qpos.copy(), data.qvel.copy()))
         original(model, data, *more)
 
+    def begin(seed, layout):
+        """Resets, and judges the start; returns the judge."""
+        info = env.reset(seed=seed, options={"layout": layout} if layout else {})[1]
+        judge = drive.judge(env)
+        violated = check(info, *judge([(env.data.qpos, env.data.qvel)], np.zeros(env.action_space.shape)))
+        return judge, any(violated)
+
+    def check(info, violated, expected):
+        expected = {"cost": any(violated), "cost_substep": any(violated)} | expected
+        for key, value in expected.items():
+            assert info[key] == pytest.approx(float(value), rel=1e-9, abs=1e-12), key
+        assert info.get("spin_out") == (float(info["slip_max"] > 0.5) if "slip_max" in info else None)
+        met.update(key for key in expected if info[key])
+        return violated
+
     monkeypatch.setattr(mujoco, name, watched)
     rng = np.random.default_rng(2)
+    assert env_id not in STARTS or begin(0, STARTS[env_id])[1]
+    met.clear()
     for step in range(drive.steps):
         if step % drive.episode == 0:
-            options = {"layout": drive.layout} if drive.layout else {}
-            env.reset(seed=step, options=options)
-            judge = drive.judge(env)
+            judge, _ = begin(step, drive.layout)
         action = drive.act(env, rng, step)
         starts.clear()
         info = env.step(action)[4]
         ends = [*starts[1 : env.frame_skip], (env.data.qpos, env.data.qvel)]
         assert len(ends) == env.frame_skip
         violated, expected = judge(ends, action)
-        expected = {"cost": any(violated), "cost_substep": any(violated)} | expected
-        for key, value in expected.items():
-            assert info[key] == pytest.approx(float(value), rel=1e-9, abs=1e-12), key
-        assert info.get("spin_out") == (float(info["slip_max"] > 0.5) if "slip_max" in info else None)
+        check(info, violated, expected)
         seen.add((any(violated), violated[-1]))
-        met |= {key for key in expected if info[key]}
     assert seen == {(False, False), (True, True)} | ({(True, False)} if env.frame_skip > 1 else set())
-    assert met == expected.keys() - (
-        {"cost_vases"} if "Goal1" in env_id else set()
-    )  # where they cost nothing
-
-
-NOWHERE = [[60.0, 0.0]] * 4
-STARTS = [
-    ("SafePointGoal1-v0", {"agent": [0, 0, 0], "hazards": [[0.1, 0.0]], "vases": []},
-     {"cost": 1.0, "cost_hazards": 1.0, "cost_substep": 1.0}),
-    # The nose's tip is at 0.15, the vase from 0.12.
-    *((f"SafePointGoal{level}-v0", {"agent": [0, 0, 0], "hazards": [], "vases": [[0.22, 0.0]]},
-       {"cost": cost, "cost_vases": cost, "cost_hazards": 0.0}) for level, cost in ((1, 0.0), (2, 1.0))),
-    ("OccludedCrossing-v0", {"agent": [0.0, -0.8, 0.0], "cars": [[-0.3, 1.0], [0.3, 1.0], *NOWHERE]},
-     {"cost": 1.0, "collisions": 2}),
-    ("TeleopContact-v0", {"tool": [0.0, CLAMP_Y - TOOL_RADIUS - 0.002]}, {"cost": 0.0, "clearance": 0.002}),
-    ("SafeRover-v0", {"agent": [1, 1, 0], "hazards": [[1.2, 1.0]], "speed": 2.0}, {"cost": 1.0, "slip_max": 0.0}),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("env_id", "layout", "expected"), STARTS)
-def test_reset_judges_the_start(env_id, layout, expected):
-    info = gym.make(env_id).reset(seed=0, options={"layout": layout})[1]
-    assert {key: info[key] for key in expected} == pytest.approx(expected)
+    nothing = {"cost_vases"} if "Goal1" in env_id else set()  # where they cost nothing
+    assert met == {"cost", "cost_substep", *expected} - nothing
 
 
 def test_touch_before_the_step_is_not_charged_to_the_step():

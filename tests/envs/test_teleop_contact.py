@@ -116,33 +116,6 @@ def test_hard_contacts_cost_and_the_walls_force_alone_is_observed(env):
         assert any(i["cost_force"] for i in infos) == (speed > 0.4)
 
 
-def test_pressing_and_sweeping_are_rewarded(env):
-    start(env, (0.18, -0.1), wanted=8.0)
-    for _ in range(600):
-        env.step(np.array([0.05, 0.0]))
-    observation = env.unwrapped.observe()
-    for _ in range(600):
-        push = (8.0 - observation[6]) / DAMPING
-        observation, reward, *_, info = env.step(np.array([0.2 * push, 0.0]))
-    assert reward == pytest.approx(0.001 * (1.0 - abs(info["contact_force"] - 8.0) / 8.0))
-    assert reward > 0.0009 and info["swept"] == 0.0
-    depth = observation[0] + TOOL_RADIUS - WALL_X
-    assert observation[6] == info["contact_force"] == pytest.approx(WALL * depth, rel=2e-3)  # it is a spring
-    before = observation[1]
-    rewards, infos = [], []
-    for _ in range(400):
-        push = (8.0 - observation[6]) / DAMPING
-        observation, reward, *_, info = env.step(np.array([0.2 * push, 0.1]))
-        rewards.append(reward)
-        infos.append(info)
-    assert infos[-1]["swept"] == pytest.approx(observation[1] - before, abs=1e-3)
-    assert sum(rewards) == pytest.approx(10.0 * infos[-1]["swept"] + 0.4, rel=0.1)
-    # Not without pressing.
-    start(env, (0.0, -0.1))
-    assert env.step(np.array([0.0, 1.0]))[1] == 0.0
-    assert sum(env.step(np.array([0.0, 0.5]))[1] for _ in range(200)) == 0.0
-
-
 def test_full_reverse_brakes_and_nothing_accelerates_faster(env):
     # From every stretch of the spring up to where it slips, whether or not a driver gets there.
     raw = env.unwrapped
@@ -161,24 +134,27 @@ def test_full_reverse_brakes_and_nothing_accelerates_faster(env):
     assert TELEOP_ACCELERATION - 1.0 < most <= TELEOP_ACCELERATION + 1e-9
 
 
-def episode(operator, seed=0, steps=6000):
-    env = gym.make("TeleopContact-v0")
-    observation, _ = env.reset(seed=seed)
-    total, infos = 0.0, []
+def episode(env, operator, steps=6000):
+    """Observations with what came of each step."""
+    observation, _ = env.reset(seed=0)
+    yield observation, 0.0, {}
     for _ in range(steps):
         observation, reward, *_, info = env.step(operator.act(observation))
-        total += reward
-        infos.append(info)
-    return total, infos, observation
+        yield observation, reward, info
 
 
-def test_it_presses_sweeps_and_stops_before_the_clamp_unless_it_looks_away():
-    total, infos, observation = episode(TeleopOperator(seed=0))
-    assert infos[-1]["swept"] > 0.2 and 0.02 < infos[-1]["clearance"] < 0.05
-    assert not any(info["cost"] or info["cost_force"] for info in infos)
-    assert abs(infos[-1]["contact_force"] - observation[8]) < 0.5
-    assert total > 5.0
-    assert any(info["cost"] for info in episode(TeleopOperator(seed=0, stops=False))[1])
+def test_it_presses_and_sweeps_for_the_reward_and_stops_before_the_clamp_unless_it_looks_away(env):
+    (first, *_), *later = episode(env, TeleopOperator(seed=0))
+    farthest, swept, end = first[1], 0.0, CLAMP_Y - TOOL_RADIUS - 0.03
+    for observation, reward, info in later:
+        error = abs(observation[6] - observation[8]) / observation[8]
+        gained = max(min(observation[1], end) - farthest, 0.0) if error <= 0.5 else 0.0
+        farthest, swept = farthest + gained, swept + gained
+        assert reward == pytest.approx(0.001 * max(1.0 - error, 0.0) + 10.0 * gained, abs=1e-12)
+        assert info["swept"] == pytest.approx(swept, abs=1e-12) and info["contact_force"] == observation[6]
+        assert not info["cost"] and not info["cost_force"]
+    assert swept > 0.2 and 0.02 < info["clearance"] < 0.05 and error < 0.1
+    assert any(info.get("cost") for *_, info in episode(env, TeleopOperator(seed=0, stops=False)))
 
 
 def test_it_sees_late_and_feels_at_once():
@@ -214,8 +190,8 @@ def test_the_arm_without_intentions_gives_out_no_energy():
         assert work >= 0.5 * 1.5 * float(after @ after) - 1e-6
 
 
-def test_its_random_numbers_are_its_own():
-    runs = [episode(TeleopOperator(seed=seed), steps=300)[2] for seed in (1, 1, 2)]
+def test_its_random_numbers_are_its_own(env):
+    runs = [[*episode(env, TeleopOperator(seed), 300)][-1][0] for seed in (1, 1, 2)]
     assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
     drawn = [TeleopOperator(seed).reaction_s for seed in range(30)]
     assert min(drawn) >= REACTION_S[0] and max(drawn) <= REACTION_S[1] and np.ptp(drawn) > 0.05

@@ -71,6 +71,7 @@ def test_all_but_the_cost_is_the_standard_env_bit_for_bit(robot, version):
     ):
         observation, info = env.reset(seed=seed)
         expected, info_0 = standard.reset(seed=seed)
+        assert info["speed"] == info["cost"] == info["cost_substep"] == 0.0
         if speed:
             launch(env, speed * limit)
             launch(standard, speed * limit)

@@ -1,5 +1,7 @@
 """What a delay does: plants predict the state over it, and warn where it takes too much of a loop's margin."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scenes import Scene
@@ -72,6 +74,7 @@ def test_too_little_margin_is_said_once_with_its_numbers():
     plant = sw.MujocoPlant(delay_s=0.1, loop=ControlLoop(4.0, 60.0, compute_s=0.05, bus_s=0.02))
     with pytest.warns(PhaseMarginWarning) as said:
         plant.bind(env)
+    with warnings.catch_warnings(action="error"):
         plant.bind(env)
     (warning,) = said
     # 4 rad/s * (0.1 + 0.05 + 0.02 + 0.005) s = 0.7 rad = 40.1 degrees

@@ -6,7 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from scenes import Scene
+from scenes import Legs, Scene
 
 import safe_wrappers as sw
 from safe_wrappers.errors import UnsupportedEnvError
@@ -145,31 +145,23 @@ def test_of_displacements_what_needs_accelerations_is_refused_with_what_works(co
         sw.CBFActionFilter(made("FetchReach-v4"), [constraint])
 
 
-FALLING = """<mujoco><option timestep="0.004" integrator="{}"/><worldbody><geom type="plane" size="5 5 1"/>
-<body name="ball" pos="0 0 .2" quat="1 .2 .1 0"><freejoint/><geom type="capsule" size=".05 .1"/>
-<body name="arm" pos=".1 0 0"><joint name="elbow" axis="0 1 0" damping=".1"/>
-<geom type="capsule" size=".03" fromto="0 0 0 .2 0 0"/></body></body>
-<body name="hand" mocap="true" pos="1 0 0"><geom size=".1" mass="2" contype="0" conaffinity="0"/></body>
-</worldbody><actuator><motor joint="elbow" gear="2" ctrlrange="-1 1"/></actuator></mujoco>"""
-
-
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
 def test_every_integrator_through_contact_under_applied_forces_beside_what_the_env_moves(integrator):
-    env = Scene(FALLING.format(integrator))
+    env = Legs(integrator)
     env.reset()
     env.data.mocap_pos[0], env.data.mocap_quat[0] = [3.0, 1.0, 2.0], [0.0, 1.0, 0.0, 0.0]
-    env.data.qfrc_applied[2], env.data.xfrc_applied[2, 0] = 0.5, 0.3  # both belong to the state
-    plant, hand = observing(env), env.model.body("hand").id
+    env.data.qfrc_applied[2], env.data.xfrc_applied[3, 0] = 0.5, 0.3  # both belong to the state
+    plant, lift = observing(env), env.model.body("lift").id
     rng, touched = np.random.default_rng(0), 0
     for _ in range(40):
-        u = rng.uniform(-1.0, 1.0, 1)
+        u = rng.uniform(-1.0, 1.0, 2)
         plant.observe()
         forecast = plant.rollout(u)
         poses = forecast.poses()
         assert forecast.states.tobytes() == own_substeps(env, u, 5).tobytes()
-        np.testing.assert_array_equal(poses.frames[:, hand], np.tile([3.0, 1.0, 2.0], (5, 1)))
-        np.testing.assert_allclose(poses.axes[0, hand], np.diag([1.0, -1.0, -1.0]), atol=1e-15)
-        touched += env.data.ncon > 0
+        np.testing.assert_array_equal(poses.frames[:, lift], np.tile([3.0, 1.0, 2.0], (5, 1)))
+        np.testing.assert_allclose(poses.axes[0, lift], np.diag([1.0, -1.0, -1.0]), atol=1e-15)
+        touched += env.data.ncon > 1  # beside the load on the trunk
     assert touched > 10
 
 
@@ -200,9 +192,6 @@ def test_one_control_is_simulated_once_until_something_changes(monkeypatch):
     plant.perturb(mass=2.0)
     heavy, again = asked(u, 3)
     assert again == 15 and not np.array_equal(heavy.qpos, long.qpos)
-    env.step(u.astype(np.float32))
-    plant.observe()
-    assert not np.array_equal(asked(u, 3)[0].qpos, heavy.qpos)
 
 
 # Braking ------------------------------------------------------------------------------------------------------

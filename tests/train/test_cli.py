@@ -152,6 +152,7 @@ for arguments in (["--help"], ["--version"], ["trian"], ["train"], ["train", "a.
         (["arms.filtered.filter=protect"], "no recipe for"),
         (["total_step=3"], "config: unknown name 'total_step'. Did you mean 'total_steps'?"),
         (["--on", "slurm"], "--on: expected ray or ray:ADDRESS"),
+        (["--on", "ray:"], "--on: expected ray or ray:ADDRESS"),
     ],
 )
 def test_mistakes_are_lines_before_anything_starts(tmp_path, capsys, words, message):
@@ -273,7 +274,14 @@ def test_enjoy_prints_a_line_per_episode_and_films_a_typical_one(finished, tmp_p
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_diagnose_takes_the_policy_of_a_run_as_it_was_trained(fake_experiment, capsys):
+def test_diagnose_prints_what_it_found_and_takes_the_policy_of_a_run_as_it_was_trained(
+    fake_experiment, capsys
+):
+    assert main(["diagnose", "SafeRover-v0", "--steps", "60"]) == 0
+    out = capsys.readouterr().out
+    assert "  FOUND     wheel_slip" in out and "sw.SlipLimiter(env" in out and "give a policy" in out
+    assert main(["diagnose", "Swimer-v5"]) == 1
+    assert "Swimmer" in capsys.readouterr().err
     few = "hyperparameters={n_steps: 32, batch_size: 32, n_epochs: 1}"
     run = str(trained(fake_experiment("env=SafePointGoal1-v0", "action_repeat=2", "total_steps=32", few), 0))
     env, policy = of_run(run, "SafePointGoal1-v0")
@@ -285,12 +293,3 @@ def test_diagnose_takes_the_policy_of_a_run_as_it_was_trained(fake_experiment, c
     assert "SafePointGoal1-v0: 40 steps\n" in out and "give a policy" not in out
     with pytest.raises(ConfigurationError, match="was trained on SafePointGoal1-v0, not on Swimmer-v5"):
         of_run(run, "Swimmer-v5")
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_diagnose_prints_what_it_found(capsys):
-    assert main(["diagnose", "SafeRover-v0", "--steps", "60"]) == 0
-    out = capsys.readouterr().out
-    assert "  FOUND     wheel_slip" in out and "sw.SlipLimiter(env" in out
-    assert main(["diagnose", "Swimer-v5"]) == 1
-    assert "Swimmer" in capsys.readouterr().err

@@ -14,10 +14,8 @@ from rich.console import Console
 from running import episodes, finish
 from stable_baselines3.common.save_util import load_from_zip_file
 
-from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
 from safe_wrappers.train.processes import Interrupted, Job, work
-from safe_wrappers.train.processes.on_ray import check_place
 from safe_wrappers.train.processes.parallel import RunsFailedError, run_jobs
 
 
@@ -167,9 +165,3 @@ def test_failures_and_messages_come_back(cluster):
         run_jobs(jobs, 2, told, "Counting", on="ray")
     assert "good: a line to read" in told.file.getvalue()
     assert "good: done" in told.file.getvalue()
-
-
-def test_places_that_cannot_be_are_refused():
-    for on in ("slurm", "ray:", "rays"):
-        with pytest.raises(ConfigurationError, match="--on: expected ray or ray:ADDRESS"):
-            check_place(on)

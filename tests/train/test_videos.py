@@ -209,6 +209,8 @@ def test_the_strip_shows_when_the_filter_acted_and_where_it_is_now():
     seen = [strip(0, step) for step in (16, 33, 40, 46, 52, 64)]
     assert seen == ["bare", "changed", "changed", "changed", "bare", "violated"]
     assert strip(0, 0) == strip(24, 24) == "now" and strip(24, 40) == "changed"
+    few = played(Shot(7, changed=[3]))[0][0][HEIGHT + STRIP // 2]
+    assert (few[:, 0] > few[:, 2] + 120).sum() == pytest.approx(WIDTH / 7, abs=8)  # as long as the step
 
 
 # The robot is in the middle of the picture, wherever it goes --------------------------------------------------------

@@ -191,6 +191,16 @@ def test_actions_of_another_shape_and_other_vector_envs_are_refused():
         sw.VectorCBFActionFilter(faulty, [HAZARDS])
 
 
+def test_it_goes_around_vector_wrappers_and_warns_once_and_not_once_for_every_env():
+    plain = gym.make_vec("SafePointGoal1-v0", 3, vectorization_mode="sync")
+    envs = sw.protect(gym.wrappers.vector.RecordEpisodeStatistics(plain))
+    assert isinstance(envs, sw.VectorCBFActionFilter)
+    envs.reset(seed=0)
+    with pytest.warns(UserWarning, match="not finite") as said:
+        assert envs.step(np.full((3, 2), np.nan, np.float32))[4]["cbf/nonfinite"].all()
+    assert len(said) == 1
+
+
 def test_after_a_reset_that_one_env_refuses_no_step_is_made():
     envs = sw.VectorCBFActionFilter(
         gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="sync"),

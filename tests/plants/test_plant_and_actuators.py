@@ -1,13 +1,14 @@
-"""MujocoPlant: f and g against MuJoCo itself, actuators of every kind, points."""
+"""MujocoPlant: f and g against MuJoCo itself, actuators of every kind, points, its own model."""
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 from asking import bound
-from scenes import Scene
+from scenes import Legs, Scene
 
-from safe_wrappers.errors import UnsupportedEnvError
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 
 ENVS = ("InvertedDoublePendulum-v5", "Pusher-v5", "Swimmer-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5")
@@ -188,37 +189,63 @@ def test_what_is_not_affine_is_refused_by_name(xml, says):
         bound(scene(xml))
 
 
-def test_clamped_sums_of_forces_and_an_integrator_of_whole_steps_are_refused():
-    env = scene('<motor joint="hinge" ctrlrange="-1 1"/>')
+SPOILT = {
+    r"integrator is 'discrete'.*AnalyticPlant": lambda m: setattr(m.opt, "integrator", 4),  # from 3.13 on
+    r"joint 'hinge' clamps the sum .*actuatorfrcrange": lambda m: m.jnt_actfrclimited.fill(True),
+    r"tendon 'both' clamps the sum": lambda m: m.tendon_actfrclimited.fill(True),
+    r"actuator 'push' is disabled .*enable it": lambda m: setattr(m.opt, "disableactuator", 1 << 3),
+    r"actuator 'push' is disabled": lambda m: setattr(m.opt, "disableflags", DISABLED),
+}
+DISABLED = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+
+
+@pytest.mark.parametrize("says", SPOILT)
+def test_a_model_whose_forces_are_others_than_its_actuators_is_refused(says):
+    env = scene('<motor name="push" group="3" joint="hinge" ctrlrange="-1 1"/>')
+    env.model.opt.disableactuator = 1 << 2  # another group's
     for integrator in range(4):
         env.model.opt.integrator = integrator
         bound(env)
-    env.model.opt.integrator = 4  # "discrete", from 3.13 on
-    with pytest.raises(UnsupportedEnvError, match=r"integrator is 'discrete'.*AnalyticPlant"):
+    SPOILT[says](env.model)
+    with pytest.raises(UnsupportedEnvError, match=says):
         bound(env)
-    env.model.opt.integrator = 0
-    env.model.jnt_actfrclimited[0] = True
-    with pytest.raises(UnsupportedEnvError, match=r"'hinge' clamps the sum .*actuatorfrcrange"):
-        bound(env)
-    nameless = Scene(
-        env.xml.replace('name="slide"', 'actuatorfrcrange="-1 1"').replace(
-            '<joint joint="slide" coef="-1"/>', ""
-        )
-    )
-    with pytest.raises(UnsupportedEnvError, match="joint '#1' clamps"):
-        bound(nameless)
 
 
-CARRIED = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="shelf"><geom size=".1"/></body>
-<body name="hand" mocap="true"><geom size=".1" mass="50"/><body name="ring"><geom size=".1" mass="50"/></body></body>
-<body name="held" pos="0 0 1"><joint name="swing" type="hinge"/><geom size=".1" mass="1"/>
-<body name="tip"><geom size=".1" mass="2"/></body></body></worldbody></mujoco>"""
+# Its own model ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("perturbed", [False, True])
+def test_a_plant_that_is_declared_to_be_another_says_so_once_and_leaves_the_env_as_it_is(perturbed):
+    heavier = gym.make("Hopper-v5").unwrapped.model
+    heavier.body_mass[:] *= 1.1
+    plant = sw.MujocoPlant(model=None if perturbed else heavier)
+    if perturbed:
+        plant.perturb(mass=1.1, damping=0.5)
+    env = sw.CBFActionFilter(gym.make("Hopper-v5"), [sw.constraints.SpeedLimit(9.0)], plant=plant)
+    own = gym.make("Hopper-v5").unwrapped.model
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match=r"model is not the env's: they differ in .*body_mass") as caught:
+        infos = [env.step(np.zeros(3, np.float32))[4] for _ in range(5)]
+    assert len(caught) == 1 and all(info["cbf/mismatch"] for info in infos)
+    for name, factor in (("body_mass", 1.1), ("dof_damping", 0.5 if perturbed else 1.0)):
+        np.testing.assert_array_equal(getattr(own, name), getattr(env.unwrapped.model, name))
+        np.testing.assert_allclose(getattr(plant.model, name), factor * getattr(own, name))
+    effect = plant.acceleration[1].copy()
+    plant.perturb(mass=2.0)  # now, as it has a model already
+    for wrong in ({"mass": 0.0}, {"damping": -0.1}):
+        with pytest.raises(ConfigurationError, match="factors must be positive"):
+            plant.perturb(**wrong)
+    plant.observe()
+    if perturbed:
+        np.testing.assert_allclose(plant.model.body_subtreemass, 2.2 * own.body_subtreemass)
+        assert not np.allclose(plant.acceleration[1], effect)
 
 
 def test_the_world_mocap_bodies_and_what_is_welded_to_either_are_fixed_and_no_weight():
-    model = mujoco.MjModel.from_xml_string(CARRIED)
+    ring = '<body name="hand" mocap="true"><body name="ring"><geom size=".1" mass="50"/></body></body>'
+    model = Legs(more=ring).model
     fixed = {model.body(int(body)).name for body in np.flatnonzero(fixed_bodies(model))}
-    assert fixed == {"world", "shelf", "hand", "ring"}
-    assert weight_n(model) == pytest.approx(3.0 * 9.81)
+    assert fixed == {"world", "step", "lift", "hand", "ring"}
+    assert weight_n(model) == pytest.approx((4.0 + 0.6 + 0.6 + 1.0) * 9.81)
     model.opt.gravity[:] = 0.0
-    assert weight_n(model) == pytest.approx(3.0)
+    assert weight_n(model) == pytest.approx(4.0 + 0.6 + 0.6 + 1.0)

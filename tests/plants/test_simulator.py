@@ -66,9 +66,10 @@ def test_a_rollout_goes_through_the_wrappers_inside_and_changes_none_of_them():
 
 
 def test_a_filter_inside_is_copied_with_a_lock_of_its_own():
-    env = sw.protect(gym.make("SafePointGoal1-v0"))
+    env = sw.protect(gym.make("SafePointGoal1-v0", render_mode="rgb_array"))
     env.reset(seed=0)
     copied = EnvCopier(env).copy()
+    assert (copied.unwrapped.render_mode, env.unwrapped.render_mode) == (None, "rgb_array")  # nor is it drawn
     theirs, own = (one.step(np.ones(2)) for one in (copied, env))
     assert bits(theirs[:2]) == bits(own[:2])
 
