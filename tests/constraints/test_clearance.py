@@ -108,16 +108,6 @@ def test_a_mujoco_point_mass_that_drives_at_the_nearest_disc_never_enters_one(fr
     assert 0.0 < gap(env.path) < 0.05  # and it is not kept away for nothing
 
 
-def test_radius_margin_and_state_error_add_up():
-    env = PointMass()
-    clear = of.Clearance([of.Plane([1.0], [-1.0])], 1.5, radius=0.05, margin=0.03, state_error=0.02, **BALL)
-    filtered = sw.CBFActionFilter(env, [clear])
-    filtered.reset(seed=0)
-    for _ in range(300):
-        filtered.step(np.array([1.0, 0.0]))
-    assert 0.898 < np.max(env.path) <= 0.9 + 1e-6
-
-
 MASS = {"bodies": ["b0"], "margin": 2e-3}
 
 

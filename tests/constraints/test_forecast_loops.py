@@ -20,14 +20,13 @@ from judged_loops import (
     manipulability,
     noisy,
     seeking,
-    slider,
     table,
 )
 
 import safe_wrappers as sw
 from safe_wrappers import constraints as of
 
-ANY = (at_random, bang_bang, seeking)
+ANY = (bang_bang, seeking)
 
 
 class Loop(NamedTuple):
@@ -70,10 +69,6 @@ def in_box(body, low, high):
     return room
 
 
-def out_of_the_disc(model, data):
-    return np.linalg.norm(data.geom("fingertip").xpos[:2] - [0.0, 0.15]) - 0.07
-
-
 ARM_JOINTS = "r_shoulder_pan_joint", "r_shoulder_lift_joint", "r_upper_arm_roll_joint", "r_elbow_flex_joint"
 
 
@@ -107,23 +102,10 @@ LOOPS = {
         most_flagged=0.4,
         deepest=1e-3,
     ),
-    "speed of a slider": Loop(
-        lambda: slider(10.0),
-        [of.SpeedLimit(0.8, "b0", "x", "substep")],
-        below_speed([0], 0.8),
-        used=0.02,
-    ),
     "a box on Reacher": Loop(
         task("Reacher-v5"),
         [of.Workspace([*FINGER_LOW, None], [*FINGER_HIGH, None], bodies=["fingertip"], horizon=10)],
         in_box("fingertip", FINGER_LOW, FINGER_HIGH),
-        most_flagged=0.1,
-        deepest=5e-3,
-    ),
-    "a disc on Reacher": Loop(
-        task("Reacher-v5"),
-        [of.Workspace(keep_out=[of.Disc([0.0, 0.15], 0.06)], geoms=["fingertip"], radius=0.01, horizon=10)],
-        out_of_the_disc,
         most_flagged=0.1,
         deepest=5e-3,
     ),

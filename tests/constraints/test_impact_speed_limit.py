@@ -1,7 +1,4 @@
-"""ImpactSpeedLimit: masses, pushes and peaks against independent answers, and gaps that are not skipped.
-
-Closed loops are in test_forecast_loops.py.
-"""
+"""ImpactSpeedLimit: masses, pushes and peaks against independent answers, and gaps that are not skipped."""
 
 import mujoco
 import numpy as np

@@ -33,22 +33,15 @@ LINKAGE = """
 LEG = """
 <mujoco><worldbody><geom type="plane" size="5 5 .1"/><body name="trunk" pos="0 0 .5"><freejoint/>
   <geom size=".1" mass="1"/><body name="leg"><joint name="hip" range="-1 1" limited="true" axis="0 1 0"/>
-  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.4"/><body pos="0 0 -.4">{ankle}
-  <geom name="foot" size=".05"/></body></body></body></worldbody>
-  <tendon><fixed name="t">{tendon}</fixed></tendon>
-  <actuator><motor joint="hip" ctrlrange="-1 1"/>{motor}</actuator></mujoco>
+  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.4"/><body pos="0 0 -.4">
+  <joint name="ankle" range="-1 1" limited="true" axis="0 1 0"/><geom name="foot" size=".05"/></body></body></body>
+  </worldbody><tendon><fixed name="t"><joint joint="ankle" coef="1"/></fixed></tendon>
+  <actuator><motor joint="hip" ctrlrange="-1 1"/><motor tendon="t" ctrlrange="-1 1"/></actuator></mujoco>
 """
-
-ANKLE = '<joint name="ankle" range="-1 1" limited="true" axis="0 1 0"/>'
-BALL = '<joint name="ankle" type="ball" range="0 1" limited="true"/>'
 
 
 def linkage(equality="", cable=""):
     return Scene(LINKAGE.format(equality=equality, cable=cable))
-
-
-def leg(ankle, tendon, motor):
-    return Scene(LEG.format(ankle=ankle, tendon=f'<joint joint="{tendon}" coef="1"/>', motor=motor))
 
 
 def fetch():
@@ -60,7 +53,11 @@ FINGERS = {"robot0:l_gripper_finger_joint", "robot0:r_gripper_finger_joint"}
 WHEELS, STEERING = {"front_left", "front_right", "rear_left", "rear_right"}, {"steer_left", "steer_right"}
 TIED = {"crank"}, {"rod", "rocker", "loose"}
 LEFT_OUT = {
-    "an arm that is pulled by its hand": (fetch, FINGERS, {"robot0:shoulder_pan_joint", "robot0:wrist_roll_joint"}),
+    "an arm that is pulled by its hand": (
+        fetch,
+        FINGERS,
+        {"robot0:shoulder_pan_joint", "robot0:wrist_roll_joint"},
+    ),
     "a body that is pushed at a site": (lambda: gym.make("SafePointGoal0-v0"), {"z"}, {"x", "y"}),
     "wheels that tendons steer": (lambda: gym.make("SafeRover-v0"), WHEELS, STEERING),
     "a joint tied to a joint": (lambda: linkage('<joint joint1="rocker" joint2="crank"/>'), *TIED),
@@ -68,13 +65,8 @@ LEFT_OUT = {
     "a site tied to a site": (lambda: linkage('<connect site1="end" site2="far"/>'), *TIED),
     "a cable that has a range": (lambda: linkage(cable='range="0 2"'), *TIED),
     "a cable that is a spring": (lambda: linkage(cable='stiffness="10"'), *TIED),
-    "an ankle with a tendon": (
-        lambda: leg(ANKLE, "ankle", '<motor tendon="t" ctrlrange="-1 1"/>'), {"hip"}, {"ankle"}
-    ),
-    "an ankle that is a ball": (
-        lambda: leg(BALL, "hip", '<motor joint="ankle" gear="0 1 0" ctrlrange="-1 1"/>'), {"hip"}, {"ankle"}
-    ),
-}  # fmt: skip
+    "an ankle that a tendon drives": (lambda: Scene(LEG), {"hip"}, {"ankle"}),
+}
 
 
 def listed(error):

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.obstacles import distances
 from safe_wrappers.control.estimation import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError
 
@@ -106,18 +105,6 @@ def test_published_discs_are_read_afresh_and_move_as_published():
         facts.facts["where"] = where
         with pytest.raises(ConfigurationError, match=words):
             still.nearest(point, facts)
-
-
-MANY = [*SHAPES.values(), sw.constraints.Plane([0.1], [1.0]), sw.constraints.Discs("where", 0.3)]
-
-
-@pytest.mark.parametrize("obstacle", MANY, ids=repr)
-def test_distances_of_many_points_are_those_of_each(obstacle):
-    facts = Facts(where=np.array([[0.0, 0.5], [-0.4, 0.1]]))
-    points = np.random.default_rng(0).uniform(-1.0, 1.0, size=(200, 3))
-    one_by_one = np.stack([obstacle.nearest(point, facts).distance for point in points])
-    assert (one_by_one < 0.0).any() and (one_by_one > 0.0).any()
-    np.testing.assert_allclose(distances(obstacle, points, facts), one_by_one, atol=1e-12)
 
 
 # TrackedDiscs against points sampled all over the bounds that they stand for

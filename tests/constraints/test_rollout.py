@@ -1,8 +1,6 @@
 """What constraints on a forecast share: what is asked of it, when it is spared, and when it breaks down."""
 
 import warnings
-from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +10,6 @@ from hypothesis import strategies as st
 from judged_loops import slider
 
 import safe_wrappers as sw
-from safe_wrappers.filter.bound import Bound
-from safe_wrappers.plants.plant import Model, Trajectory
 
 HOLD_S = 0.05
 
@@ -112,46 +108,3 @@ def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monk
     assert limit.admits(np.array([1.0]))
     assert not limit.admits(np.array([1e9]))
     assert limit.admits(np.array([2.0]))  # and the next one is a forecast again
-
-
-# Where controls are displacements: how long slopes are kept ----------------------------------------------------
-
-
-@dataclass
-class Approaching(sw.Constraint, Model):
-    """What is left of a bound on the first control, on a model of one line of arithmetic."""
-
-    left: float
-    sketches = 0
-
-    def setup(self, plant):
-        self.plant, self.model = plant, self
-
-    def braking(self):
-        return np.zeros(2)
-
-    def rollout(self, control, horizon=1):
-        return Trajectory(control, np.zeros((8, 0)))
-
-    def sketch(self, control, horizon=1):
-        self.sketches += 1
-        return self.rollout(control)
-
-    def h_along(self, path):
-        first = 0.0 if path.control is None else path.control[0]
-        return self.left - first * np.linspace(0.1, 1.0, 8)[:, None]
-
-
-@pytest.mark.parametrize(("left", "often"), [(0.5, 10), (-0.1, 1)])
-def test_slopes_are_kept_for_ten_control_steps_and_from_outside_for_none(left, often):
-    ends = {"lower": -np.ones(2), "upper": np.ones(2)}
-    plant = SimpleNamespace(has_acceleration=False, control_dt=0.1, model_version=0, **ends)
-    limit, memory = Bound(Approaching(left), plant), {}
-    for plant.observation_id in range(1, 25):
-        limit.observe(memory)
-        limit.spec.sketches = 0
-        for _ in range(2):  # once per observation
-            limit.rows()
-        # Of braking and of one difference for each control.
-        assert limit.spec.sketches == 3 * ((plant.observation_id - 1) % often == 0)
-        memory = limit.executed(np.zeros(2))

@@ -97,16 +97,6 @@ def test_peaks_are_those_of_the_integrated_oscillator(v, m, k, a, share, depth):
     assert peak_force(v, m, k, a, start) == pytest.approx(k * deep, rel=1e-6)
 
 
-@given(speeds, masses, stiffnesses, st.floats(0.1, 300.0))
-def test_braking_that_starts_at_the_peak_or_later_is_too_late(v, m, k, a):
-    quarter = float(time_to_peak(m, k))
-    late = quarter * np.array([1.0, 1.5, 40.0, np.inf])
-    free = braked_deflection(v, m, k, 0.0, np.inf)
-    np.testing.assert_array_equal(braked_deflection(v, m, k, a, late), free)
-    deeper = braked_deflection(v, m, k, a, quarter * np.linspace(0.0, 0.999, 20))
-    assert (np.diff(deeper) > 0.0).all() and (deeper > 0.0).all() and (deeper < free).all()
-
-
 def test_a_drop_in_mujoco_has_the_peak_force_of_its_spring():
     """Negative solref asks for a stiffness per mass; an impedance near 1 leaves it as it is."""
     mass, stiffness, height = 2.0, 2e5, 0.3

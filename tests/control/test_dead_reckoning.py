@@ -68,11 +68,10 @@ def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
     np.testing.assert_allclose(to_sensor(points[2], rotation, origin), seen[2], atol=1e-14)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_mujocos_readings_lead_to_mujocos_motion(seed):
+def test_mujocos_readings_lead_to_mujocos_motion():
     """Thrown, and pushed anew every 0.2 s; the readings are MuJoCo's alone."""
     model = mujoco.MjModel.from_xml_string(THROWN)
-    data, rng, step_s = mujoco.MjData(model), np.random.default_rng(seed), model.opt.timestep
+    data, rng, step_s = mujoco.MjData(model), np.random.default_rng(0), model.opt.timestep
     data.qvel[:] = rng.normal(size=6) * [1, 1, 1, 2, 2, 2]
     mujoco.mj_forward(model, data)
     mount = orientation_of(model.site_quat[0]).as_matrix()
@@ -110,3 +109,18 @@ def test_mujocos_readings_lead_to_mujocos_motion(seed):
     assert np.linalg.norm(without.position - data.qpos[:3]) > 0.5
     assert np.linalg.norm(without.velocity - data.qvel[:3]) > 0.1
     assert (without.orientation.inv() * end).magnitude() < 1e-4
+
+
+def test_it_takes_the_rate_between_two_readings_for_the_parabola_with_their_mean():
+    """A unit that spins up as w = 3 s - 2 s^2 within one interval: only its arm moves."""
+    arm, time_s, s = 0.5, 0.2, np.linspace(0.0, 1.0, 2001)[:, None]
+    angle, rate = time_s * (1.5 * s**2 - 2.0 / 3.0 * s**3), 3.0 * s - 2.0 * s * s
+    outwards, up = np.hstack([np.cos(angle), np.sin(angle), 0 * s]), np.array([0.0, 0.0, 1.0])
+    acceleration = arm * ((3.0 - 4.0 * s) / time_s * np.cross(up, outwards) - rate**2 * outwards)
+    mean = np.trapezoid(acceleration, s, axis=0)
+    reckoning = DeadReckoning(rigid_transform(np.eye(3), [arm, 0.0, 0.0]), np.zeros(3))
+    reckoning.fix(np.zeros(3), np.zeros(3), Rotation.identity(), np.zeros(3))
+    force = Rotation.from_rotvec(0.5 * angle[-1] * up).apply(mean, inverse=True)
+    reckoning.advance(force, angle[-1] * up, rate[-1] * up, time_s)
+    np.testing.assert_allclose(reckoning.velocity, 0.0, atol=1e-4)
+    assert np.linalg.norm(time_s * mean) > 0.4

@@ -12,22 +12,18 @@ from safe_wrappers.envs.ground import MagicFormula
 SPEEDS = st.floats(-30.0, 30.0)
 
 
-@pytest.mark.parametrize(
-    ("wheel", "ground", "slip"),
-    [
-        (2.0, 2.0, 0.0),  # rolling
-        (3.0, 0.0, 1.0),  # spins on the spot
-        (0.0, 3.0, -1.0),  # locked
-        (2.0, 1.0, 0.5),  # drives
-        (1.0, 2.0, -0.5),  # brakes
-        (-2.0, -1.0, -0.5),  # drives in reverse: pushes backwards
-        (-1.0, -2.0, 0.5),  # brakes in reverse: pushes forwards
-        (1.0, -1.0, 2.0),  # turns against the motion
-        (0.0, 0.0, 0.0),  # at rest
-    ],
-)
-def test_named_cases(wheel, ground, slip):
-    assert slip_ratio(wheel, ground, 1e-3) == slip
+def test_slips_that_have_a_name():
+    rolls, spins_on_the_spot, locked, at_rest = (
+        (2.0, 2.0, 0.0),
+        (3.0, 0.0, 1.0),
+        (0.0, 3.0, -1.0),
+        (0.0, 0.0, 0.0),
+    )
+    drives, brakes, against = (2.0, 1.0, 0.5), (1.0, 2.0, -0.5), (1.0, -1.0, 2.0)
+    in_reverse = (-2.0, -1.0, -0.5), (-1.0, -2.0, 0.5)  # driving pushes backwards, braking forwards
+    cases = rolls, spins_on_the_spot, locked, at_rest, drives, brakes, against, *in_reverse
+    wheel, ground, slip = np.transpose(cases)
+    np.testing.assert_array_equal(slip_ratio(wheel, ground, 1e-3), slip)
 
 
 @given(SPEEDS, SPEEDS, st.floats(0.01, 0.9), st.floats(0.01, 2.0))

@@ -52,14 +52,6 @@ def test_what_has_no_answer_is_said_to_have_none(monkeypatch):
     assert by_clarabel(open_ended) == "failed"  # its solver reached its limit
 
 
-@pytest.mark.parametrize("part", ["equal", "values", "rows", "limits", "cones"])
-def test_what_is_no_number_is_failed_and_not_infeasible(part):
-    parts = {"equal": ROWS[:1].copy(), "values": np.ones(1), "rows": ROWS.copy(), "limits": np.ones(2)}
-    parts["cones"] = np.ones((1, 3, 1))
-    parts[part].flat[0] = np.nan
-    assert by_clarabel(nearest([0.0], **parts)) == "failed"
-
-
 # Random robots ----------------------------------------------------------------------------------------------------
 
 
