@@ -60,7 +60,7 @@ ALONE = [
     ({"slides": LIMITED}, "no limits"),
     ({"motors": ONE_MOTOR}, "actuator of its own"),
     ({"motors": TWO_MOTORS}, "actuator of its own"),
-    ({"motors": MOTORS + '<adhesion body="point" ctrlrange="0 1"/>'}, "no other actuator"),
+    ({"ball": BALL + '<site name="s"/>', "motors": MOTORS + '<motor site="s"/>'}, "no other actuator"),
     ({"motors": MOTORS.replace("-1 2", "0 2")}, "push both ways"),
     ({"motors": MOTORS.replace('gear="10"', 'gear="-10"')}, "gear above zero"),
     ({"motors": MOTORS.replace("<motor joint", '<position kp="3" joint')}, "is .* off that"),
