@@ -85,6 +85,10 @@ def test_distances_are_of_the_rectangles_between_positions(places, wall):
         # Inside: the shortest translation along an axis that separates them.
         moves = wall[1] - low[0], high[0] - wall[0], wall[3] - low[1], high[1] - wall[2]
         assert distance == pytest.approx(-min(moves), abs=1e-12)
+    around, *_, end = of.distances(places, np.array([wall]), True)
+    box = np.stack([places.min(axis=0), places.max(axis=0)])
+    assert around == of.distances(box, np.array([wall]), False)[0]
+    assert end == of.distances(places[[-1, -1]], np.array([wall]), False)[0]
 
 
 @given(PAIRS, SPEEDS, PAIRS, st.sampled_from([1, 4]), st.booleans(), st.floats(0.05, 0.2))
