@@ -41,7 +41,8 @@ OFF = {
     | dict.fromkeys(range(218, 237), PARALLEL),
 }
 """Steps by robot, level and episode."""
-OTHER_CORNERS = mujoco.mj_version() >= 3_012_000
+OTHER_CORNERS = {("point", 2, 2): 11, ("car", 1, 2): 4, ("car", 2, 2): 86}
+"""From MuJoCo 3.12 on: so many steps of an episode may be beyond their bounds."""
 
 
 def recorded(robot, level, episode):
@@ -123,7 +124,8 @@ def forward_as_2_3_3(model, data):
 @pytest.mark.parametrize(("level", "episode"), [(1, 1), (1, 2), (2, 1), (2, 2)])
 def test_every_recorded_step(monkeypatch, robot, level, episode):
     env = gym.make(f"Safe{robot.title()}Goal{level}-v0").unwrapped
-    there, off = recorded(robot, level, episode), OFF.get((robot, level, episode), {})
+    key = robot, level, episode
+    there, off = recorded(*key), OFF.get(key, {})
     costs = replayed(env, there)[:, 4:]
     assert costs[[t for t in range(300) if t not in off]].max() < 4e-4 and not costs[:, 1].any()
     if robot == "car":
@@ -133,7 +135,5 @@ def test_every_recorded_step(monkeypatch, robot, level, episode):
     monkeypatch.setattr(mujoco, "mj_step", step_as_2_3_3)
     errors = replayed(env, there)
     bounds = np.array([off.get(t, AGREE[robot]) for t in range(300)])
-    if OTHER_CORNERS:
-        assert (errors <= bounds).all(axis=1).sum() > 180
-    else:
-        np.testing.assert_array_less(errors, bounds + 1e-300)
+    beyond = np.flatnonzero(~(errors <= bounds).all(axis=1))
+    assert len(beyond) <= (OTHER_CORNERS.get(key, 0) if mujoco.mj_version() >= 3_012_000 else 0), beyond
