@@ -1,7 +1,6 @@
 """Registered tasks, imported as ``safe_wrappers.envs``: the package that knows MJCF and rewards.
 
-Importing this module imports neither MuJoCo nor any environment: the ids point to their classes by name, and
-`gymnasium.make` imports a class when it is asked for.
+The ids point to their classes by name, and `gymnasium.make` imports a class when it is asked for.
 """
 
 from typing import Final

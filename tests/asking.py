@@ -1,7 +1,23 @@
-"""A constraint on a plant, asked at whatever state the plant has observed."""
+"""A constraint on a plant, asked at whatever state the plant has observed, and the plainest one."""
+
+from dataclasses import dataclass
+
+import numpy as np
 
 import safe_wrappers as sw
 from safe_wrappers.filter.bound import Bound
+
+
+@dataclass
+class Below(sw.Constraint):
+    """One state stays below a limit at the end of the hold, and its rate is the control: rows alone, no h."""
+
+    limit: float
+    of: int = 0
+
+    def rows(self):
+        left = self.limit - self.plant.state[self.of]
+        return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
 
 
 def bound(env, **options):

@@ -2,12 +2,12 @@
 
 import functools
 import pickle
-from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from asking import Below
 from gymnasium.spaces import Box, Dict, Discrete
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -88,17 +88,6 @@ class GoalLine(Line):
         return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
 
 
-@dataclass
-class BehindTheWall(sw.Constraint):
-    """x <= wall at the end of the hold, which is u <= (wall - x) / hold."""
-
-    wall: float
-
-    def rows(self):
-        left = self.wall - self.plant.state[0]
-        return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
-
-
 def filtered(wall=WALL, task=Line):
     plant = sw.AnalyticPlant(
         f=lambda x: np.zeros(1),
@@ -106,7 +95,7 @@ def filtered(wall=WALL, task=Line):
         state=lambda env: np.array([env.x]),
         control_dt=HOLD,
     )
-    return Monitor(sw.RecordInterventions(sw.CBFActionFilter(task(), [BehindTheWall(wall)], plant=plant)))
+    return Monitor(sw.RecordInterventions(sw.CBFActionFilter(task(), [Below(wall)], plant=plant)))
 
 
 def filtered_goals(wall=WALL):

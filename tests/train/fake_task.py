@@ -137,6 +137,9 @@ def count(steps, progress):
         progress.steps(at)
     progress.say("a line to read")
     assert os.environ["OMP_NUM_THREADS"] == os.environ["NPROC"] == "1"
+    import torch  # here: the other jobs need none
+
+    assert torch.get_num_threads() == 1
 
 
 def fail(progress):

@@ -4,6 +4,7 @@ import csv
 import io
 import itertools
 import json
+import re
 
 import gymnasium as gym
 import numpy as np
@@ -231,7 +232,9 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
         assert not [tag for tag in written if "cost" in tag or "violations" in tag or "lease" in tag]
         assert ("interventions/infeasible" in written) == (arm.name == "filtered")
         of_filter = {
-            tag.removeprefix("evaluation_") for tag in written if "infeasible" in tag or "unsafe" in tag
+            tag.removeprefix("evaluation_")
+            for tag in written
+            if re.search("infeasible|unsafe|correction", tag)
         }
         assert "filter_on/infeasible" in of_filter and not {tag for tag in of_filter if "filter_off" in tag}
     with (experiment.folder / "per_seed.csv").open() as file:
@@ -241,6 +244,7 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
     assert "Steps in violation, total │ not judged │ not judged" in table
     said = "Violations are not judged: the task reports no cost."
     assert said in table and said in page and said in " ".join(verdict(experiment, summary))
+    assert "No finished training episode" not in page  # there are, which nobody judged
     # The page's note; cost and violations of two arms in three conditions.
     assert page.partition("In numbers")[2].partition("The same episode")[0].count("not judged") == 1 + 2 * 6
 
@@ -312,6 +316,7 @@ def test_the_interval_has_95_percent_of_all_resamples(seeds):
         assert (means < bound - 1e-9).mean() - 0.005 <= share <= (means <= bound + 1e-9).mean() + 0.005
     assert estimate(values) == found  # not another interval at each look
     # The range of two, and none of one.
+    assert estimate([0.0] * 3) == Estimate(0.0, 0.0, 0.0, 3)  # nothing that a bootstrap could draw
     assert estimate([3.0]) == Estimate(3.0, None, None, 1) and str(estimate([3.0])) == "3 [n/a]"
     assert estimate([1.0, 2.0]) == Estimate(1.5, 1.0, 2.0, 2) and str(estimate([1.0, 2.0])) == "1.5 [1, 2]"
 

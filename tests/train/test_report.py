@@ -14,10 +14,10 @@ from running import JUDGES_NOTHING, SILENT, episode, fill, steps, trained, write
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train import videos
-from safe_wrappers.train.evaluation.summary import summarize
+from safe_wrappers.train.evaluation.summary import Curve, summarize
 from safe_wrappers.train.policies import write_card
 from safe_wrappers.train.report import verdict, write_report
-from safe_wrappers.train.report.figures import place_pictures, telling_pair
+from safe_wrappers.train.report.figures import curve_picture, place_pictures, telling_pair
 
 
 class Page(HTMLParser):
@@ -203,6 +203,15 @@ def test_the_verdict_says_what_the_numbers_say(fake_experiment, off, on, sentenc
         assert said.startswith("Violations are not judged") and "in violation" not in said
 
 
+def test_of_the_same_policies_only_the_evaluation_is_compared(fake_experiment):
+    of = "{filter: {factory: 'fake_task:shield'}}"
+    experiment = fake_experiment(f"arms={{a: {of}, b: {of}}}")
+    fill(experiment, HURT, {})
+    said = " ".join(verdict(experiment, summarize(experiment)))
+    assert "none of 400 steps was in violation; without it 20 of 400 steps (5 %)" in said
+    assert "with 20 of 400 steps in violation" in said  # beside the return
+
+
 @pytest.mark.parametrize(
     ("seeds", "spread", "surely"),
     [
@@ -234,6 +243,13 @@ def texts(picture):
     assert kind == "data:image/svg+xml;base64"
     root = ElementTree.fromstring(base64.b64decode(data))
     return {"".join(node.itertext()) for node in root.iter() if node.tag.endswith("text")}
+
+
+def test_a_curve_says_where_it_begins_and_ends():
+    seeds = np.array([np.linspace(0, 10, 20), np.linspace(0, 30, 20)])
+    curve = Curve(np.arange(20.0), seeds.mean(axis=0), *seeds, seeds)
+    picture = curve_picture("Return", "return", {"bare": curve}, ["bare"])
+    assert picture.reading.endswith(": “bare” 0.526 to 19.5.")
 
 
 def test_where_in_state_space():

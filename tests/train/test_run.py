@@ -297,7 +297,10 @@ def test_two_processes_do_not_train_one_run_and_a_killed_one_holds_no_folder(fak
         trained(experiment)
     child = os.fork()
     if not child:
-        only_writer(experiment.run_folder(experiment.arms[1], 0)).__enter__()
+        held = only_writer(
+            experiment.run_folder(experiment.arms[1], 0)
+        )  # unnamed it would be let go of at once
+        held.__enter__()
         os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     trained(experiment)

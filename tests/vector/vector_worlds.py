@@ -97,13 +97,7 @@ def cart(index=0, delay_s=0.25):
 
 
 class AtHazard(gym.Wrapper):
-    """Starts every episode in front of a hazard, until it is shown no more; goal and vase stay random."""
-
-    shown = True
-
-    @property
-    def hazard_positions(self):
-        return self.unwrapped.hazard_positions[: self.shown]
+    """Starts every episode in front of a hazard; goal and vase stay random."""
 
     def reset(self, *, seed=None, options=None):
         layout = {"agent": [0.0, 0.0, 0.0], "hazards": [[0.26, 0.0]]}

@@ -11,9 +11,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Below
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds import Cart, Raw, SpeedRow, filtered_cart, full_throttle, wall
+from worlds import Cart, Raw, filtered_cart, full_throttle, wall
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -42,7 +43,7 @@ FORMS = st.sampled_from([np.float32, np.float64, list])
 @given(st.lists(st.tuples(VALUES, FORMS), min_size=1, max_size=12))
 def test_what_is_executed_and_reported_is_the_projection_in_closed_form(proposals):
     # Bug 8: raw, boxed and executed are three things; saturation does not hide the intervention.
-    filtered = started(SpeedRow(LIMIT), fallback="zero")
+    filtered = started(Below(LIMIT, of=1), fallback="zero")
     for value, form in proposals:
         action = [value] if form is list else np.array([value], form)
         proposed = float(action[0])
@@ -73,7 +74,7 @@ def test_what_is_executed_and_reported_is_the_projection_in_closed_form(proposal
     ],
 )
 def test_a_wrong_action_is_warned_of_once(action, words):
-    filtered = started(SpeedRow(LIMIT))
+    filtered = started(Below(LIMIT, of=1))
     with pytest.warns(UserWarning, match=words) as caught:
         for _ in range(3):
             filtered.step(np.array(action))
@@ -121,7 +122,7 @@ CAUSES = {
 )  # fmt: skip
 def test_where_nothing_is_found_the_fallback_acts_once_and_the_cause_is_said(cause, fallback, expected):
     # Bug 2: infeasible, and the unsafe action passed with "intervened" False; a failed solve poisoned the next.
-    filtered = started(SpeedRow(50.0), Raw(), fallback=fallback)
+    filtered = started(Below(50.0, of=1), Raw(), fallback=fallback)
     filtered.step(np.array([0.35], np.float32))
     rows = filtered.filter.bound[1].spec
     rows.fixed = CAUSES[cause]

@@ -3,8 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import Below
 from episodes import actions
-from worlds import Cart, SpeedRow, filtered_cart
+from worlds import Cart, filtered_cart
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -45,7 +46,7 @@ LIMIT = 0.25
 
 
 def filtered(paid=lambda _: 1.5):
-    return filtered_cart([SpeedRow(LIMIT)], env=gym.wrappers.TransformReward(Cart(), paid))
+    return filtered_cart([Below(LIMIT, of=1)], env=gym.wrappers.TransformReward(Cart(), paid))
 
 
 @pytest.mark.parametrize("penalty", [0.5, np.float32(3)])
@@ -157,7 +158,7 @@ IMAGE = gym.spaces.Box(0, 255, (4, 4, 3), np.uint8)
     ("space", "key"), [(IMAGE, "observation"), (gym.spaces.Dict(pixels=IMAGE), "pixels")]
 )
 def test_dicts_get_a_key_and_images_become_dicts(space, key):
-    env = sw.FilterObservation(filtered_cart([SpeedRow(LIMIT)], env=Pictured(Cart(), space)))
+    env = sw.FilterObservation(filtered_cart([Below(LIMIT, of=1)], env=Pictured(Cart(), space)))
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     assert set(observation) == {key, "filter"} and observation["filter"].dtype == np.float32

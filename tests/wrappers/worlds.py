@@ -1,7 +1,5 @@
 """Small worlds whose motion is known exactly: a cart on a line, pushed by a bounded acceleration."""
 
-from dataclasses import dataclass
-
 import gymnasium as gym
 import numpy as np
 
@@ -64,17 +62,6 @@ def full_throttle(filtered, steps, state=(0.0, 0.0)):
     """Always the largest action; returns the infos."""
     filtered.reset(seed=0, options={"state": list(state)})
     return [filtered.step(np.array([1.0], np.float32))[4] for _ in range(steps)]
-
-
-@dataclass
-class SpeedRow(sw.Constraint):
-    """v <= limit at the end of the hold, by the plainest possible constraint: rows alone, no h."""
-
-    limit: float
-
-    def rows(self):
-        left = self.limit - self.plant.state[1]
-        return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
 
 
 class Raw(sw.Constraint):
