@@ -1,5 +1,6 @@
 """What no constraint and no obstacle can be made of, or bound to, is refused with what to give instead."""
 
+from collections.abc import Sequence
 from dataclasses import fields
 
 import gymnasium as gym
@@ -45,14 +46,27 @@ RIGHT = {
 }
 
 
+NUMBERS = float, int, float | None, float | Sequence[float]
+MAY_BE_0 = {
+    "margin",
+    "state_error",
+    "tolerance",
+    "uncertainty",
+    "sigmas",
+    "candidates",
+    "max_decrease_per_speed",
+}
+
+
 def numbers(kind):
-    return [field.name for field in fields(kind) if field.init and field.type in (float, int, float | None)]
+    return [field.name for field in fields(kind) if field.init and field.type in NUMBERS]
 
 
 @pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in RIGHT for name in numbers(kind)])
 def test_a_number_that_is_none_or_negative_is_refused_by_its_name(kind, name):
     kind(**RIGHT[kind])
-    for wrong in (np.nan, "much", -0.1, [[1.0]]):
+    radius_0 = name == "radius" and hasattr(kind, "margin")  # of a machine, not of a disc
+    for wrong in (np.nan, np.inf, "much", -1, [[1.0]], *([] if name in MAY_BE_0 or radius_0 else [0])):
         with pytest.raises(ConfigurationError, match=name):
             kind(**RIGHT[kind] | {name: wrong})
 
@@ -62,6 +76,12 @@ MADE = [
     (of.Box, {"half_size": [1, 1, 1]}, "half_size must be 2 finite numbers"),
     (of.Clearance, {"obstacles": []}, "obstacles is a list with at least one obstacle"),
     (of.Clearance, {"obstacles": ["wall"]}, "expected an obstacle .* got 'wall'"),
+    (of.CoastingClearance, {"horizon": 1}, "at least 2"),
+    (of.JointPositionLimit, {"lower": np.nan}, "lower is a position"),
+    (of.SpeedLimit, {"direction": ""}, "no direction ''"),
+    (of.Workspace, {"high": [np.nan, 0.0, 0.0]}, "high must be finite"),
+    (of.PredictiveShield, {"backup": 0.5}, "backup is zero, hold"),
+    (of.Clearance, {"position": [0] * 4, "velocity": [1] * 4}, "up to three"),
     (of.Clearance, {"position": [0], "velocity": [1, 2]}, "position and velocity .* in the same order"),
     (of.CoastingClearance, {"keep_out": []}, "keep_out .* or untouched"),
     (of.CoastingClearance, {"keep_out": [of.Plane([0.0], [1.0])]}, "holds Disc and Discs, got Plane"),

@@ -1,6 +1,6 @@
 """ContactFeasibility and SupportMargin where balls slide and tables tip; Stance by a program put together by hand.
 
-Closed loops are in test_forecast_loops.py, robots under Stance's program in plants/test_floating_base.py.
+Closed loops are in test_forecast_loops.py, robots under Stance's program in plants/test_dynamics.py.
 """
 
 import gymnasium as gym
@@ -217,3 +217,13 @@ def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone):
             assert info["cbf/infeasible"] and info["cbf/fallback"]
             assert info["whole_body/cone_margin"] < 0.0
     assert standing > 5
+
+
+def test_at_bounds_that_float32_rounds_outwards_nothing_is_changed():
+    env = sw.CBFActionFilter(gym.make("Humanoid-v5"), [sw.constraints.Stance(1.0)])
+    high = env.action_space.high
+    assert float(high[0]) > env.plant.upper[0]  # 0.4 as float32 is more than the model's 0.4
+    env.reset(seed=0)
+    info = env.step(high)[4]
+    assert not info["cbf/intervened"] and not info["cbf/refused"].any()
+    assert info["executed_action"].astype(high.dtype).tobytes() == high.tobytes()

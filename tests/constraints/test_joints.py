@@ -38,6 +38,14 @@ LEG = """
   </worldbody><tendon><fixed name="t"><joint joint="ankle" coef="1"/></fixed></tendon>
   <actuator><motor joint="hip" ctrlrange="-1 1"/><motor tendon="t" ctrlrange="-1 1"/></actuator></mujoco>
 """
+BALL_LEG = (
+    LEG.replace(
+        'name="ankle" range="-1 1" limited="true" axis="0 1 0"',
+        'name="ankle" type="ball" range="0 1" limited="true"',
+    )
+    .replace('<joint joint="ankle" coef', '<joint joint="hip" coef')
+    .replace('<motor tendon="t"', '<motor joint="ankle" gear="0 1 0"')
+)
 
 
 def linkage(equality="", cable=""):
@@ -66,6 +74,7 @@ LEFT_OUT = {
     "a cable that has a range": (lambda: linkage(cable='range="0 2"'), *TIED),
     "a cable that is a spring": (lambda: linkage(cable='stiffness="10"'), *TIED),
     "an ankle that a tendon drives": (lambda: Scene(LEG), {"hip"}, {"ankle"}),
+    "an ankle that is a ball": (lambda: Scene(BALL_LEG), {"hip"}, {"ankle"}),
 }
 
 

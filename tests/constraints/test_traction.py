@@ -40,7 +40,7 @@ def test_drives_stay_on_the_stable_side_and_use_what_there_is(name, ground):
     (speed, act), env, top = DRIVES[name], rover(), MAGIC_FORMULA[ground]
     env.reset(seed=0, options={"layout": OPEN | {"ground": ground, "speed": speed}})
     infos, raw = [], env.unwrapped
-    while len(infos) < 120 and not (name == "panic brake" and raw.forward_speed < 0.02):
+    while raw.forward_speed > 0.02 if name == "panic brake" else len(infos) < 120:
         infos.append(env.step(act(len(infos)))[4])
     assert max(info["slip_max"] for info in infos) < 0.16
     slips = np.abs([info["slip"] for info in infos])
@@ -49,7 +49,7 @@ def test_drives_stay_on_the_stable_side_and_use_what_there_is(name, ground):
         assert slips.max() < max(1.17 * top.peak_slip, 0.135)
         assert (slips[60:] > 0.6 * top.peak_slip).all()
     if name == "panic brake":  # v^2 / (2 mu g) needs the peak's slip at all wheels from the first moment on
-        assert raw.agent_position[0] < 1.07 * 9.0 / (2.0 * top.peak_friction * 9.81)
+        assert raw.agent_position[0] < 1.05 * 9.0 / (2.0 * top.peak_friction * 9.81)
 
 
 def test_another_ground_costs_a_step_or_two():
@@ -245,6 +245,8 @@ def test_a_state_that_is_no_number_is_forgotten():
         assert np.isfinite(traction.rows().offsets).all() == numbers
         assert np.isfinite(traction.backup()).all()
     np.testing.assert_array_equal(traction.spec.seen.present, 0.0)
+    traction.spec.friction = np.nan  # a row that is no number is kept, and fails
+    assert np.isnan(traction.spec.rows().offsets).sum() == 4
 
 
 def test_motion_is_that_of_the_wheels_centres_in_any_attitude():

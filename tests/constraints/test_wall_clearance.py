@@ -171,3 +171,16 @@ def test_from_inside_the_margin_and_from_the_wall_it_comes_back_and_stays(option
     margins = np.array([info["cbf/margin"] for info in infos])
     assert infos[0]["cbf/unsafe"] == lost and not infos[-1]["cbf/unsafe"]
     assert margins.min() >= margins[0] - 1e-9 and margins[120:].min() >= 0.05 - 1e-6
+
+
+@pytest.mark.parametrize(
+    ("at", "velocity", "asked"),
+    [((-0.06, 0.05), (4.4, -3.6), (0.6, -0.5)), ((0.21, -0.16), (-2.0, 1.7), (0.0, 0.6))],
+)
+def test_beside_a_corner_both_orders_are_tried_and_without_a_known_clip_the_rectangle_counts(
+    at, velocity, asked
+):
+    limit = placed(filtered(velocity_clip=5.0), at, velocity)
+    near, far = (np.linalg.norm(control - asked) for control in limit.candidates(np.array(asked)))
+    assert near < far - 0.1 and limit.least > limit.spec.margin
+    assert placed(filtered(), at, velocity).least < 0.0

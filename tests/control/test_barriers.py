@@ -94,3 +94,9 @@ def test_no_sample_above_the_threshold_needs_more_and_no_smaller_number_would_do
     else:
         assert found == pytest.approx(w.min())
     assert validated_threshold(samples, 0.5, limit / 2.0) == found
+
+
+def test_of_a_jacobian_with_a_nan_nothing_is_said():
+    jacobians = np.array([np.eye(2, 3), np.eye(2, 3)])
+    jacobians[0, 1, 2] = np.nan
+    assert np.isnan(manipulability(jacobians)).tolist() == [True, False]

@@ -17,6 +17,8 @@ from safe_wrappers.errors import ConfigurationError
 UP, OUTLINE = np.array([0.0, 0.0, 1.0]), "three points that are not on one line"
 REFUSED = [
     (project, ([np.nan], [[1.0]], [1.0], -1, 1), "u_nom must be finite"),
+    (project, ([np.inf], [[1.0]], [1.0], -1, 1), "u_nom must be finite"),
+    (project, ([0.0], [[1.0]], [1.0], np.nan, 1.0), "lower must not exceed upper"),
     (project, ([0.0], [[1.0]], [1.0], 1.0, -1.0), "lower must not exceed upper"),
     (project, ([0.0, 0.0], [[1.0, 1.0]], [1.0, 2.0], -1, 1), "expected u_nom (m,)"),
     (project, ([0.0, 0.0, 0.0], np.ones((3, 2)), [1.0, 2.0], -1, 1), "expected u_nom (m,)"),  # transposed

@@ -40,7 +40,16 @@ def used(lease, speed, braking, delays, localisation, margin, acceleration, top=
     st.one_of(st.none(), st.floats(0.0, 60.0)),
 )
 @example(10.0, 2.0, 1.0, 0.5, 0.0, 0.0, 1e-12, None)
-@example(3024.1523, 45.7250, 1.25260797395764, 0.0, 2188.4896829519953, 1.08724998293, 0.0, None)
+@example(
+    3024.152304640018,
+    45.72502328660836,
+    1.2526079739576417,
+    0.0,
+    2188.4896829519953,
+    1.0872499829308457,
+    0.0,
+    None,
+)
 @example(1e-300, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-200, None)
 @example(2.0, 0.0, 1.0, 0.0, 1.999999999999, 0.0, 1e-9, None)  # room of 1e-12 m, known to 1e-14 m
 def test_the_lease_is_the_longest_that_keeps_the_inequality(d, v, b, delays, loc, gap, a, top):
@@ -160,14 +169,20 @@ def test_phases_of_jerk_by_hand(way, time):
 
 @given(st.floats(0.1, 3.0), st.floats(0.1, 3.0), st.floats(0.01, 9.0), st.floats(-2.0, 2.0))
 def test_the_time_to_rest_is_the_closed_form_of_the_slowest_axis(speed, acceleration, way, start):
-    alone = way / speed + speed / acceleration
-    if way <= speed**2 / acceleration:
-        alone = 2.0 * np.sqrt(way / acceleration)
-    together = transit_time([start, start - way], start, 0.0, [9.0, speed], [9.0, acceleration])
-    assert together == pytest.approx(max(alone, transit_time(start, start, 0.0, 9.0, 9.0)), rel=1e-6)
-    # Moving that way already it is there sooner, by what speeding up would have taken.
+    def alone(way, v, a):
+        return way / v + v / a if way > v * v / a else 2.0 * np.sqrt(way / a)
+
+    together = transit_time([start + way / 2, start - way], start, 0.0, [0.7, speed], [0.4, acceleration])
+    slowest = max(alone(way / 2, 0.7, 0.4), alone(way, speed, acceleration))
+    assert together == pytest.approx(slowest, rel=1e-6)
+    # Already at full speed where one from rest would have reached it, it takes as long less the speeding up.
     moving = transit_time(start + way, start - 0.5 * speed**2 / acceleration, speed, speed, acceleration)
     assert moving == pytest.approx(way / speed + speed / acceleration, rel=1e-6)
+
+
+def test_a_start_that_is_too_fast_is_braked_first():
+    # 4 s down to 1 m/s, over 12 m; 0.5 m more to rest is 11.5 m too far: 1 + 11.5 s back, and 1 s of it to speed up.
+    assert transit_time(1.0, 0.0, 5.0, 1.0, 1.0) == pytest.approx(17.5)
 
 
 @pytest.mark.parametrize("name", ["goal", "position", "velocity"])

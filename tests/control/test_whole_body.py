@@ -52,6 +52,13 @@ def test_what_has_no_answer_is_said_to_have_none(monkeypatch):
     assert by_clarabel(open_ended) == "failed"  # its solver reached its limit
 
 
+@pytest.mark.parametrize("part", ["linear", "values", "limits"])
+def test_what_is_no_number_is_failed_and_not_infeasible(part):
+    fields = {"values": np.ones(1), "equal": ROWS[:1], "limits": np.ones(2), "rows": ROWS}
+    program = nearest([0.0], **fields)
+    assert by_clarabel(program._replace(**{part: getattr(program, part) * np.nan})) == "failed"
+
+
 # Random robots ----------------------------------------------------------------------------------------------------
 
 

@@ -294,6 +294,15 @@ def recorded(env, **arrays):
     return dataclasses.replace(recording, infos=[{}] * k, **{"first": np.zeros(k, bool)} | arrays)
 
 
+def test_an_error_in_a_measurement_is_not_taken_for_a_refusal(monkeypatch):
+    def broken(recording):
+        raise ConfigurationError("of a bug")
+
+    monkeypatch.setitem(SYMPTOMS, "limits", SYMPTOMS["limits"]._replace(measure=broken))
+    with pytest.raises(ConfigurationError, match="of a bug"):
+        diagnose(gym.make("Swimmer-v5"), steps=2)
+
+
 def test_command_steps_are_not_counted_over_resets():
     executed = np.array([[0.0], [0.1], [0.2], [-1.0], [-0.9], [-0.8]])
     first = np.array([True, False, False, True, False, False])

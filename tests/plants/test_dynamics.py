@@ -176,15 +176,15 @@ def test_the_flexible_arms_resonances_are_those_of_finite_differences_and_of_two
 
 TWO_MASSES = """<mujoco><option timestep="0.0005" gravity="0 0 0"/><worldbody><body><joint name="motor" axis="0 0 1"
 armature="0.05" damping="{damping}"/><joint name="spring" axis="0 0 1" stiffness="{stiffness}" damping="{across}"/>
-<geom type="box" size="0.1 0.1 0.1" mass="3"/></body>{other}</worldbody>
+<geom type="box" size="0.1 0.1 0.1" mass="3"/></body></worldbody>
 <actuator>{actuator}</actuator></mujoco>"""
 INERTIA = 3.0 * (0.2**2 + 0.2**2) / 12.0
 
 
 class TwoMasses(Scene):
-    def __init__(self, stiffness=200.0, damping=0.0, across=0.0, actuator='<motor joint="motor"/>', other=""):
+    def __init__(self, stiffness=200.0, damping=0.0, across=0.0, actuator='<motor joint="motor"/>'):
         given = {"stiffness": stiffness, "damping": damping, "across": across}
-        super().__init__(TWO_MASSES.format(actuator=actuator, other=other, **given), frame_skip=20)
+        super().__init__(TWO_MASSES.format(actuator=actuator, **given), frame_skip=20)
 
 
 def test_a_stiff_and_damped_spring_is_rigid_enough_and_one_that_rings_is_not():
@@ -211,7 +211,7 @@ def test_a_servos_own_damping_counts():
 def test_a_spring_that_servos_share_out_among_all_vibrations_is_one():
     tip = '<body><joint name="t" axis="0 0 1" armature=".02"/><geom pos=".1 0 0" size=".05" mass="1"/></body>'
     servos = '<position joint="motor" kp="800"/><position joint="t" kp="100"/>'
-    whole = TWO_MASSES.replace("</body>{other}", tip + "</body>")
+    whole = TWO_MASSES.replace("</body>", tip + "</body>")
     env = Scene(whole.format(stiffness=200, damping=0, across=0, actuator=servos), frame_skip=20)
     check = rigid_model_check(env)  # no vibration has half of its energy in the spring
     assert check.resonances and not check.rigid_is_good_enough

@@ -64,12 +64,25 @@ def own_substeps(env, action, substeps):
 
 
 LEFT_ALONE = (
-    *("qpos", "qvel", "ctrl", "mocap_pos", "qfrc_applied", "xfrc_applied", "qacc", "qacc_warmstart", "xpos"),
-    *("xipos", "xmat", "cvel", "qM", "qfrc_bias", "actuator_length", "actuator_velocity", "sensordata"),
+    *("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied", "qacc"),
+    *(
+        "qacc_warmstart",
+        "xpos",
+        "xquat",
+        "xipos",
+        "xmat",
+        "geom_xpos",
+        "site_xpos",
+        "subtree_com",
+        "cvel",
+        "qM",
+    ),
+    *("qfrc_bias", "qfrc_constraint", "actuator_length", "actuator_velocity", "actuator_force", "sensordata"),
 )
 
 
 def arrays(data):
+    """Those of which MuJoCo fills more than a part."""
     return {name: getattr(data, name).tobytes() for name in LEFT_ALONE if hasattr(data, name)}
 
 

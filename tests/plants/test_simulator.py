@@ -237,25 +237,31 @@ def test_noise_of_any_generator_is_foreseen(kind):
 
 
 class LateNoise(Cart):
-    """What is measured draws from the generator of the whole process, but not before its hundredth step."""
+    """What is seen, or else measured, draws from the whole process's generator, but not before its hundredth step."""
 
     made, hidden = 0, 1.0
 
+    def __init__(self, seen):
+        super().__init__()
+        self.seen = seen
+
     def step(self, action):
         self.made += 1
-        self.hidden = 1.0 + (0.1 * np.random.randn() if self.made > 100 else 0.0)
-        return super().step(action)
+        late = 0.1 * np.random.randn() if self.made > 100 else 0.0
+        self.hidden = 1.0 + (not self.seen) * late
+        return super().step(np.asarray(action) + self.seen * late)
 
 
-def test_a_measure_that_is_another_after_the_check_is_flagged_at_its_first_step():
+@pytest.mark.parametrize(("seen", "says"), [(True, r"observation\[\d\]"), (False, "h")])
+def test_what_is_another_after_the_check_is_flagged_at_its_first_step(seen, says):
     shield = sw.constraints.PredictiveShield(
         lambda view: view.env.hidden, 3, sees="view", terminal=lambda view: True
     )
-    env = sw.CBFActionFilter(LateNoise(), [shield], plant=sw.SimulatorPlant(check_steps=50))
+    env = sw.CBFActionFilter(LateNoise(seen), [shield], plant=sw.SimulatorPlant(check_steps=50))
     env.reset(seed=0)
     for step in range(100):
         info = env.step(np.array([0.1]))[4]
         assert not info["cbf/mismatch"] and env.constraints[0].promise == "proved", step
-    with pytest.warns(UserWarning, match=r"not its simulation's: its h is .* instead of") as said:
+    with pytest.warns(UserWarning, match=rf"not its simulation's: its {says} is .* instead of") as said:
         assert all(env.step(np.array([0.1]))[4]["cbf/mismatch"] for _ in range(2))
     assert len(said) == 1 and env.constraints[0].promise == "best effort"

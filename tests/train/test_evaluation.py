@@ -18,6 +18,7 @@ from scipy import stats
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
+from safe_wrappers.train.cli import main
 from safe_wrappers.train.config import EnvConfig, FilterConfig
 from safe_wrappers.train.evaluation import step_log
 from safe_wrappers.train.evaluation.evaluate import compared_pairs, evaluated_steps, shown_episode
@@ -218,7 +219,7 @@ def reported(experiment):
 SHORT = ("seeds=[0]", "total_steps=128", "evaluation.episodes=2")
 
 
-def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
+def test_what_nobody_judged_is_nowhere_zero(fake_experiment, capsys):
     experiment = fake_experiment("env=fake_task:SilentGoal-v0", *SHORT)
     summary, table, page = reported(experiment)
     for arm in experiment.arms:
@@ -245,6 +246,11 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
     said = "Violations are not judged: the task reports no cost."
     assert said in table and said in page and said in " ".join(verdict(experiment, summary))
     assert "No finished training episode" not in page  # there are, which nobody judged
+    assert (
+        main(["enjoy", str(folder), "--episodes", "1", "--output", str(experiment.folder / "film.webp")]) == 0
+    )
+    told = capsys.readouterr().out
+    assert "Film: " in told and "20 steps" in told and "in violation" not in told
     # The page's note; cost and violations of two arms in three conditions.
     assert page.partition("In numbers")[2].partition("The same episode")[0].count("not judged") == 1 + 2 * 6
 

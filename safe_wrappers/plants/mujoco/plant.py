@@ -105,7 +105,7 @@ class MujocoPlant(Plant):
         """Read the model anew: at binding, and when the env's has changed."""
         source = self._source
         model = binding.checked_model(source, self._given)
-        if self._given is None and self._factors != (1.0, 1.0):
+        if self._factors != (1.0, 1.0):
             model = copy.copy(model)
             _scale(model, *self._factors)
         moved = source.model is not self._env_model
