@@ -13,7 +13,6 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.layer import action_array
-from safe_wrappers.wrappers.stack import refuse_order
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -66,8 +65,6 @@ class VectorCBFActionFilter(_Wrapper):
     ) -> None:
         super().__init__(env)
         envs = single_envs(env)
-        for single in envs:
-            refuse_order(single, CBFActionFilter.layer, CBFActionFilter.__name__)
         self.filters = [
             CBFActionFilter(single, constraints, copy.deepcopy(plant), fallback, margin) for single in envs
         ]
