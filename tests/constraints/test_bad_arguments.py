@@ -71,6 +71,13 @@ def test_a_number_that_is_none_or_negative_is_refused_by_its_name(kind, name):
             kind(**RIGHT[kind] | {name: wrong})
 
 
+@pytest.mark.parametrize("kind", RIGHT)
+def test_what_is_neither_true_nor_false_is_refused_by_its_name(kind):
+    for name in (field.name for field in fields(kind) if field.init and field.type is bool):
+        with pytest.raises(ConfigurationError, match=name):
+            kind(**RIGHT[kind] | {name: 1})
+
+
 MADE = [
     (of.Barrier, {"h": 4.0}, "h must be a function of the state, got 4.0"),
     (of.Box, {"half_size": [1, 1, 1]}, "half_size must be 2 finite numbers"),
@@ -80,6 +87,7 @@ MADE = [
     (of.JointPositionLimit, {"lower": np.nan}, "lower is a position"),
     (of.SpeedLimit, {"direction": ""}, "no direction ''"),
     (of.Workspace, {"high": [np.nan, 0.0, 0.0]}, "high must be finite"),
+    (of.Plane, {"point": [0.0] * 4}, "point must be 1 or 2 or 3 finite numbers"),
     (of.PredictiveShield, {"backup": 0.5}, "backup is zero, hold"),
     (of.Clearance, {"position": [0] * 4, "velocity": [1] * 4}, "up to three"),
     (of.Clearance, {"position": [0], "velocity": [1, 2]}, "position and velocity .* in the same order"),
@@ -140,6 +148,7 @@ BOUND = {
     ("SafeRover-v0", ConfigurationError): [
         (of.Traction, {"wheels": ["steer_left"]}, "'steer_left' is no driven wheel"),
         (of.Traction, {"wheels": ["front_left", "front_left"]}, "each once"),
+        (of.Traction, {"wheels": []}, r"each once, got \[\]"),
     ],
     ("Reacher-v5", UnknownNameError): [
         (of.ImpactSpeedLimit, {"bodies": ["hand"]}, "no body or geom 'hand'; bodies: world.*fingertip"),

@@ -138,6 +138,18 @@ def test_pushing_counts(share, passes):
     assert any(info["cbf/intervened"] for *_, info in steps) != passes
 
 
+def test_at_the_end_of_the_held_step_the_push_is_over():
+    push, wall = np.ones(1), 1.0
+    for _ in range(2):  # the second time the wall is reached within the last substep
+        env = cart_before_a_wall(MASS, K, gap=wall, force=LIMIT)
+        env.data.qvel[0] = 0.9
+        constraint = asked(env, limit(horizon=1))
+        before, end = constraint.plant.rollout(push).qpos[-2:, 0]
+        speed, wall = constraint.plant.rollout(push).qvel[-1, 0], 0.5 * (before + end)
+    struck = np.hypot(K * (end - wall), speed * STRUCK)
+    assert constraint.slack(push) == pytest.approx(LIMIT - struck, rel=1e-3)
+
+
 @pytest.mark.parametrize("margin", [0.0, 5.0])
 def test_a_limit_that_cannot_be_kept_any_more_is_flagged_from_inside_the_margin_too(margin):
     env = sw.CBFActionFilter(cart_before_a_wall(MASS, K, gap=0.02, force=20.0), [limit(margin=margin)])

@@ -124,12 +124,17 @@ def reacher(qpos, qvel):
     return env
 
 
-def test_value_and_rows_of_a_speed_are_the_plants_own_prediction():
-    limit = asked(reacher([0.0, 0.0], [3.5, -3.0]), of.JointSpeedLimit(4.0, margin=0.1))
+@pytest.mark.parametrize("most", [1.0, 5.0])
+def test_value_and_rows_of_a_speed_are_the_plants_own_prediction(most):
+    env = reacher([0.0, 0.0], [3.5, -3.0])
+    env.unwrapped.model.actuator_ctrlrange[:] = -most, most
+    env.unwrapped.model.actuator_gear[:] /= most
+    env.unwrapped.action_space = gym.spaces.Box(-most, most, (2,), np.float32)
+    limit = asked(env, of.JointSpeedLimit(4.0, margin=0.1))
     np.testing.assert_allclose(limit.value(), [0.5, 1.0])
     rows, plant = limit.rows(), limit.plant
     drift, effect = plant.acceleration
-    for u in np.random.default_rng(0).uniform(-1, 1, (50, 2)):
+    for u in np.random.default_rng(0).uniform(-most, most, (50, 2)):
         after = plant.qvel[:2] + plant.control_dt * (drift + effect @ u)[:2]
         assert (rows.normals @ u <= rows.offsets).all() == (np.abs(after) <= 3.9).all()
 

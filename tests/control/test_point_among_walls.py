@@ -55,6 +55,7 @@ def test_of_a_way_that_is_not_finite_no_distance_is_a_number():
     still, lost, holds = np.zeros(2), np.array([0.0, math.nan]), np.zeros((1, 2))
     endless = of.way(axes(clip=math.inf), still, np.array([1e9, 0.0]), holds[:0])
     fast = of.way(axes(), still, np.array([math.inf, 0.0]), holds)
+    assert np.isnan(endless[-1]).tolist() == [True, False]  # the other axis came to rest
     for way in (of.way(axes(), lost, still, holds), of.way(axes(), still, lost, holds), fast, endless):
         for whole in (False, True):
             assert np.isnan(way[-1]).any() and np.isnan(of.distances(way, AMONG, whole)).all()

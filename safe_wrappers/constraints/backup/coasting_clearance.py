@@ -19,6 +19,7 @@ from safe_wrappers.errors import (
     finite_array,
     non_negative,
     positive,
+    true_or_false,
     whole_number,
 )
 from safe_wrappers.filter.constraint import Memory
@@ -83,6 +84,7 @@ class CoastingClearance(Detour, Model):
             if any(getattr(obstacle, "velocity_attribute", None) is not None for obstacle in found):
                 raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
             setattr(self, name, found)
+        self.detour = true_or_false("detour", self.detour)
         if not (self.keep_out or self.untouched):
             raise ConfigurationError("give obstacles in keep_out (for the origin) or untouched (the outline)")
         self.outline = _checked_outline(self.outline)

@@ -10,7 +10,7 @@ from safe_wrappers.constraints.detour import Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup.heading_drive import clearances, look, way_to_rest
 from safe_wrappers.control.numerics.shapes import nearest_discs
-from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative
+from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative, true_or_false
 from safe_wrappers.filter.constraint import HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
 from safe_wrappers.plants.mujoco.plant import require_mujoco
@@ -55,6 +55,7 @@ class HeadingDriveClearance(Detour, Model):
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles, kinds=(Disc, Discs))
         check_fields(self, non_negative, ("margin", "state_error"), "m")
+        self.detour = true_or_false("detour", self.detour)
         self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
         if self.uncertainty >= 1.0:
             raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
