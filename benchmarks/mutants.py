@@ -153,16 +153,17 @@ def named_tests(mutant: Mutant) -> str:
 
 
 def tests_of(where: Path, file: str) -> list[str]:
-    """The test files that mention most of the names that a module defines."""
+    """The test files that import a module or are named after it, then those that mention most of its names."""
     tree = ast.parse((where / "safe_wrappers" / file).read_text())
     names = [n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef) if n.name[0] != "_"]
-    names += [rf"{Path(file).stem} import", *(name.removeprefix("Bound") for name in names)]
+    stem = Path(file).stem
+    names += [name.removeprefix("Bound") for name in names]
     word = re.compile(rf"\b({'|'.join(names)})\b")
     folders = ("filter", "constraints", "control", "plants", "wrappers", "vector", "contract", "train")
     paths = [path for folder in folders for path in sorted((where / "tests" / folder).rglob("test_*.py"))]
     texts = {path: path.read_text() for path in paths}
     counts = {
-        path: len(word.findall(text)) / len(text) + (Path(file).stem in path.stem)
+        path: len(word.findall(text)) / len(text) + (stem in path.stem) + (f"{stem} import" in text)
         for path, text in texts.items()
     }
     best = sorted((path for path in counts if counts[path]), key=lambda path: -counts[path])[:MOST_TESTS]
