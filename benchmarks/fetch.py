@@ -4,6 +4,7 @@ No code of a constraint is in the judge. It makes the env take its physics subst
 own positions after each, and after what the env does to its fingers at the end of a step; nothing is replayed.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -11,7 +12,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import mujoco_drivers
-from benchmarks.drivers import Action, Driver, Maker, held
+from benchmarks.drivers import Action, Maker, stepwise
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.wrappers.recipes import RECIPES
 
@@ -163,25 +164,20 @@ def seeking(points: Any, hold: int) -> Maker:
         hold: Steps for each, at most; half of it at least.
     """
 
-    def make(env: Any, rng: np.random.Generator) -> Driver:
+    @stepwise
+    def seek(env: Any, rng: np.random.Generator) -> Iterator[Action]:
         model: mujoco.MjModel = env.model
         data, site = mujoco.MjData(model), model.site("robot0:grip").id
+        while True:
+            left, point = int(rng.integers(hold // 2, hold + 1)), points(env, rng)
+            fingers = rng.choice([-1.0, 1.0])
+            for _ in range(left):
+                data.qpos[:] = env.data.qpos
+                mujoco.mj_kinematics(model, data)
+                wanted = (point - data.site_xpos[site]) / DISPLACEMENT_M
+                yield np.append(np.clip(wanted, -1.0, 1.0), fingers)
 
-        def draw() -> tuple[int, Any]:
-            return int(rng.integers(hold // 2, hold + 1)), (points(env, rng), rng.choice([-1.0, 1.0]))
-
-        aim = held(draw)
-
-        def act() -> Action:
-            point, fingers = aim()
-            data.qpos[:] = env.data.qpos
-            mujoco.mj_kinematics(model, data)
-            wanted = (point - data.site_xpos[site]) / DISPLACEMENT_M
-            return np.append(np.clip(wanted, -1.0, 1.0), fingers)
-
-        return act
-
-    return make
+    return seek
 
 
 def _beyond_a_corner(env: Any, rng: np.random.Generator) -> Action:
@@ -222,34 +218,33 @@ def margin_reading(ball: bool) -> Maker:
         ball: Whether the filter keeps the fingers out of the ball, too.
     """
 
-    def make(env: Any, rng: np.random.Generator) -> Driver:
+    @stepwise
+    def read(env: Any, rng: np.random.Generator) -> Iterator[Action]:
         recipe = RECIPES[env.spec.id.rpartition("-v")[0]]
         constraints: list[Any] = recipe(env, keep_out=obstacles(env) if ball else [])
         plant = sw.plants.DisplacementPlant()
         plant.bind(env)
         bound = [Bound(constraint, plant) for constraint in constraints]
-        state: dict[str, Any] = {"way": rng.normal(size=3)}
+        way = rng.normal(size=3)
 
         def left(action: Action) -> float:
             return float(min(c.slacks(action).min() for c in bound))
 
-        def act() -> Action:
+        while True:
             plant.observe()
             for c in bound:
                 c.observe({})  # nobody says when an episode begins
             if rng.random() < 0.04:
-                state["way"] = rng.normal(size=3)
+                way = rng.normal(size=3)
             fingers = rng.choice([-1.0, 1.0])
-            noisy = 3.0 * (state["way"] + 0.7 * rng.normal(size=3))
+            noisy = 3.0 * (way + 0.7 * rng.normal(size=3))
             tries = [np.append(np.clip(noisy, -1.0, 1.0), fingers)]
             tries += [np.where(rng.random(4) < 0.5, -1.0, 1.0) for _ in range(2)]
             found = [(left(action), k) for k, action in enumerate(tries)]
             admitted = [pair for pair in found if pair[0] >= 0.0]
-            return tries[min(admitted)[1] if admitted else max(found)[1]]
+            yield tries[min(admitted)[1] if admitted else max(found)[1]]
 
-        return act
-
-    return make
+    return read
 
 
 def obstacles(env: Any) -> list[sw.constraints.Sphere]:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from _crossing import STEP_S, car_tracks, tracked, turn_to
-from _style import FORBIDDEN, INK, OFF, ON
+from _style import FORBIDDEN, INK, OFF, ON, panels
 
 STEPS = 250
 TOLERANCE = 0.5
@@ -38,8 +38,7 @@ def run() -> tuple[Any, Any, Any, Any]:
 def draw() -> Figure:
     """A panel per car."""
     errors, sigmas, seen, expired = run()
-    figure = Figure(figsize=(7.2, 5.2))
-    axes = figure.subplots(3, 1, sharex=True)
+    figure, axes = panels(rows=3, height=5.2, sharex=True)
     times = STEP_S * np.arange(1, STEPS + 1)
     for i, (ax, name) in enumerate(zip(axes, ("car0", "car3", "car4"), strict=True)):
         band = np.minimum(3.0 * sigmas[:, i], TOP)
