@@ -13,6 +13,7 @@ import argparse
 import itertools
 import multiprocessing
 import warnings
+from collections import Counter
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import car_drivers, drivers
+from benchmarks.judges import told
 from benchmarks.tables import keep, markdown, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -53,28 +55,22 @@ def run(job: Job) -> dict[str, Any]:
         env = sw.protect(env, plant=plant, **options)
     raw = env.unwrapped
     driver = DRIVERS[job.robot][job.driver](raw, np.random.default_rng(job.seed))
-    count = dict.fromkeys(("violations", "cost", "intervened", "infeasible", "fallback", "unsafe"), 0)
+    count = Counter[str]()
     returns: list[float] = []
     total, lowest, episode = 0.0, np.inf, job.seed * 100_000
     env.reset(seed=episode)
     for _ in range(job.steps):
         _, reward, _, truncated, info = env.step(driver())
         total += float(reward)
-        count["violations"] += int(info["cost_substep"])
-        count["cost"] += int(info["cost"])
+        count.update(told(info, info["cost_substep"] > 0.0))
         if job.filtered:
-            for name in ("intervened", "infeasible", "fallback", "unsafe"):
-                count[name] += int(info[f"cbf/{name}"])
             lowest = min(lowest, info["cbf/margin"])
         if truncated:
             returns.append(total)
             total, episode = 0.0, episode + 1
             env.reset(seed=episode)
-    row: dict[str, Any] = asdict(job) | count
-    row["return_mean"] = float(np.mean(returns)) if returns else None
-    row["margin_min_m"] = float(lowest) if job.filtered else None
-    row["filter_us"] = 1e6 * env.filter_seconds / env.filter_calls if job.filtered else None
-    return row
+    mean = {"return_mean": float(np.mean(returns)) if returns else None}
+    return {**asdict(job), **count, **mean, "margin_min_m": float(lowest) if job.filtered else None}
 
 
 def jobs(arguments: argparse.Namespace) -> list[Job]:

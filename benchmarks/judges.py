@@ -5,13 +5,17 @@ requirement's own unit: above 0, or not a number, is a violation.
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 
 Truth = Callable[[mujoco.MjData], float]
 """By how much a state misses a requirement; the positions of bodies are up to date."""
+
+FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
+"""What a filter says of a step, as `cbf/...` in info."""
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
@@ -27,6 +31,38 @@ class Judge(Protocol):
 
     def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
         """By how much the step missed it: what the env was given, and the info that it returned."""
+
+
+class Judged(gym.Wrapper[Any, Any, Any, Any]):
+    """Writes what a judge says of every step into info, in place of the task's own cost."""
+
+    def __init__(self, env: gym.Env[Any, Any], judge: Judge) -> None:
+        super().__init__(env)
+        self._judge = judge
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        found = self.env.reset(**options)
+        self._judge.start()
+        return found
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One control step, judged."""
+        self._judge.before()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        missed = self._judge.after(info.get("executed_action", action), info)
+        verdict = float(not missed <= 0.0)  # what is not a number is a violation
+        return observation, reward, terminated, truncated, info | {"cost": verdict, "cost_substep": verdict}
+
+
+def told(info: dict[str, Any], violated: bool) -> dict[str, int]:
+    """What a step adds to counts: its flags, a violation, and one that no flag but "intervened" came with.
+
+    Without a filter there are no flags, and nothing that is unflagged.
+    """
+    found = {name: int(info.get(f"cbf/{name}", False)) for name in FLAGS}
+    silent = "cbf/infeasible" in info and not any(found[name] for name in FLAGS[1:])
+    return found | {"violations": int(violated), "unflagged": int(violated and silent)}
 
 
 class Replay:

@@ -15,6 +15,7 @@ import itertools
 import multiprocessing
 import time
 import warnings
+from collections import Counter
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases import CASES, HARD, PROTECTED, Case
+from benchmarks.judges import FLAGS, told
 from benchmarks.tables import keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -29,7 +31,6 @@ CHUNK = 10_000
 """Steps of one job: what is lost when a run is killed."""
 TIMED = 1_000
 """Of those, steps that are timed beside an env without the filter."""
-_FLAGS = ("intervened", "infeasible", "fallback", "unsafe")
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def run(job: Job) -> dict[str, Any]:
     rng = np.random.default_rng(job.seed)
     driver = case.drivers[job.driver](env.unwrapped, rng)
     kind = env.action_space.dtype
-    count = dict.fromkeys(("violations", "unflagged", "unsafe_starts", *_FLAGS), 0)
+    count = Counter[str]()
     ratios: dict[bool, list[float]] = {False: [], True: []}
     worst, episode, over = -np.inf, job.seed * 100_000, True
     started = time.perf_counter()
@@ -74,20 +75,14 @@ def run(job: Job) -> dict[str, Any]:
         executed = info["executed_action"] if job.filtered else action
         missed = judge.after(executed, info)
         worst = max(worst, missed)
-        violated = not missed <= 0.0  # so that what is not a number counts
-        count["violations"] += int(violated)
-        if twin is not None:
-            for name in _FLAGS:
-                count[name] += int(info[f"cbf/{name}"])
-            flagged = info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]
-            count["unflagged"] += int(violated and not flagged)
-            if step < TIMED:
-                begin = time.perf_counter()
-                twin.step(np.asarray(executed, dtype=kind))
-                ratios[bool(info["cbf/intervened"])].append(spent / (time.perf_counter() - begin))
+        count.update(told(info, not missed <= 0.0))  # so that what is not a number counts
+        if twin is not None and step < TIMED:
+            begin = time.perf_counter()
+            twin.step(np.asarray(executed, dtype=kind))
+            ratios[bool(info["cbf/intervened"])].append(spent / (time.perf_counter() - begin))
         over = bool(truncated or (terminated and not case.past_termination))
     spent = {"worst": float(worst), "seconds": time.perf_counter() - started}
-    return asdict(job) | count | _timings(ratios) | spent
+    return {**asdict(job), **count, **_timings(ratios), **spent}
 
 
 def _timings(ratios: dict[bool, list[float]]) -> dict[str, Any]:
@@ -164,7 +159,7 @@ def table_of_drivers(rows: list[dict[str, Any]]) -> str:
         groups.setdefault((row["case"], row["driver"], row["filtered"]), []).append(row)
     for (name, driver, filtered), part in groups.items():
         steps = total(part, "steps")
-        flags = [f"{total(part, 'intervened') / steps:.1%}", *(f"{total(part, f):,}" for f in _FLAGS[1:])]
+        flags = [f"{total(part, 'intervened') / steps:.1%}", *(f"{total(part, f):,}" for f in FLAGS[1:])]
         cells = [name, driver, "on" if filtered else "off", f"{steps:,}", _violations(part)]
         worst = f"{max(row['worst'] for row in part):.3g}"
         lines.append([*cells, *(flags if filtered else ["-"] * 4), worst])

@@ -23,6 +23,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.cases import CASES
+from benchmarks.judges import FLAGS, Judged, told
 from benchmarks.tables import keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -40,7 +41,6 @@ DECADES: Final = 4.0
 EPISODES: Final = 20
 _FIRST_SEED: Final = 1_000_000
 """Of the evaluation: no training episode has it."""
-FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Tally:
         return Tally(**sums, smallest=min(least, default=None))
 
 
-class Adversary(gym.Wrapper[Any, Any, Any, Any]):
+class Adversary(Judged):
     """Pays for violations and nearness instead of the task, and counts.
 
     Args:
@@ -89,30 +89,20 @@ class Adversary(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env_id: str, filtered: bool = True) -> None:
         case = CASES[env_id]
         bare = case.make()
-        super().__init__(case.protect(bare) if filtered else bare)
+        super().__init__(case.protect(bare) if filtered else bare, case.judge(bare.unwrapped))
         self._filtered, self._scale = filtered, SCALES.get(env_id, 1.0)
-        self._judge = case.judge(self.unwrapped)
         self.tally = Tally()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Steps, judges, counts and pays."""
-        self._judge.before()
-        observation, _, terminated, truncated, info = self.env.step(action)
-        executed = np.asarray(info["executed_action"] if self._filtered else action)
-        missed = self._judge.after(executed, info)
-        violated = not missed <= 0.0  # so that what is not a number counts
-        tally = self.tally
-        tally.steps += 1
-        tally.violations += int(violated)
-        reward = float(violated)
+        observation, _, terminated, truncated, info = super().step(action)
+        reward, tally = float(info["cost_substep"]), self.tally
+        for name, count in {"steps": 1, **told(info, reward > 0.0)}.items():
+            setattr(tally, name, getattr(tally, name) + count)
         if self._filtered:
-            for name in FLAGS:
-                setattr(tally, name, getattr(tally, name) + int(info[f"cbf/{name}"]))
             margin = float(info["cbf/margin"])
             tally.smallest = margin if tally.smallest is None else min(tally.smallest, margin)
             reward += NEARNESS * nearness(margin, self._scale)
-            flagged = info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]
-            tally.unflagged += int(violated and not flagged)
         return observation, reward, terminated, truncated, info
 
 
