@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 import safe_wrappers as sw
 from benchmarks.cases import PROTECTED
 from benchmarks.judges import Judged
-from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, Count, encode, font
+from benchmarks.moving_picture import CHANGED_TEXT, INK, PAPER, VIOLATED, Count, beside, encode, font
 from benchmarks.tables import options
 from safe_wrappers.wrappers.safety_overlay import find_renderer, set_size
 
@@ -143,10 +143,7 @@ def film(scene: Scene) -> tuple[list[Image.Image], float, dict[str, Count]]:
         for _ in range(scene.stride):
             for side in sides:
                 side.step()
-        whole = Image.new("RGB", (2 * PANEL + GAP, HEAD + PANEL + FOOT), PAPER)
-        for k, side in enumerate(sides):
-            whole.paste(side.frame(), (k * (PANEL + GAP), 0))
-        frames.append(whole)
+        frames.append(beside(*(side.frame() for side in sides)))
     task: Any = sides[0].env.unwrapped
     for side in sides:
         side.env.close()
