@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, markdown, measured, options, total
+from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 
 TIMESTEP_S, SUBSTEPS = 0.002, 10
 """A control step of 20 ms, as Reacher's."""
@@ -214,8 +214,6 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, print the table."""
-    given = options(
-        __doc__, approaches=10_000, workers=multiprocessing.cpu_count(), folder=Path("runs/impact")
-    )
+    given = options(__doc__, approaches=10_000, workers=multiprocessing.cpu_count())
     jobs = [Job(limited, block) for block in range(given.approaches // BLOCK) for limited in (False, True)]
-    keep("impact", table(measured(given.folder / "impact.jsonl", jobs, run, given.workers)))
+    keep("impact", table(measured(RUNS / "impact/impact.jsonl", jobs, run, given.workers)))

@@ -13,7 +13,6 @@ began unsafe.
 
 import warnings
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
@@ -24,7 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.cases import CASES
 from benchmarks.judges import FLAGS, Judged, told
-from benchmarks.tables import keep, markdown, measured, options, total
+from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 SCALES: Final = {
@@ -176,6 +175,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Train what is not trained yet, print the table."""
-    given = options(__doc__, steps=300_000, seed=0, folder=Path("runs/trained_adversary"))
+    given = options(__doc__, steps=300_000, seed=0)
     jobs = [Job(env, given.steps, given.seed) for env in SCALES]
-    keep("trained_adversary", table(measured(given.folder / "trained_adversary.jsonl", jobs, run, 1)))
+    keep(
+        "trained_adversary", table(measured(RUNS / "trained_adversary/trained_adversary.jsonl", jobs, run, 1))
+    )
