@@ -291,6 +291,6 @@ HARD: dict[str, Case] = _by_name(
     PROTECTED["PointMaze_UMaze-v3"],
     _point_maze("Large"),
 )
-"""The envs with a hard limit, likewise; one row per driver."""
+"""The envs with a hard limit, likewise: what tests and other benchmarks attack besides."""
 
 CASES: dict[str, Case] = PROTECTED | HARD

@@ -13,6 +13,7 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks import mujoco_drivers
 from benchmarks.drivers import Action, Maker, stepwise
+from benchmarks.judges import Judge
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.wrappers.recipes import RECIPES
 
@@ -28,7 +29,6 @@ _FINGER_M = 0.15
 GRACE = 10
 """Control steps within which fingers that a reset has put into the table must have left it; later it counts."""
 BALL_RADIUS_M = 0.05
-_CORNERS = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
 
 
 def box_of(raw: Any) -> tuple[Array, Array]:
@@ -46,7 +46,7 @@ def ball_of(raw: Any) -> tuple[Array, float]:
     return np.asarray(raw.initial_gripper_xpos + np.array([0.02, 0.13, 0.08])), BALL_RADIUS_M
 
 
-class FetchJudge:
+class FetchJudge(Judge):
     """The gripper in its box, nothing of the robot in contact with the table, fingers out of a ball, if there is one.
 
     A contact counts from MuJoCo's contact margin on (1 mm here), where it begins to push. FetchPush and FetchSlide
@@ -109,25 +109,12 @@ class FetchJudge:
         return float(np.linalg.norm(np.maximum(np.abs(inside) - self._model.geom_size[finger], 0.0)))
 
     def _touch(self, data: mujoco.MjData) -> float:
-        """By how much a contact of robot and table is closer than where contacts begin, m; without one below zero."""
+        """By how much a contact of robot and table is closer than where contacts begin, m; without one -1."""
         pairs = data.contact.geom
         touching = (self._table[pairs] @ _ONES > 0.0) & (self._robot[pairs] @ _ONES > 0.0)
         if not touching.any():
-            return min(-self._room_over_table(data), 0.0)
+            return -1.0
         return float((data.contact.includemargin - data.contact.dist)[touching].max())
-
-    def _room_over_table(self, data: mujoco.MjData) -> float:
-        """Height of the lowest of the fingers' corners that are over the table, above its top, m."""
-        corners = np.concatenate(
-            [
-                data.geom_xpos[g] + (_CORNERS * self._model.geom_size[g]) @ data.geom_xmat[g].reshape(3, 3).T
-                for g in self._fingers
-            ]
-        )
-        table = int(self._table.argmax())
-        away = corners - data.geom_xpos[table]
-        over = (np.abs(away) <= self._model.geom_size[table])[:, :2].all(axis=1)
-        return float((away[over, 2] - self._model.geom_size[table][2]).min(initial=np.inf))
 
     def start(self) -> float:
         """The truth of the env's present state; a table that the reset itself touches is excused."""

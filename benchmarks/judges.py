@@ -5,7 +5,7 @@ requirement's own unit: above 0, or not a number, is a violation.
 """
 
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import gymnasium as gym
 import mujoco
@@ -20,17 +20,19 @@ FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-class Judge(Protocol):
+class Judge:
     """What says whether a step broke the requirement."""
 
     def start(self) -> float:
-        """By how much the env's present state, of a reset, misses it."""
+        """By how much the env's present state, of a reset, misses it; 0 where steps alone are judged."""
+        return 0.0
 
     def before(self) -> None:
         """Called before each step."""
 
     def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
         """By how much the step missed it: what the env was given, and the info that it returned."""
+        raise NotImplementedError
 
 
 class Judged(gym.Wrapper[Any, Any, Any, Any]):
@@ -65,7 +67,7 @@ def told(info: dict[str, Any], violated: bool) -> dict[str, int]:
     return found | {"violations": int(violated), "unflagged": int(violated and silent)}
 
 
-class Replay:
+class Replay(Judge):
     """Makes every step once more on data of its own and evaluates a truth after each physics substep.
 
     Args:
@@ -124,7 +126,7 @@ class Replay:
         return self._truth(self._data)
 
 
-class Reported:
+class Reported(Judge):
     """Reads what the task itself reports of a step.
 
     Args:
@@ -134,15 +136,7 @@ class Reported:
     def __init__(self, missed: Callable[[dict[str, Any]], float]) -> None:
         self._missed = missed
 
-    def start(self) -> float:
-        """Nothing has been reported yet: safe."""
-        return 0.0
-
-    def before(self) -> None:
-        """Nothing to keep."""
-
     def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
-        """What the step's info says."""
         return self._missed(info)
 
 
@@ -231,7 +225,7 @@ def wall_geoms(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX)))
 
 
-class Worst:
+class Worst(Judge):
     """Several judges at once: the one that is most displeased.
 
     Args:
