@@ -57,49 +57,32 @@ class Case:
         return gym.make(self.env_id, max_episode_steps=self.max_episode_steps, render_mode=render_mode)
 
 
-CROSSING_TRACKS: dict[str, Any] = {
-    # 2 * 0.15^2 / 2 = 0.0225 m^2/s^3 along their lanes, and nothing across: safe_wrappers.envs.traffic.
-    "tracks": [
-        {
-            "bodies": bodies,
-            "mean_velocity": [mean, 0],
-            "acceleration_noise": [0.0225, 0],
-            "reversion_s": 2.0,
-            "start_position_std": [0.3, 0],
-            "start_velocity_std": [0.15, 0],
-        }
-        for bodies, mean in (("car[012]", 1), ("car[345]", -1))
-    ],
-    "sensor": {"camera": "eye", "view_deg": 120, "range_m": 6, "position_std": 0.05},
-    "tolerance": 0.5,
-}
-"""Of OccludedCrossing: as configs/occluded_crossing_ppo.yaml has it."""
-
-PATROLLED_TRACKS: dict[str, Any] = {
-    # 2 * (0.5^2 + 0.15^2) / 2 = 0.2725 m^2/s^3 along the corridor: safe_wrappers.envs.patrolled_maze.
-    "tracks": [
-        {
-            "published": "patrol_positions",
-            "acceleration_noise": [0.2725, 0],
-            "reversion_s": 2.0,
-            "start_position_std": [0.1, 0],
-            "start_velocity_std": [0.55, 0],
-        }
-    ],
-    "sensor": {"site": "particle_site", "position_std": 0.02},
-    "tolerance": 0.5,
-}
-"""Of PatrolledPointMaze on the U maze."""
+def crossing(env: gym.Env[Any, Any], tolerance: float = 0.5) -> sw.OcclusionPenalty:
+    """OccludedCrossing with its cars tracked, as configs/occluded_crossing_ppo.yaml has it."""
+    car = {
+        # 2 * 0.15^2 / 2 = 0.0225 m^2/s^3 along their lanes, and nothing across: safe_wrappers.envs.traffic.
+        "acceleration_noise": [0.0225, 0],
+        "reversion_s": 2.0,
+        "start_position_std": [0.3, 0],
+        "start_velocity_std": [0.15, 0],
+    }
+    lanes = (("car[012]", 1), ("car[345]", -1))
+    tracks = [{"bodies": bodies, "mean_velocity": [mean, 0], **car} for bodies, mean in lanes]
+    sensor = {"camera": "eye", "view_deg": 120, "range_m": 6, "position_std": 0.05}
+    return sw.OcclusionPenalty(env, tracks, sensor, tolerance)
 
 
-def crossing(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
-    """OccludedCrossing with its cars tracked."""
-    return sw.OcclusionPenalty(env, **(CROSSING_TRACKS | changes))
-
-
-def patrolled(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
-    """PatrolledPointMaze with its patrols tracked."""
-    return sw.OcclusionPenalty(env, **(PATROLLED_TRACKS | changes))
+def patrolled(env: gym.Env[Any, Any]) -> sw.OcclusionPenalty:
+    """PatrolledPointMaze on the U maze with its patrols tracked."""
+    patrol = {
+        "published": "patrol_positions",
+        # 2 * (0.5^2 + 0.15^2) / 2 = 0.2725 m^2/s^3 along the corridor: safe_wrappers.envs.patrolled_maze.
+        "acceleration_noise": [0.2725, 0],
+        "reversion_s": 2.0,
+        "start_position_std": [0.1, 0],
+        "start_velocity_std": [0.55, 0],
+    }
+    return sw.OcclusionPenalty(env, [patrol], {"site": "particle_site", "position_std": 0.02}, tolerance=0.5)
 
 
 _BLIND: dict[str, Maker] = {
@@ -177,26 +160,6 @@ def _point_maze(maze: str) -> Case:
     return Case(f"PointMaze_{maze}-v3", judge=judge, drivers=_BLIND | {"wall-seeking": drivers.wall_seeking})
 
 
-def _patrolled_maze() -> Case:
-    walls = _point_maze("UMaze").judge
-    return Case(
-        "PatrolledPointMaze-v0",
-        judge=lambda env: Worst(walls(env), Reported(judges.costs)),
-        drivers=_BLIND | PATROLLED,
-        protect=lambda env: sw.protect(patrolled(env)),
-    )
-
-
-def _teleop() -> Case:
-    # A step is 1 ms: half a minute of the others' pulses is half a second here.
-    return Case(
-        "TeleopContact-v0",
-        judge=_replayed(lambda model: judges.joint_above(model, "y", CLAMP_Y - TOOL_RADIUS)),
-        drivers=_BLIND
-        | {"pulse of 0.3 s": drivers.corners(hold=300), "clamp-seeking": drivers.clamp_seeking},
-    )
-
-
 def _fallen(env_id: str) -> Case:
     """A pendulum whose episodes go on after the fall: the cart goes far before the pole does only by chance."""
     return Case(
@@ -244,7 +207,13 @@ PROTECTED: dict[str, Case] = _by_name(
         judge=lambda env: Reported(lambda info: float(info["slip_max"]) - 0.2),
         drivers=_BLIND | {"full throttle and reverse": drivers.end_seeking},
     ),
-    _teleop(),
+    # A step is 1 ms: half a minute of the others' pulses is half a second here.
+    Case(
+        "TeleopContact-v0",
+        judge=_replayed(lambda model: judges.joint_above(model, "y", CLAMP_Y - TOOL_RADIUS)),
+        drivers=_BLIND
+        | {"pulse of 0.3 s": drivers.corners(hold=300), "clamp-seeking": drivers.clamp_seeking},
+    ),
     Case(
         "OccludedCrossing-v0",
         judge=lambda env: Reported(judges.costs),
@@ -252,7 +221,12 @@ PROTECTED: dict[str, Case] = _by_name(
         protect=lambda env: sw.protect(crossing(env)),
     ),
     _point_maze("UMaze"),
-    _patrolled_maze(),
+    Case(
+        "PatrolledPointMaze-v0",
+        judge=lambda env: Worst(_point_maze("UMaze").judge(env), Reported(judges.costs)),
+        drivers=_BLIND | PATROLLED,
+        protect=lambda env: sw.protect(patrolled(env)),
+    ),
     Case(
         "AntMaze_UMaze-v5",
         judge=_replayed(lambda model: judges.near_wall(model, "torso", 0.4)),

@@ -23,7 +23,6 @@ REACH_M = 0.25
 """Of the gripper's box, from where an episode starts, along x and y."""
 FLOOR_M, CEILING_M = 0.02, 0.5
 """Of the gripper's box, above the table's top."""
-_ONES = np.ones(2)
 _FINGER_M = 0.15
 """No part of a finger is farther from the gripper's site."""
 GRACE = 10
@@ -60,7 +59,6 @@ class FetchJudge(Judge):
     Attributes:
         low: Corner of the gripper's box, m.
         high: Likewise.
-        excused: Control steps that began in grace so far.
     """
 
     def __init__(self, raw: Any, ball: bool = False) -> None:
@@ -72,11 +70,11 @@ class FetchJudge(Judge):
         self._site = model.site("robot0:grip").id
         self._fingers = [model.geom(f"robot0:{side}_gripper_finger_link").id for side in "lr"]
         owner = [model.body(i).name for i in model.geom_bodyid]
-        self._robot = np.array([name.startswith("robot0:") for name in owner], dtype=np.float64)
-        self._table = np.array([name == "table0" for name in owner], dtype=np.float64)
+        self._robot = np.array([name.startswith("robot0:") for name in owner])
+        self._table = np.array([name == "table0" for name in owner])
         self.low, self.high = box_of(raw)
         self._missed = np.full(3, -np.inf)
-        self._left = self.excused = 0
+        self._left = 0
         raw._mujoco_step = self._step
 
     def _step(self, action: Array) -> None:
@@ -111,7 +109,7 @@ class FetchJudge(Judge):
     def _touch(self, data: mujoco.MjData) -> float:
         """By how much a contact of robot and table is closer than where contacts begin, m; without one -1."""
         pairs = data.contact.geom
-        touching = (self._table[pairs] @ _ONES > 0.0) & (self._robot[pairs] @ _ONES > 0.0)
+        touching = self._table[pairs].any(axis=1) & self._robot[pairs].any(axis=1)
         if not touching.any():
             return -1.0
         return float((data.contact.includemargin - data.contact.dist)[touching].max())
@@ -134,7 +132,6 @@ class FetchJudge(Judge):
             self._look(qpos)
         if not self._left:
             return float(self._missed.max())
-        self.excused += 1
         self._left = self._left - 1 if self._missed.max() > 0.0 else 0
         return float(self._missed[0])
 

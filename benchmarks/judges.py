@@ -93,7 +93,6 @@ class Replay(Judge):
         self._state = np.zeros(mujoco.mj_stateSize(self._model, _STATE))
 
     def start(self) -> float:
-        """The truth of the env's present state."""
         self.before()
         mujoco.mj_setState(self._model, self._data, self._state, _STATE)
         return self._present()
@@ -236,11 +235,9 @@ class Worst(Judge):
         self._judges = judges
 
     def start(self) -> float:
-        """The largest."""
         return float(np.max([judge.start() for judge in self._judges]))
 
     def before(self) -> None:
-        """Tell them all."""
         for judge in self._judges:
             judge.before()
 

@@ -54,7 +54,7 @@ def run(job: Job) -> dict[str, Any]:
     driver = case.drivers[job.driver](env.unwrapped, rng)
     kind = env.action_space.dtype
     count = Counter[str]()
-    ratios: dict[bool, list[float]] = {False: [], True: []}
+    ratios: dict[str, list[float]] = {"inactive": [], "active": []}
     episode, over = job.seed * 100_000, True
     for step in range(job.steps):
         while over:
@@ -74,16 +74,13 @@ def run(job: Job) -> dict[str, Any]:
         if twin is not None and step < TIMED:
             begin = time.perf_counter()
             twin.step(np.asarray(executed, dtype=kind))
-            ratios[bool(info["cbf/intervened"])].append(spent / (time.perf_counter() - begin))
+            ratios["active" if info["cbf/intervened"] else "inactive"].append(
+                spent / (time.perf_counter() - begin)
+            )
         over = bool(truncated or (terminated and not case.past_termination))
-    return {**asdict(job), **count, **_timings(ratios)}
-
-
-def _timings(ratios: dict[bool, list[float]]) -> dict[str, Any]:
-    row: dict[str, Any] = {}
-    for changed, name in ((False, "inactive"), (True, "active")):
-        row[f"{name}_timed"] = len(ratios[changed])
-        row[f"{name}_ratio"] = float(np.median(ratios[changed])) if ratios[changed] else None
+    row = {**asdict(job), **count}
+    for name, timed in ratios.items():
+        row |= {f"{name}_timed": len(timed), f"{name}_ratio": float(np.median(timed)) if timed else None}
     return row
 
 
@@ -92,10 +89,9 @@ def jobs(cases: dict[str, Case], steps: int) -> list[Job]:
     found = []
     for (name, case), filtered in itertools.product(cases.items(), (True, False)):
         for driver in case.drivers:
-            left, seed = max(steps // len(case.drivers), 1), 0
-            while left > 0:
-                found.append(Job(name, driver, filtered, min(left, CHUNK), seed))
-                left, seed = left - CHUNK, seed + 1
+            each = max(steps // len(case.drivers), 1)
+            for seed, first in enumerate(range(0, each, CHUNK)):
+                found.append(Job(name, driver, filtered, min(each - first, CHUNK), seed))
     return found
 
 

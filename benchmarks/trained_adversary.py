@@ -13,6 +13,7 @@ began unsafe.
 
 import warnings
 from dataclasses import asdict, dataclass
+from functools import reduce
 from typing import Any, Final
 
 import gymnasium as gym
@@ -121,9 +122,7 @@ def run(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
     policy = "MultiInputPolicy" if isinstance(envs.observation_space, gym.spaces.Dict) else "MlpPolicy"
     model = PPO(policy, envs, seed=job.seed, device="cpu", **settings)
     model.learn(job.steps)
-    training = Tally()
-    for env in made:
-        training = training.plus(env.tally)
+    training = reduce(Tally.plus, (env.tally for env in made))
     row: dict[str, Any] = asdict(job) | {"training": asdict(training)}
     for name, deterministic, filtered in (
         ("deterministic", True, True),
