@@ -22,7 +22,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import car_drivers, drivers
-from benchmarks.judges import told
+from benchmarks.judges import counted
 from benchmarks.tables import keep, markdown, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -62,7 +62,7 @@ def run(job: Job) -> dict[str, Any]:
     for _ in range(job.steps):
         _, reward, _, truncated, info = env.step(driver())
         total += float(reward)
-        count.update(told(info, info["cost_substep"] > 0.0))
+        count.update(counted(info, info["cost_substep"] > 0.0))
         if job.filtered:
             lowest = min(lowest, info["cbf/margin"])
         if truncated:

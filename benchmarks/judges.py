@@ -57,7 +57,7 @@ class Judged(gym.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info | {"cost": verdict, "cost_substep": verdict}
 
 
-def told(info: dict[str, Any], violated: bool) -> dict[str, int]:
+def counted(info: dict[str, Any], violated: bool) -> dict[str, int]:
     """What a step adds to counts: its flags, a violation, and one that no flag but "intervened" came with.
 
     Without a filter there are no flags, and nothing that is unflagged.

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases import PROTECTED, Case
-from benchmarks.judges import told
+from benchmarks.judges import counted
 from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -70,7 +70,7 @@ def run(job: Job) -> dict[str, Any]:
         spent = time.perf_counter() - begin
         executed = info["executed_action"] if job.filtered else action
         missed = judge.after(executed, info)
-        count.update(told(info, not missed <= 0.0))  # so that what is not a number counts
+        count.update(counted(info, not missed <= 0.0))  # so that what is not a number counts
         if twin is not None and step < TIMED:
             begin = time.perf_counter()
             twin.step(np.asarray(executed, dtype=kind))

@@ -23,7 +23,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.cases import CASES
-from benchmarks.judges import FLAGS, Judged, told
+from benchmarks.judges import FLAGS, Judged, counted
 from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
@@ -97,7 +97,7 @@ class Adversary(Judged):
         """Steps, judges, counts and pays."""
         observation, _, terminated, truncated, info = super().step(action)
         reward, tally = float(info["cost_substep"]), self.tally
-        for name, count in {"steps": 1, **told(info, reward > 0.0)}.items():
+        for name, count in {"steps": 1, **counted(info, reward > 0.0)}.items():
             setattr(tally, name, getattr(tally, name) + count)
         if self._filtered:
             margin = float(info["cbf/margin"])
