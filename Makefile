@@ -128,7 +128,6 @@ figures: .venv/installed
 	$(RUN) adversarial --robot car --steps 500000
 	$(RUN) adversarial --robot car --off --steps 49000 --parts 1
 	$(RUN) protected --steps 3000
-	$(RUN) protected --hard --steps 100000
 	for name in trained_adversary leases slip impact occlusion teleop kills training_time; do $(RUN) $$name || exit 1; done
 	$(RUN) kills --seeds 2 --workers 2 --name kills_together
 	for config in $(COMPARED); do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done

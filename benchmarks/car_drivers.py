@@ -4,12 +4,13 @@ The motors saturate at a control of 0.02: what lies beyond is full torque.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from benchmarks.drivers import Action, Driver, Maker, held
+from benchmarks import drivers
+from benchmarks.drivers import Action, Driver, Maker, stepwise
 from safe_wrappers.errors import Array
 
 _FULL = 0.02
@@ -28,89 +29,68 @@ def goal_seeking(env: Any, rng: np.random.Generator) -> Driver:
     return lambda: towards(env, env.goal_position)
 
 
-def hazard_seeking(env: Any, rng: np.random.Generator) -> Driver:
-    """Into one hazard after another; every 75 steps another one of the nearest three."""
-    return _seeking(env, rng, lambda: np.asarray(env.hazard_positions))
+def _seeking(places: str) -> Maker:
+    """Into one after another of the env's places of this name; every 75 steps another one of the nearest three."""
+
+    @stepwise
+    def seek(env: Any, rng: np.random.Generator) -> Iterator[Action]:
+        while True:
+            pick, backwards = int(rng.integers(3)), rng.choice([-1.0, 1.0]) < 0.0
+            strength = float(rng.choice([0.5, 1.0])) * _FULL
+            for _ in range(75):
+                targets = np.asarray(getattr(env, places))
+                near = np.argsort(np.linalg.norm(targets - env.agent_position, axis=1))
+                target = targets[near[pick % len(targets)]]
+                if backwards:  # the mirror of the target leads backwards into it
+                    yield -towards(env, 2.0 * env.agent_position - target, strength)[::-1]
+                else:
+                    yield towards(env, target, strength)
+
+    return seek
 
 
-def _seeking(env: Any, rng: np.random.Generator, where: Callable[[], Array]) -> Driver:
-    state: dict[str, Any] = {"step": 0, "pick": 0, "sense": 1.0, "strength": _FULL}
-
-    def act() -> Action:
-        targets = where()
-        if state["step"] % 75 == 0:
-            state.update(pick=int(rng.integers(3)), sense=float(rng.choice([-1.0, 1.0])))
-            state.update(strength=float(rng.choice([0.5, 1.0])) * _FULL)
-        state["step"] += 1
-        near = np.argsort(np.linalg.norm(targets - env.agent_position, axis=1))
-        target = targets[near[state["pick"] % len(targets)]]
-        if state["sense"] > 0.0:
-            return towards(env, target, state["strength"])
-        # The mirror of the target leads backwards into it.
-        return -towards(env, 2.0 * env.agent_position - target, state["strength"])[::-1]
-
-    return act
-
-
-def bang_bang(env: Any, rng: np.random.Generator) -> Driver:
-    """Full torque one way or the other, both wheels, held for random times."""
-    return _in_the_field(env, held(lambda: (int(rng.geometric(0.08)), rng.choice([-1.0, 1.0], size=2))))
-
-
-def full_throttle(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def full_throttle(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Run at an obstacle at top speed, then kick the wheels any way when it is near."""
-    state: dict[str, Any] = {"step": 0, "pick": 0, "run": 40, "kick": np.ones(2)}
-
-    def act() -> Action:
-        targets = np.concatenate([env.hazard_positions, env.vase_positions])
-        phase = state["step"] % 60
-        if phase == 0:
-            state.update(pick=int(rng.integers(len(targets))), run=int(rng.integers(20, 60)))
-            state.update(kick=rng.choice([-1.0, 0.0, 1.0], size=2))
-        state["step"] += 1
-        if phase < state["run"]:
-            return np.sign(towards(env, targets[state["pick"]]) - 0.1 * _FULL)
-        return np.array(state["kick"])
-
-    return act
+    while True:
+        pick, run = int(rng.integers(len(drivers.obstacles(env)))), int(rng.integers(20, 60))
+        kick = rng.choice([-1.0, 0.0, 1.0], size=2)
+        for step in range(60):
+            ahead = np.sign(towards(env, drivers.obstacles(env)[pick]) - 0.1 * _FULL)
+            yield ahead if step < run else kick.copy()
 
 
-def pulse(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def pulse(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Nothing, then a kick of one or two steps."""
-    state = {"left": 0}
-
-    def act() -> Action:
-        state["left"] -= 1
-        if state["left"] < -int(rng.integers(1, 12)):
-            state["left"] = int(rng.integers(1, 3))
-        return rng.choice([-1.0, 0.0, 1.0], size=2) if state["left"] > 0 else np.zeros(2)
-
-    return _in_the_field(env, act)
+    left = 0
+    while True:
+        left -= 1
+        if left < -int(rng.integers(1, 12)):
+            left = int(rng.integers(1, 3))
+        yield rng.choice([-1.0, 0.0, 1.0], size=2) if left > 0 else np.zeros(2)
 
 
-def uniform(env: Any, rng: np.random.Generator) -> Driver:
-    """Uniform random actions."""
-    return _in_the_field(env, lambda: rng.uniform(-1.0, 1.0, size=2))
-
-
-def _in_the_field(env: Any, driver: Driver) -> Driver:
+def _in_the_field(maker: Maker) -> Maker:
     """A driver that goes back to the middle, over all that stands there, whenever it has left the field."""
-    state = {"home": False}
 
-    def act() -> Action:
-        distance = float(np.linalg.norm(env.agent_position))
-        state["home"] = distance > env.level.half_extent or (state["home"] and distance > 0.5)
-        return towards(env, np.zeros(2)) if state["home"] else driver()
+    @stepwise
+    def drive(env: Any, rng: np.random.Generator) -> Iterator[Action]:
+        act, homewards = maker(env, rng), False
+        while True:
+            distance = float(np.linalg.norm(env.agent_position))
+            homewards = distance > env.level.half_extent or (homewards and distance > 0.5)
+            yield towards(env, np.zeros(2)) if homewards else act()
 
-    return act
+    return drive
 
 
 DRIVERS: dict[str, Maker] = {
-    "random": uniform,
+    "random": _in_the_field(drivers.uniform),
     "goal-seeking": goal_seeking,
-    "hazard-seeking": hazard_seeking,
-    "vase-seeking": lambda env, rng: _seeking(env, rng, lambda: np.asarray(env.vase_positions)),
-    "bang-bang": bang_bang,
+    "hazard-seeking": _seeking("hazard_positions"),
+    "vase-seeking": _seeking("vase_positions"),
+    "bang-bang": _in_the_field(drivers.bang_bang(0.08)),
     "full throttle": full_throttle,
-    "pulse": pulse,
+    "pulse": _in_the_field(pulse),
 }

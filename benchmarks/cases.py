@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 
 import safe_wrappers as sw
@@ -56,49 +57,32 @@ class Case:
         return gym.make(self.env_id, max_episode_steps=self.max_episode_steps, render_mode=render_mode)
 
 
-CROSSING_TRACKS: dict[str, Any] = {
-    # 2 * 0.15^2 / 2 = 0.0225 m^2/s^3 along their lanes, and nothing across: safe_wrappers.envs.traffic.
-    "tracks": [
-        {
-            "bodies": bodies,
-            "mean_velocity": [mean, 0],
-            "acceleration_noise": [0.0225, 0],
-            "reversion_s": 2.0,
-            "start_position_std": [0.3, 0],
-            "start_velocity_std": [0.15, 0],
-        }
-        for bodies, mean in (("car[012]", 1), ("car[345]", -1))
-    ],
-    "sensor": {"camera": "eye", "view_deg": 120, "range_m": 6, "position_std": 0.05},
-    "tolerance": 0.5,
-}
-"""Of OccludedCrossing: as configs/occluded_crossing_ppo.yaml has it."""
-
-PATROLLED_TRACKS: dict[str, Any] = {
-    # 2 * (0.5^2 + 0.15^2) / 2 = 0.2725 m^2/s^3 along the corridor: safe_wrappers.envs.patrolled_maze.
-    "tracks": [
-        {
-            "published": "patrol_positions",
-            "acceleration_noise": [0.2725, 0],
-            "reversion_s": 2.0,
-            "start_position_std": [0.1, 0],
-            "start_velocity_std": [0.55, 0],
-        }
-    ],
-    "sensor": {"site": "particle_site", "position_std": 0.02},
-    "tolerance": 0.5,
-}
-"""Of PatrolledPointMaze on the U maze."""
+def crossing(env: gym.Env[Any, Any], tolerance: float = 0.5) -> sw.OcclusionPenalty:
+    """OccludedCrossing with its cars tracked, as configs/occluded_crossing_ppo.yaml has it."""
+    car = {
+        # 2 * 0.15^2 / 2 = 0.0225 m^2/s^3 along their lanes, and nothing across: safe_wrappers.envs.traffic.
+        "acceleration_noise": [0.0225, 0],
+        "reversion_s": 2.0,
+        "start_position_std": [0.3, 0],
+        "start_velocity_std": [0.15, 0],
+    }
+    lanes = (("car[012]", 1), ("car[345]", -1))
+    tracks = [{"bodies": bodies, "mean_velocity": [mean, 0], **car} for bodies, mean in lanes]
+    sensor = {"camera": "eye", "view_deg": 120, "range_m": 6, "position_std": 0.05}
+    return sw.OcclusionPenalty(env, tracks, sensor, tolerance)
 
 
-def crossing(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
-    """OccludedCrossing with its cars tracked."""
-    return sw.OcclusionPenalty(env, **(CROSSING_TRACKS | changes))
-
-
-def patrolled(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
-    """PatrolledPointMaze with its patrols tracked."""
-    return sw.OcclusionPenalty(env, **(PATROLLED_TRACKS | changes))
+def patrolled(env: gym.Env[Any, Any]) -> sw.OcclusionPenalty:
+    """PatrolledPointMaze on the U maze with its patrols tracked."""
+    patrol = {
+        "published": "patrol_positions",
+        # 2 * (0.5^2 + 0.15^2) / 2 = 0.2725 m^2/s^3 along the corridor: safe_wrappers.envs.patrolled_maze.
+        "acceleration_noise": [0.2725, 0],
+        "reversion_s": 2.0,
+        "start_position_std": [0.1, 0],
+        "start_velocity_std": [0.55, 0],
+    }
+    return sw.OcclusionPenalty(env, [patrol], {"site": "particle_site", "position_std": 0.02}, tolerance=0.5)
 
 
 _BLIND: dict[str, Maker] = {
@@ -110,15 +94,17 @@ _RAIL = _BLIND | {"end-seeking": drivers.end_seeking, "carrying": drivers.carryi
 _SPEED = _BLIND | {"speed-seeking": drivers.speed_seeking}
 
 _DISC, _DISC_RADIUS = (-0.1, 0.1), 0.05
-_TABLE_LOW, _TABLE_HIGH = (-0.2, -1.2, -0.3), (0.9, 0.15, 0.4)
 
 
-def _rail(env: Any) -> Judge:
-    return Replay(env, judges.joint_beyond(env.model, "slider", 0.95))
+def _replayed(*truths: Callable[[mujoco.MjModel], judges.Truth]) -> Callable[[Any], Judge]:
+    return lambda env: Replay(env, judges.any_of(*(truth(env.model) for truth in truths)))
 
 
-def _joint_speeds(limit: float) -> Callable[[Any], Judge]:
-    return lambda env: Replay(env, judges.joints_too_fast(env.model, limit))
+def _joint_speeds(limit: float) -> Callable[[mujoco.MjModel], judges.Truth]:
+    return lambda model: judges.joints_too_fast(model, limit)
+
+
+_RAIL_ENDS = _replayed(lambda model: judges.joint_beyond(model, "slider", 0.95))
 
 
 def _reacher_and_disc(env: gym.Env[Any, Any]) -> sw.CBFActionFilter:
@@ -130,26 +116,6 @@ def _reacher_and_disc(env: gym.Env[Any, Any]) -> sw.CBFActionFilter:
         horizon=3,
     )
     return sw.CBFActionFilter(env, [speeds, disc])
-
-
-def _judge_reacher_and_disc(env: Any) -> Judge:
-    return Replay(
-        env,
-        judges.any_of(
-            judges.joints_too_fast(env.model, 5.0),
-            judges.inside_disc(env.model, "fingertip", _DISC, _DISC_RADIUS),
-        ),
-    )
-
-
-def _judge_pusher(env: Any) -> Judge:
-    return Replay(
-        env,
-        judges.any_of(
-            judges.joints_too_fast(env.model, 6.0),
-            judges.outside_box(env.model, "tips_arm", _TABLE_LOW, _TABLE_HIGH),
-        ),
-    )
 
 
 # Beyond every side of the tip's box: past the table's edges, through its top, behind the shoulder, up.
@@ -194,29 +160,11 @@ def _point_maze(maze: str) -> Case:
     return Case(f"PointMaze_{maze}-v3", judge=judge, drivers=_BLIND | {"wall-seeking": drivers.wall_seeking})
 
 
-def _patrolled_maze() -> Case:
-    walls = _point_maze("UMaze").judge
-    return Case(
-        "PatrolledPointMaze-v0",
-        judge=lambda env: Worst(walls(env), Reported(judges.costs)),
-        drivers=_BLIND | PATROLLED,
-        protect=lambda env: sw.protect(patrolled(env)),
-    )
-
-
-def _teleop() -> Case:
-    # A step is 1 ms: half a minute of the others' pulses is half a second here.
-    return Case(
-        "TeleopContact-v0",
-        judge=lambda env: Replay(env, judges.joint_above(env.model, "y", CLAMP_Y - TOOL_RADIUS)),
-        drivers=_BLIND
-        | {"pulse of 0.3 s": drivers.corners(hold=300), "clamp-seeking": drivers.clamp_seeking},
-    )
-
-
 def _fallen(env_id: str) -> Case:
     """A pendulum whose episodes go on after the fall: the cart goes far before the pole does only by chance."""
-    return Case(env_id, _rail, _RAIL, note="on after the fall", past_termination=True, max_episode_steps=500)
+    return Case(
+        env_id, _RAIL_ENDS, _RAIL, note="on after the fall", past_termination=True, max_episode_steps=500
+    )
 
 
 def _hand(env_id: str, limit: float, slides: float = np.inf, also: tuple[str, ...] = ()) -> Case:
@@ -236,23 +184,36 @@ PROTECTED: dict[str, Case] = _by_name(
     *(_goal_task("Car", level, CAR_GOAL) for level in range(3)),
     _fallen("InvertedPendulum-v5"),
     _fallen("InvertedDoublePendulum-v5"),
-    Case("Reacher-v5", _joint_speeds(5.0), _SPEED),
-    Case("FlexJointReach-v0", _joint_speeds(8.0), _SPEED),
-    Case("Pusher-v5", _judge_pusher, _SPEED | {"off the table": _OFF_THE_TABLE}),
+    Case("Reacher-v5", _replayed(_joint_speeds(5.0)), _SPEED),
+    Case("FlexJointReach-v0", _replayed(_joint_speeds(8.0)), _SPEED),
+    Case(
+        "Pusher-v5",
+        _replayed(
+            _joint_speeds(6.0),
+            lambda model: judges.outside_box(model, "tips_arm", (-0.2, -1.2, -0.3), (0.9, 0.15, 0.4)),
+        ),
+        _SPEED | {"off the table": _OFF_THE_TABLE},
+    ),
     _velocity("HalfCheetah", 3.2096),
     _velocity("Hopper", 0.7402),
     _velocity("Walker2d", 2.3415),
     _velocity("Swimmer", 0.2282),
     _velocity("Ant", 2.6222, plane=True),
     _velocity("Humanoid", 1.4149, plane=True),
-    Case("HumanoidStandup-v5", _joint_speeds(20.0), _SPEED),
+    Case("HumanoidStandup-v5", _replayed(_joint_speeds(20.0)), _SPEED),
     # At the edge of another ground a step or two overshoot the limit of 0.15; beyond 0.2 all grounds have fallen.
     Case(
         "SafeRover-v0",
         judge=lambda env: Reported(lambda info: float(info["slip_max"]) - 0.2),
         drivers=_BLIND | {"full throttle and reverse": drivers.end_seeking},
     ),
-    _teleop(),
+    # A step is 1 ms: half a minute of the others' pulses is half a second here.
+    Case(
+        "TeleopContact-v0",
+        judge=_replayed(lambda model: judges.joint_above(model, "y", CLAMP_Y - TOOL_RADIUS)),
+        drivers=_BLIND
+        | {"pulse of 0.3 s": drivers.corners(hold=300), "clamp-seeking": drivers.clamp_seeking},
+    ),
     Case(
         "OccludedCrossing-v0",
         judge=lambda env: Reported(judges.costs),
@@ -260,10 +221,15 @@ PROTECTED: dict[str, Case] = _by_name(
         protect=lambda env: sw.protect(crossing(env)),
     ),
     _point_maze("UMaze"),
-    _patrolled_maze(),
+    Case(
+        "PatrolledPointMaze-v0",
+        judge=lambda env: Worst(_point_maze("UMaze").judge(env), Reported(judges.costs)),
+        drivers=_BLIND | PATROLLED,
+        protect=lambda env: sw.protect(patrolled(env)),
+    ),
     Case(
         "AntMaze_UMaze-v5",
-        judge=lambda env: Replay(env, judges.near_wall(env.model, "torso", 0.4)),
+        judge=_replayed(lambda model: judges.near_wall(model, "torso", 0.4)),
         drivers={
             "random": drivers.random,
             "pulse": drivers.pulse,
@@ -281,13 +247,16 @@ PROTECTED: dict[str, Case] = _by_name(
 """Every env that `protect` knows, by the name of its row."""
 
 HARD: dict[str, Case] = _by_name(
-    Case("InvertedPendulum-v5", _rail, _RAIL),
+    Case("InvertedPendulum-v5", _RAIL_ENDS, _RAIL),
     _fallen("InvertedPendulum-v5"),
-    Case("InvertedDoublePendulum-v5", _rail, _RAIL),
+    Case("InvertedDoublePendulum-v5", _RAIL_ENDS, _RAIL),
     _fallen("InvertedDoublePendulum-v5"),
     Case(
         "Reacher-v5",
-        _judge_reacher_and_disc,
+        _replayed(
+            _joint_speeds(5.0),
+            lambda model: judges.inside_disc(model, "fingertip", _DISC, _DISC_RADIUS),
+        ),
         _SPEED | {"disc-seeking": drivers.point_seeking("fingertip", [(*_DISC, 0.01)])},
         _reacher_and_disc,
         note="with a disc",
@@ -296,6 +265,6 @@ HARD: dict[str, Case] = _by_name(
     PROTECTED["PointMaze_UMaze-v3"],
     _point_maze("Large"),
 )
-"""The envs with a hard limit, likewise; one row per driver."""
+"""The envs with a hard limit, likewise: what tests and other benchmarks attack besides."""
 
 CASES: dict[str, Case] = PROTECTED | HARD

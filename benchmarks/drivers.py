@@ -4,7 +4,8 @@ Each is a function of the unwrapped env, seeded; those of the crossing know noth
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,11 @@ from numpy.typing import NDArray
 Action = NDArray[np.float64]
 Driver = Callable[[], Action]
 Maker = Callable[[Any, np.random.Generator], Driver]
+
+
+def stepwise(actions: Callable[[Any, np.random.Generator], Iterator[Action]]) -> Maker:
+    """Makes a driver of a generator, which yields one action per control step."""
+    return lambda env, rng: partial(next, actions(env, rng))
 
 
 def held(draw: Callable[[], tuple[int, Any]]) -> Callable[[], Any]:
@@ -42,42 +48,30 @@ def goal_seeking(env: Any, rng: np.random.Generator) -> Driver:
     return lambda: towards(env, env.goal_position)
 
 
-def hazard_seeking(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def hazard_seeking(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Into one obstacle after another, vases too; every 150 steps another one of the nearest three."""
-    state = {"step": 0, "pick": 0}
-
-    def act() -> Action:
-        obstacles = _obstacles(env)
-        if state["step"] % 150 == 0:
-            state["pick"] = int(rng.integers(3))
-        state["step"] += 1
-        near = np.argsort(np.linalg.norm(obstacles - env.agent_position, axis=1))
-        return towards(env, obstacles[near[state["pick"]]])
-
-    return act
+    while True:
+        pick = int(rng.integers(3))
+        for _ in range(150):
+            places = obstacles(env)
+            near = np.argsort(np.linalg.norm(places - env.agent_position, axis=1))
+            yield towards(env, places[near[pick]])
 
 
-def lateral_drift(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def lateral_drift(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Gather speed towards an obstacle, then turn, so that no actuator acts along the velocity."""
-    state = {"step": 0, "pick": 0, "turn": 1.0, "drive": 0.0, "run": 60}
-
-    def act() -> Action:
-        obstacles = _obstacles(env)
-        phase = state["step"] % 110
-        if phase == 0:
-            state.update(pick=int(rng.integers(len(obstacles))), run=int(rng.integers(30, 90)))
-            state.update(turn=float(rng.choice([-1.0, 1.0])), drive=float(rng.choice([-1.0, 0.0, 1.0])))
-        state["step"] += 1
-        if phase < state["run"]:
-            return towards(env, obstacles[state["pick"]])
-        return np.array([state["drive"], state["turn"]])
-
-    return act
+    while True:
+        pick, run = int(rng.integers(len(obstacles(env)))), int(rng.integers(30, 90))
+        turn, drive = rng.choice([-1.0, 1.0]), rng.choice([-1.0, 0.0, 1.0])
+        for step in range(110):
+            yield towards(env, obstacles(env)[pick]) if step < run else np.array([drive, turn])
 
 
-def bang_bang(env: Any, rng: np.random.Generator) -> Driver:
-    """Full throttle one way or the other, both actuators, held for random times."""
-    return held(lambda: (int(rng.geometric(0.04)), rng.choice([-1.0, 1.0], size=2)))
+def bang_bang(often: float, size: int = 2) -> Maker:
+    """All actuators at one end or the other, held for random times; `often` is the share of steps with a change."""
+    return lambda env, rng: held(lambda: (int(rng.geometric(often)), rng.choice([-1.0, 1.0], size)))
 
 
 def uniform(env: Any, rng: np.random.Generator) -> Driver:
@@ -85,7 +79,8 @@ def uniform(env: Any, rng: np.random.Generator) -> Driver:
     return lambda: rng.uniform(-1.0, 1.0, size=2)
 
 
-def _obstacles(env: Any) -> NDArray[np.float64]:
+def obstacles(env: Any) -> NDArray[np.float64]:
+    """Places of all hazards and vases."""
     vases = env.vase_positions
     return np.concatenate([env.hazard_positions, vases]) if len(vases) else np.asarray(env.hazard_positions)
 
@@ -95,68 +90,54 @@ DRIVERS: dict[str, Maker] = {
     "goal-seeking": goal_seeking,
     "hazard-seeking": hazard_seeking,
     "lateral-drift": lateral_drift,
-    "bang-bang": bang_bang,
+    "bang-bang": bang_bang(0.04),
 }
 """Of SafePointGoal."""
 
 
-def across(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def across(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Straight to the goal as fast as the robot can, looking where it goes."""
-
-    def act() -> Action:
+    while True:
         x, y = env.goal_position - env.agent_position
         turn = math.remainder(math.atan2(y, x) - env.agent_heading, math.tau)
-        return np.clip([2.0 * x, 2.0 * y, 2.0 * turn], -1.0, 1.0)
-
-    return act
+        yield np.clip([2.0 * x, 2.0 * y, 2.0 * turn], -1.0, 1.0)
 
 
-def crossing_bang_bang(env: Any, rng: np.random.Generator) -> Driver:
-    """Full force one way or the other along each axis, and full turns, held for random times (1 s on average)."""
-    return held(lambda: (int(rng.geometric(0.04)), rng.choice([-1.0, 1.0], 3)))
-
-
-def into_traffic(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def into_traffic(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """To the middle of a lane and into its traffic: rests, then full force along or across it, by turns."""
-
-    def draw() -> tuple[int, tuple[float, float, float, float]]:
+    while True:
         (along, across), left = rng.choice([-1.0, 0.0, 1.0], 2), int(rng.integers(5, 40))
-        turn = float(rng.choice([-1.0, 0.0, 1.0]))
-        return left, (along, across, turn, float(rng.choice(env.lane_centres)))
-
-    current = held(draw)
-
-    def act() -> Action:
-        along, across, turn, lane = current()
-        back = lane - env.agent_position[1]
-        return np.clip([along, across if abs(back) < 1.0 else 2.0 * back, turn], -1.0, 1.0)
-
-    return act
+        turn, lane = rng.choice([-1.0, 0.0, 1.0]), rng.choice(env.lane_centres)
+        for _ in range(left):
+            back = lane - env.agent_position[1]
+            yield np.clip([along, across if abs(back) < 1.0 else 2.0 * back, turn], -1.0, 1.0)
 
 
-CROSSING: dict[str, Maker] = {"goal-seeking": across, "bang-bang": crossing_bang_bang, "pulse": into_traffic}
+CROSSING: dict[str, Maker] = {
+    "goal-seeking": across,
+    "bang-bang": bang_bang(0.04, size=3),
+    "pulse": into_traffic,
+}
 
 
-def patrol_seeking(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def patrol_seeking(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Straight at the nearest patrol, at full force, hidden or not."""
-
-    def act() -> Action:
+    while True:
         offsets = env.patrol_positions - env.agent_position
-        return np.clip(5.0 * offsets[np.hypot(*offsets.T).argmin()], -1.0, 1.0)
-
-    return act
+        yield np.clip(5.0 * offsets[np.hypot(*offsets.T).argmin()], -1.0, 1.0)
 
 
-def corridor(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def corridor(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Up and down the middle of the nearest corridor, turning about at random."""
     way = held(lambda: (int(rng.integers(20, 150)), float(rng.choice([-1.0, 1.0]))))
-
-    def act() -> Action:
+    while True:
         (_, y), (vx, vy) = env.agent_position, env.agent_velocity
         middle = env.patrol_positions[:, 1][np.abs(env.patrol_positions[:, 1] - y).argmin()]
-        return np.clip([0.5 * way() - 0.2 * vx * abs(vx), 3.0 * (middle - y) - 0.3 * vy], -1.0, 1.0)
-
-    return act
+        yield np.clip([0.5 * way() - 0.2 * vx * abs(vx), 3.0 * (middle - y) - 0.3 * vy], -1.0, 1.0)
 
 
 PATROLLED: dict[str, Maker] = {"patrol-seeking": patrol_seeking, "corridor": corridor}

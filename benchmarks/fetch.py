@@ -4,6 +4,7 @@ No code of a constraint is in the judge. It makes the env take its physics subst
 own positions after each, and after what the env does to its fingers at the end of a step; nothing is replayed.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -11,7 +12,8 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import mujoco_drivers
-from benchmarks.drivers import Action, Driver, Maker, held
+from benchmarks.drivers import Action, Maker, stepwise
+from benchmarks.judges import Judge
 from safe_wrappers.filter.bound import Bound
 from safe_wrappers.wrappers.recipes import RECIPES
 
@@ -21,13 +23,11 @@ REACH_M = 0.25
 """Of the gripper's box, from where an episode starts, along x and y."""
 FLOOR_M, CEILING_M = 0.02, 0.5
 """Of the gripper's box, above the table's top."""
-_ONES = np.ones(2)
 _FINGER_M = 0.15
 """No part of a finger is farther from the gripper's site."""
 GRACE = 10
 """Control steps within which fingers that a reset has put into the table must have left it; later it counts."""
 BALL_RADIUS_M = 0.05
-_CORNERS = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
 
 
 def box_of(raw: Any) -> tuple[Array, Array]:
@@ -45,7 +45,7 @@ def ball_of(raw: Any) -> tuple[Array, float]:
     return np.asarray(raw.initial_gripper_xpos + np.array([0.02, 0.13, 0.08])), BALL_RADIUS_M
 
 
-class FetchJudge:
+class FetchJudge(Judge):
     """The gripper in its box, nothing of the robot in contact with the table, fingers out of a ball, if there is one.
 
     A contact counts from MuJoCo's contact margin on (1 mm here), where it begins to push. FetchPush and FetchSlide
@@ -59,7 +59,6 @@ class FetchJudge:
     Attributes:
         low: Corner of the gripper's box, m.
         high: Likewise.
-        excused: Control steps that began in grace so far.
     """
 
     def __init__(self, raw: Any, ball: bool = False) -> None:
@@ -71,11 +70,11 @@ class FetchJudge:
         self._site = model.site("robot0:grip").id
         self._fingers = [model.geom(f"robot0:{side}_gripper_finger_link").id for side in "lr"]
         owner = [model.body(i).name for i in model.geom_bodyid]
-        self._robot = np.array([name.startswith("robot0:") for name in owner], dtype=np.float64)
-        self._table = np.array([name == "table0" for name in owner], dtype=np.float64)
+        self._robot = np.array([name.startswith("robot0:") for name in owner])
+        self._table = np.array([name == "table0" for name in owner])
         self.low, self.high = box_of(raw)
         self._missed = np.full(3, -np.inf)
-        self._left = self.excused = 0
+        self._left = 0
         raw._mujoco_step = self._step
 
     def _step(self, action: Array) -> None:
@@ -108,25 +107,12 @@ class FetchJudge:
         return float(np.linalg.norm(np.maximum(np.abs(inside) - self._model.geom_size[finger], 0.0)))
 
     def _touch(self, data: mujoco.MjData) -> float:
-        """By how much a contact of robot and table is closer than where contacts begin, m; without one below zero."""
+        """By how much a contact of robot and table is closer than where contacts begin, m; without one -1."""
         pairs = data.contact.geom
-        touching = (self._table[pairs] @ _ONES > 0.0) & (self._robot[pairs] @ _ONES > 0.0)
+        touching = self._table[pairs].any(axis=1) & self._robot[pairs].any(axis=1)
         if not touching.any():
-            return min(-self._room_over_table(data), 0.0)
+            return -1.0
         return float((data.contact.includemargin - data.contact.dist)[touching].max())
-
-    def _room_over_table(self, data: mujoco.MjData) -> float:
-        """Height of the lowest of the fingers' corners that are over the table, above its top, m."""
-        corners = np.concatenate(
-            [
-                data.geom_xpos[g] + (_CORNERS * self._model.geom_size[g]) @ data.geom_xmat[g].reshape(3, 3).T
-                for g in self._fingers
-            ]
-        )
-        table = int(self._table.argmax())
-        away = corners - data.geom_xpos[table]
-        over = (np.abs(away) <= self._model.geom_size[table])[:, :2].all(axis=1)
-        return float((away[over, 2] - self._model.geom_size[table][2]).min(initial=np.inf))
 
     def start(self) -> float:
         """The truth of the env's present state; a table that the reset itself touches is excused."""
@@ -146,7 +132,6 @@ class FetchJudge:
             self._look(qpos)
         if not self._left:
             return float(self._missed.max())
-        self.excused += 1
         self._left = self._left - 1 if self._missed.max() > 0.0 else 0
         return float(self._missed[0])
 
@@ -163,25 +148,20 @@ def seeking(points: Any, hold: int) -> Maker:
         hold: Steps for each, at most; half of it at least.
     """
 
-    def make(env: Any, rng: np.random.Generator) -> Driver:
+    @stepwise
+    def seek(env: Any, rng: np.random.Generator) -> Iterator[Action]:
         model: mujoco.MjModel = env.model
         data, site = mujoco.MjData(model), model.site("robot0:grip").id
+        while True:
+            left, point = int(rng.integers(hold // 2, hold + 1)), points(env, rng)
+            fingers = rng.choice([-1.0, 1.0])
+            for _ in range(left):
+                data.qpos[:] = env.data.qpos
+                mujoco.mj_kinematics(model, data)
+                wanted = (point - data.site_xpos[site]) / DISPLACEMENT_M
+                yield np.append(np.clip(wanted, -1.0, 1.0), fingers)
 
-        def draw() -> tuple[int, Any]:
-            return int(rng.integers(hold // 2, hold + 1)), (points(env, rng), rng.choice([-1.0, 1.0]))
-
-        aim = held(draw)
-
-        def act() -> Action:
-            point, fingers = aim()
-            data.qpos[:] = env.data.qpos
-            mujoco.mj_kinematics(model, data)
-            wanted = (point - data.site_xpos[site]) / DISPLACEMENT_M
-            return np.append(np.clip(wanted, -1.0, 1.0), fingers)
-
-        return act
-
-    return make
+    return seek
 
 
 def _beyond_a_corner(env: Any, rng: np.random.Generator) -> Action:
@@ -222,34 +202,33 @@ def margin_reading(ball: bool) -> Maker:
         ball: Whether the filter keeps the fingers out of the ball, too.
     """
 
-    def make(env: Any, rng: np.random.Generator) -> Driver:
+    @stepwise
+    def read(env: Any, rng: np.random.Generator) -> Iterator[Action]:
         recipe = RECIPES[env.spec.id.rpartition("-v")[0]]
         constraints: list[Any] = recipe(env, keep_out=obstacles(env) if ball else [])
         plant = sw.plants.DisplacementPlant()
         plant.bind(env)
         bound = [Bound(constraint, plant) for constraint in constraints]
-        state: dict[str, Any] = {"way": rng.normal(size=3)}
+        way = rng.normal(size=3)
 
         def left(action: Action) -> float:
             return float(min(c.slacks(action).min() for c in bound))
 
-        def act() -> Action:
+        while True:
             plant.observe()
             for c in bound:
                 c.observe({})  # nobody says when an episode begins
             if rng.random() < 0.04:
-                state["way"] = rng.normal(size=3)
+                way = rng.normal(size=3)
             fingers = rng.choice([-1.0, 1.0])
-            noisy = 3.0 * (state["way"] + 0.7 * rng.normal(size=3))
+            noisy = 3.0 * (way + 0.7 * rng.normal(size=3))
             tries = [np.append(np.clip(noisy, -1.0, 1.0), fingers)]
             tries += [np.where(rng.random(4) < 0.5, -1.0, 1.0) for _ in range(2)]
             found = [(left(action), k) for k, action in enumerate(tries)]
             admitted = [pair for pair in found if pair[0] >= 0.0]
-            return tries[min(admitted)[1] if admitted else max(found)[1]]
+            yield tries[min(admitted)[1] if admitted else max(found)[1]]
 
-        return act
-
-    return make
+    return read
 
 
 def obstacles(env: Any) -> list[sw.constraints.Sphere]:

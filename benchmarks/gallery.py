@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw
 
 import safe_wrappers as sw
-from benchmarks.cases import PROTECTED, Case
-from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, Count, encode, font
+from benchmarks.cases import PROTECTED
+from benchmarks.judges import Judged
+from benchmarks.moving_picture import CHANGED_TEXT, INK, PAPER, VIOLATED, Count, beside, encode, font
 from benchmarks.tables import options
 from safe_wrappers.wrappers.safety_overlay import find_renderer, set_size
 
@@ -83,28 +83,6 @@ SCENES = {
 }  # fmt: skip
 
 
-class Judged(gym.Wrapper[Any, Any, Any, Any]):
-    """Writes what the case's judge says of every step into info, in place of the task's own cost."""
-
-    def __init__(self, env: gym.Env[Any, Any], case: Case) -> None:
-        super().__init__(env)
-        self._judge = case.judge(env.unwrapped)
-
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
-        found = self.env.reset(**options)
-        self._judge.start()
-        return found
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """One control step, judged."""
-        self._judge.before()
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        missed = self._judge.after(info.get("executed_action", action), info)
-        verdict = float(not missed <= 0.0)  # what is not a number is a violation
-        return observation, reward, terminated, truncated, info | {"cost": verdict, "cost_substep": verdict}
-
-
 class Side:
     """One side of a film.
 
@@ -120,7 +98,7 @@ class Side:
         self._renderer: Any = find_renderer(env)
         self._renderer.default_cam_config = {**(self._renderer.default_cam_config or {}), **scene.camera}
         self.count, self.filtered, self._scene, self._seed = Count(), filtered, scene, scene.seed
-        self.env = sw.SafetyOverlay(Judged(case.protect(env) if filtered else env, case))
+        self.env = sw.SafetyOverlay(Judged(case.protect(env) if filtered else env, case.judge(env.unwrapped)))
         self.reset()
 
     def reset(self) -> None:
@@ -165,10 +143,7 @@ def film(scene: Scene) -> tuple[list[Image.Image], float, dict[str, Count]]:
         for _ in range(scene.stride):
             for side in sides:
                 side.step()
-        whole = Image.new("RGB", (2 * PANEL + GAP, HEAD + PANEL + FOOT), PAPER)
-        for k, side in enumerate(sides):
-            whole.paste(side.frame(), (k * (PANEL + GAP), 0))
-        frames.append(whole)
+        frames.append(beside(*(side.frame() for side in sides)))
     task: Any = sides[0].env.unwrapped
     for side in sides:
         side.env.close()

@@ -10,6 +10,7 @@ normal force of any physics substep. The filter keeps 2 % of the limit as its ma
 
 import itertools
 import multiprocessing
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, markdown, measured, options, total
+from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 
 TIMESTEP_S, SUBSTEPS = 0.002, 10
 """A control step of 20 ms, as Reacher's."""
@@ -127,45 +128,35 @@ def approached(rng: np.random.Generator) -> dict[str, Any]:
             return {"qpos": qpos, "qvel": qvel, "angle": angle, "distance": distance}
 
 
-class Driver:
-    """What attacks the wall: one of `DRIVERS`, seeded."""
+def actions(name: str, raw: ArmAndWall, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """What attacks the wall: one of `DRIVERS`, step by step."""
+    data, jacobian = mujoco.MjData(raw.model), np.zeros((3, raw.model.nv))
+    tip, corners = raw.model.geom("fingertip").id, np.array([*itertools.product((-1.0, 1.0), repeat=2)])
+    directions = itertools.cycle((-1.0, 1.0) if name == "feint" else (1.0,))
 
-    def __init__(self, name: str, raw: ArmAndWall, rng: np.random.Generator) -> None:
-        self._name, self._raw, self._rng, self._left, self._away = name, raw, rng, 0, False
-        self._data = mujoco.MjData(raw.model)
-        self._tip = raw.model.geom("fingertip").id
-
-    def act(self) -> np.ndarray:
-        """The next action, shape (2,)."""
-        rng, raw = self._rng, self._raw
-        if self._name == "random":
-            return rng.uniform(-1.0, 1.0, 2)
-        if self._name == "worst":
-            return max(
-                (np.array(corner) for corner in itertools.product((-1.0, 1.0), repeat=2)), key=self._harm
-            )
-        jacobian = np.zeros((3, raw.model.nv))
-        mujoco.mj_jacGeom(raw.model, raw.data, jacobian, None, self._tip)
-        effect = (jacobian.T @ raw.normal)[:2]
-        if self._name == "corner":
-            return np.where(effect < 0.0, -1.0, 1.0)
-        push = effect / max(float(np.abs(effect).max()), 1e-9)
-        if self._name == "feint":
-            if self._left == 0:
-                self._left, self._away = int(rng.integers(1, 6)), not self._away
-            self._left -= 1
-        return np.asarray(-push if self._away else push)
-
-    def _harm(self, action: np.ndarray) -> float:
+    def harm(action: np.ndarray) -> float:
         """How hard an action held for two control steps hits, or how fast it comes near."""
-        raw, data = self._raw, self._data
         mujoco.mj_copyData(data, raw.model, raw.data)
         data.ctrl[:] = action
         force = 0.0
         for _ in range(2 * SUBSTEPS):
             mujoco.mj_step(raw.model, data)
             force = max(force, normal_force(data))
-        return 1e3 * force + float(data.geom_xpos[self._tip] @ raw.normal)
+        return 1e3 * force + float(data.geom_xpos[tip] @ raw.normal)
+
+    while True:
+        direction = next(directions)
+        for _ in range(int(rng.integers(1, 6)) if name == "feint" else 1):
+            mujoco.mj_jacGeom(raw.model, raw.data, jacobian, None, tip)
+            effect = (jacobian.T @ raw.normal)[:2]
+            if name == "random":
+                yield rng.uniform(-1.0, 1.0, 2)
+            elif name == "worst":
+                yield max(corners, key=harm)
+            elif name == "corner":
+                yield np.where(effect < 0.0, -1.0, 1.0)
+            else:
+                yield direction * effect / max(float(np.abs(effect).max()), 1e-9)
 
 
 @dataclass(frozen=True)
@@ -192,10 +183,10 @@ def run(job: Job) -> dict[str, Any]:
             env = sw.CBFActionFilter(raw, [sw.constraints.ImpactSpeedLimit(["fingertip"], ["wall"], **kept)])
         for k in range(first, first + BLOCK // MACHINES):
             rng = np.random.default_rng((job.block, first, k))
-            driver, peak = Driver(DRIVERS[k % len(DRIVERS)], raw, rng), 0.0
+            driver, peak = actions(DRIVERS[k % len(DRIVERS)], raw, rng), 0.0
             env.reset(seed=0, options=approached(rng))
             for _ in range(STEPS):
-                info = env.step(driver.act().astype(np.float32))[4]
+                info = env.step(next(driver).astype(np.float32))[4]
                 peak = max(peak, float(raw.forces.max()))
                 counts["steps"] += 1
                 counts["changed"] += bool(info.get("cbf/intervened"))
@@ -223,8 +214,6 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, print the table."""
-    given = options(
-        __doc__, approaches=10_000, workers=multiprocessing.cpu_count(), folder=Path("runs/impact")
-    )
+    given = options(__doc__, approaches=10_000, workers=multiprocessing.cpu_count())
     jobs = [Job(limited, block) for block in range(given.approaches // BLOCK) for limited in (False, True)]
-    keep("impact", table(measured(given.folder / "impact.jsonl", jobs, run, given.workers)))
+    keep("impact", table(measured(RUNS / "impact/impact.jsonl", jobs, run, given.workers)))

@@ -5,31 +5,69 @@ requirement's own unit: above 0, or not a number, is a violation.
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Final
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 
 Truth = Callable[[mujoco.MjData], float]
 """By how much a state misses a requirement; the positions of bodies are up to date."""
 
+FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
+"""What a filter says of a step, as `cbf/...` in info."""
+
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-class Judge(Protocol):
+class Judge:
     """What says whether a step broke the requirement."""
 
     def start(self) -> float:
-        """By how much the env's present state, of a reset, misses it."""
+        """By how much the env's present state, of a reset, misses it; 0 where steps alone are judged."""
+        return 0.0
 
     def before(self) -> None:
         """Called before each step."""
 
     def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
         """By how much the step missed it: what the env was given, and the info that it returned."""
+        raise NotImplementedError
 
 
-class Replay:
+class Judged(gym.Wrapper[Any, Any, Any, Any]):
+    """Writes what a judge says of every step into info, in place of the task's own cost."""
+
+    def __init__(self, env: gym.Env[Any, Any], judge: Judge) -> None:
+        super().__init__(env)
+        self._judge = judge
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        found = self.env.reset(**options)
+        self._judge.start()
+        return found
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One control step, judged."""
+        self._judge.before()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        missed = self._judge.after(info.get("executed_action", action), info)
+        verdict = float(not missed <= 0.0)  # what is not a number is a violation
+        return observation, reward, terminated, truncated, info | {"cost": verdict, "cost_substep": verdict}
+
+
+def counted(info: dict[str, Any], violated: bool) -> dict[str, int]:
+    """What a step adds to counts: its flags, a violation, and one that no flag but "intervened" came with.
+
+    Without a filter there are no flags, and nothing that is unflagged.
+    """
+    found = {name: int(info.get(f"cbf/{name}", False)) for name in FLAGS}
+    silent = "cbf/infeasible" in info and not any(found[name] for name in FLAGS[1:])
+    return found | {"violations": int(violated), "unflagged": int(violated and silent)}
+
+
+class Replay(Judge):
     """Makes every step once more on data of its own and evaluates a truth after each physics substep.
 
     Args:
@@ -55,7 +93,6 @@ class Replay:
         self._state = np.zeros(mujoco.mj_stateSize(self._model, _STATE))
 
     def start(self) -> float:
-        """The truth of the env's present state."""
         self.before()
         mujoco.mj_setState(self._model, self._data, self._state, _STATE)
         return self._present()
@@ -88,7 +125,7 @@ class Replay:
         return self._truth(self._data)
 
 
-class Reported:
+class Reported(Judge):
     """Reads what the task itself reports of a step.
 
     Args:
@@ -98,15 +135,7 @@ class Reported:
     def __init__(self, missed: Callable[[dict[str, Any]], float]) -> None:
         self._missed = missed
 
-    def start(self) -> float:
-        """Nothing has been reported yet: safe."""
-        return 0.0
-
-    def before(self) -> None:
-        """Nothing to keep."""
-
     def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
-        """What the step's info says."""
         return self._missed(info)
 
 
@@ -195,7 +224,7 @@ def wall_geoms(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX)))
 
 
-class Worst:
+class Worst(Judge):
     """Several judges at once: the one that is most displeased.
 
     Args:
@@ -206,11 +235,9 @@ class Worst:
         self._judges = judges
 
     def start(self) -> float:
-        """The largest."""
         return float(np.max([judge.start() for judge in self._judges]))
 
     def before(self) -> None:
-        """Tell them all."""
         for judge in self._judges:
             judge.before()
 

@@ -19,7 +19,6 @@ import math
 import multiprocessing
 from collections import deque
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -28,7 +27,7 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, markdown, measured, options, total
+from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.control.watchdog import longest_lease
 from safe_wrappers.errors import Array
 from safe_wrappers.wrappers.faults import Outages
@@ -310,7 +309,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, print the table."""
-    given = options(__doc__, episodes=10_000, workers=multiprocessing.cpu_count(), folder=Path("runs/leases"))
+    given = options(__doc__, episodes=10_000, workers=multiprocessing.cpu_count())
     blocks = range(math.ceil(given.episodes / BLOCK))
     jobs = [Job(mode, block) for block in blocks for mode in MODES]
-    keep("leases", table(measured(given.folder / "leases.jsonl", jobs, run, given.workers)))
+    keep("leases", table(measured(RUNS / "leases/leases.jsonl", jobs, run, given.workers)))

@@ -10,11 +10,10 @@ physics is the env's.
 
 import io
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import matplotlib as mpl
 import mujoco
 import numpy as np
@@ -24,14 +23,13 @@ from PIL import Image, ImageDraw, ImageFont
 from benchmarks.tables import RESULTS, options
 from safe_wrappers.envs.patrolled_maze import MarkingRenderer
 from safe_wrappers.train.policies import load_policy
-from safe_wrappers.train.run.policy import TrainedPolicy
-from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.wrappers.safety_overlay import set_size
 
 ROOT = Path(__file__).parents[1]
 FILM, COUNTS = ROOT / "docs" / "static" / "filter.webp", RESULTS / "moving_picture.json"
 POLICIES = ROOT / "configs" / "policies"
-SEEDS, SECONDS, SPEED, STRIDE = (0, 1, 2), 8.0, 2.0, 6
-"""What is filmed: the first seconds of each seed's episode, times real time, a frame every so many steps."""
+SEEDS, STEPS, SPEED, STRIDE = (0, 1, 2), 400, 2.0, 6
+"""What is filmed: the first steps of each seed's episode, times real time, a frame every so many steps."""
 COUNTED = range(100)
 """Seeds of the whole episodes that are counted."""
 
@@ -67,12 +65,6 @@ class Count:
         self.reward += float(reward)
 
 
-def make(trained: TrainedPolicy, **kwargs: Any) -> gym.Env[Any, Any]:
-    """The env that a policy was trained in, with its filter, if it had one."""
-    task = replace(trained.arm.env, kwargs={**trained.arm.env.kwargs, **kwargs})
-    return make_stack(task, trained.arm.filter)
-
-
 class Side:
     """One side of the film: a policy, its env, its counts, and what is drawn of it.
 
@@ -84,9 +76,11 @@ class Side:
         self.policy = load_policy(POLICIES / name, other_filter=True)
         self.title, self.colour = SIDES[name]
         self.filtered, self.count = self.policy.arm.filter.kind != "none", Count()
-        shown = {"render_mode": "rgb_array", "width": PANEL, "height": PANEL}
-        self.env = make(self.policy, **shown, default_camera_config=CAMERA)
+        self.flags: list[tuple[bool, bool]] = []
+        self.env = self.policy.make_env("trained", "rgb_array")
+        set_size(self.env, PANEL, PANEL)
         self.task: Any = self.env.unwrapped
+        self.task.mujoco_renderer.default_cam_config = CAMERA
         self.task.mujoco_renderer = MarkingRenderer(self.task.mujoco_renderer, self._markers)
         model = self.task.model
         for geom in range(model.ngeom):
@@ -99,21 +93,33 @@ class Side:
         """Begin an episode."""
         self.observation, _ = self.env.reset(seed=seed)
         self.policy.reset()
-        self.trail = [self.task.agent_position]
+        self.seed, self.trail = seed, [self.task.agent_position]
         self.mark: tuple[int, int, int] | None = None
 
-    def step(self) -> tuple[bool, bool]:
-        """One control step; whether it was changed, and whether it violated."""
+    def step(self) -> None:
+        """One control step."""
         self.observation, reward, _, _, info = self.env.step(self.policy(self.observation))
         self.count.add(reward, info)
         self.trail.append(self.task.agent_position)
-        flags = bool(info.get("cbf/intervened", False)), info["cost_substep"] > 0
-        self.mark = VIOLATED if flags[1] else CHANGED if flags[0] else None
-        return flags
+        changed, violated = bool(info.get("cbf/intervened", False)), info["cost_substep"] > 0
+        self.flags.append((changed, violated))
+        self.mark = VIOLATED if violated else CHANGED if changed else None
 
     def frame(self) -> Image.Image:
-        """The picture of now."""
-        return Image.fromarray(np.asarray(self.env.render(), dtype=np.uint8))
+        """The picture of now, between words, and the strip of time."""
+        whole = Image.new("RGB", (PANEL, HEAD + PANEL + FOOT + STRIP), PAPER)
+        whole.paste(Image.fromarray(np.asarray(self.env.render(), dtype=np.uint8)), (0, HEAD))
+        draw, count, top = ImageDraw.Draw(whole), self.count, HEAD + PANEL + 6
+        draw.text((4, 5), self.title, self.colour, font(17, bold=True))
+        draw.text((PANEL - 4, 8), f"seed {self.seed}", INK, font(14), anchor="ra")
+        hurt = VIOLATED if count.violations else INK
+        draw.text((4, top), f"{count.violations} steps in a hazard", hurt, font(17, bold=True))
+        draw.text((PANEL - 4, top + 1), f"goals: {count.goals}", INK, font(15), anchor="ra")
+        if self.filtered:
+            changed = f"the filter changed {count.changed / count.steps:.0%} of the actions"
+            draw.text((4, top + 24), changed, CHANGED_TEXT, font(15))
+        whole.paste(strip(self.flags), (0, HEAD + PANEL + FOOT))
+        return whole
 
     def _markers(self) -> list[dict[str, Any]]:
         """Where it came from in the last two seconds, and a ring while the filter acts or a hazard is entered."""
@@ -142,40 +148,24 @@ def _marker(
 def film() -> list[Image.Image]:
     """The frames, both sides of each."""
     sides = [Side(name) for name in SIDES]
-    flags: list[list[tuple[bool, bool]]] = [[], []]
-    shots = []
+    frames = []
     for seed in SEEDS:
         for side in sides:
             side.reset(seed)
-        for step in range(round(SECONDS / sides[0].task.dt)):
-            for side, seen in zip(sides, flags, strict=True):
-                seen.append(side.step())
+        for step in range(STEPS):
+            for side in sides:
+                side.step()
             if step % STRIDE == 0:
-                at = len(flags[0]) - 1
-                shots.append((seed, at, [(side.frame(), replace(side.count)) for side in sides]))
-    frames = []
-    for seed, at, pair in shots:
-        whole = Image.new("RGB", (2 * PANEL + GAP, HEAD + PANEL + FOOT + STRIP), PAPER)
-        for k, (picture, count) in enumerate(pair):
-            left = k * (PANEL + GAP)
-            whole.paste(picture, (left, HEAD))
-            _write(whole, left, sides[k], count, seed)
-            whole.paste(strip(flags[k], at), (left, HEAD + PANEL + FOOT))
-        frames.append(whole)
+                frames.append(beside(*(side.frame() for side in sides)))
     return frames
 
 
-def _write(whole: Image.Image, left: int, side: Side, count: Count, seed: int) -> None:
-    draw = ImageDraw.Draw(whole)
-    draw.text((left + 4, 5), side.title, side.colour, font(17, bold=True))
-    draw.text((left + PANEL - 4, 8), f"seed {seed}", INK, font(14), anchor="ra")
-    top = HEAD + PANEL + 6
-    hurt = VIOLATED if count.violations else INK
-    draw.text((left + 4, top), f"{count.violations} steps in a hazard", hurt, font(17, bold=True))
-    draw.text((left + PANEL - 4, top + 1), f"goals: {count.goals}", INK, font(15), anchor="ra")
-    if side.filtered:
-        changed = f"the filter changed {count.changed / count.steps:.0%} of the actions"
-        draw.text((left + 4, top + 24), changed, CHANGED_TEXT, font(15))
+def beside(left: Image.Image, right: Image.Image) -> Image.Image:
+    """Two pictures of the same height as one."""
+    whole = Image.new("RGB", (left.width + GAP + right.width, left.height), PAPER)
+    whole.paste(left, (0, 0))
+    whole.paste(right, (left.width + GAP, 0))
+    return whole
 
 
 def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
@@ -184,14 +174,14 @@ def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(Path(mpl.get_data_path()) / "fonts" / "ttf" / name, size)
 
 
-def strip(flags: list[tuple[bool, bool]], at: int) -> Image.Image:
+def strip(flags: list[tuple[bool, bool]]) -> Image.Image:
     """What happened at every step of the film, up to now."""
-    row = np.tile(np.array(BARE, np.uint8), (PANEL, 1))
-    for k, (changed, violated) in enumerate(flags[: at + 1]):
-        first, last = k * PANEL // len(flags), (k + 1) * PANEL // len(flags)
+    row, steps = np.tile(np.array(BARE, np.uint8), (PANEL, 1)), len(SEEDS) * STEPS
+    for k, (changed, violated) in enumerate(flags):
+        first, last = k * PANEL // steps, (k + 1) * PANEL // steps
         if changed or violated:
             row[first : max(last, first + 2)] = VIOLATED if violated else CHANGED
-    now = at * PANEL // len(flags)
+    now = (len(flags) - 1) * PANEL // steps
     row[max(0, now - 1) : now + 2] = INK
     return Image.fromarray(np.tile(row[None], (STRIP, 1, 1)))
 
@@ -217,7 +207,7 @@ def whole_episodes() -> dict[str, Any]:
     found = {}
     for name in SIDES:
         trained = load_policy(POLICIES / name, other_filter=True)
-        env, total = make(trained), Count()
+        env, total = trained.make_env(), Count()
         for seed in COUNTED:
             observation, _ = env.reset(seed=seed)
             trained.reset()

@@ -3,7 +3,7 @@
 `random`, `bang_bang` and `pulse` know nothing. The others read the true state and go for one limit.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import cycle
 from typing import Any
 
@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from benchmarks.drivers import Action, Driver, Maker, held
+from benchmarks.drivers import Action, Driver, Maker, held, stepwise
 from benchmarks.judges import stepped, wall_geoms
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -60,18 +60,16 @@ def end_seeking(env: Any, rng: np.random.Generator) -> Driver:
     return held(lambda: (int(rng.integers(20, 80)), next(ends)))
 
 
-def carrying(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def carrying(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Balances the pole (LQR about upright, on the env's own model) and carries it to one end, then to the other."""
     low, high = _box(env)
     gain, ways = balancing_gain(env), cycle((-1.0, 1.0))
     way = held(lambda: (int(rng.integers(100, 300)), next(ways)))
-
-    def act() -> Action:
+    while True:
         away = np.concatenate([env.data.qpos, env.data.qvel])
         away[0] = -0.3 * way()  # the carrot: always a little farther on
-        return np.asarray(np.clip(-gain @ away, low, high))
-
-    return act
+        yield np.asarray(np.clip(-gain @ away, low, high))
 
 
 def balancing_gain(env: Any) -> np.ndarray:
@@ -93,22 +91,18 @@ def balancing_gain(env: Any) -> np.ndarray:
     return np.asarray(np.linalg.solve(cost + b.T @ value @ b, b.T @ value @ a))
 
 
-def speed_seeking(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def speed_seeking(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Every motor pushes its joint the way that it moves already; now and then one is turned round."""
     low, high = _box(env)
     dofs = env.model.jnt_dofadr[env.model.actuator_trnid[:, 0]]
-    state: dict[str, Any] = {"left": 0, "motor": 0}
-
-    def act() -> Action:
-        if state["left"] == 0:
-            state.update(left=int(rng.integers(10, 60)), motor=int(rng.integers(low.size)))
-        state["left"] -= 1
-        forward = env.data.qvel[dofs] >= 0.0
-        if state["left"] < 5:
-            forward[state["motor"]] = not forward[state["motor"]]
-        return np.where(forward, high, low)
-
-    return act
+    while True:
+        steps, motor = int(rng.integers(10, 60)), int(rng.integers(low.size))
+        for left in reversed(range(steps)):
+            forward = env.data.qvel[dofs] >= 0.0
+            if left < 5:
+                forward[motor] = not forward[motor]
+            yield np.where(forward, high, low)
 
 
 def point_seeking(body: str, points: list[tuple[float, ...]], hold: int = 50) -> Maker:
@@ -120,36 +114,30 @@ def point_seeking(body: str, points: list[tuple[float, ...]], hold: int = 50) ->
         hold: Steps for each; the bodies are thrown about for half as long before.
     """
 
-    def make(env: Any, rng: np.random.Generator) -> Driver:
+    @stepwise
+    def pull(env: Any, rng: np.random.Generator) -> Iterator[Action]:
         model: mujoco.MjModel = env.model
         data, index = mujoco.MjData(model), model.body(body).id
         dofs, gear = model.jnt_dofadr[model.actuator_trnid[:, 0]], model.actuator_gear[:, 0]
         low, high = _box(env)
-        state: dict[str, Any] = {"step": 0, "point": np.zeros(3), "action": high}
         jacobian = np.zeros((3, model.nv))
+        while True:
+            thrown, point = rng.uniform(low, high), np.array(points[rng.integers(len(points))])
+            yield from [thrown] * (hold // 2)
+            for _ in range(hold):
+                data.qpos[:] = env.data.qpos
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                mujoco.mj_jacBody(model, data, jacobian, None, index)
+                force = jacobian[:, dofs].T @ (point - data.xpos[index]) * gear
+                # As strong as the actuators can along that direction.
+                yield np.asarray(np.clip(force / max(float(np.abs(force / high).max()), 1e-12), low, high))
 
-        def act() -> Action:
-            phase = state["step"] % (hold + hold // 2)
-            state["step"] += 1
-            if phase == 0:
-                state["action"] = rng.uniform(low, high)
-                state["point"] = np.array(points[rng.integers(len(points))])
-            if phase < hold // 2:
-                return np.asarray(state["action"])
-            data.qpos[:] = env.data.qpos
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_jacBody(model, data, jacobian, None, index)
-            force = jacobian[:, dofs].T @ (state["point"] - data.xpos[index]) * gear
-            # As strong as the actuators can along that direction.
-            return np.asarray(np.clip(force / max(float(np.abs(force / high).max()), 1e-12), low, high))
-
-        return act
-
-    return make
+    return pull
 
 
-def wall_seeking(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def wall_seeking(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """A point on two axes: at full force to a random spot on one of the nearest walls, then to another."""
     geoms = wall_geoms(env.model)
     middle, half = env.model.geom_pos[geoms, :2], env.model.geom_size[geoms, :2]
@@ -162,7 +150,8 @@ def wall_seeking(env: Any, rng: np.random.Generator) -> Driver:
     return _running_to(env, held(draw))
 
 
-def corner_seeking(env: Any, rng: np.random.Generator) -> Driver:
+@stepwise
+def corner_seeking(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Past (or at) the corners of walls, from one side to the other, at full force: where the path bends."""
     geoms = wall_geoms(env.model)
     middle, half = env.model.geom_pos[geoms, :2], env.model.geom_size[geoms, :2]
@@ -180,14 +169,11 @@ def corner_seeking(env: Any, rng: np.random.Generator) -> Driver:
     return _running_to(env, held(draw))
 
 
-def _running_to(env: Any, spot: Callable[[], Action]) -> Driver:
+def _running_to(env: Any, spot: Callable[[], Action]) -> Iterator[Action]:
     """At full force to a place in the plane, m."""
-
-    def act() -> Action:
+    while True:
         offset = spot() - env.data.qpos[:2]
-        return np.asarray(offset / max(float(np.abs(offset).max()), 1e-9))
-
-    return act
+        yield np.asarray(offset / max(float(np.abs(offset).max()), 1e-9))
 
 
 def planning(gain: Callable[[Any], Callable[[np.ndarray], float]]) -> Maker:
@@ -198,12 +184,13 @@ def planning(gain: Callable[[Any], Callable[[np.ndarray], float]]) -> Maker:
     """
     steps, tries, keep = 12, 8, 2
 
-    def make(env: Any, rng: np.random.Generator) -> Driver:
+    @stepwise
+    def run(env: Any, rng: np.random.Generator) -> Iterator[Action]:
         model: mujoco.MjModel = env.model
         data, substeps, value = mujoco.MjData(model), stepped(env).frame_skip, gain(env)
         low, high = _box(env)
         snapshot = np.zeros(mujoco.mj_stateSize(model, _STATE))
-        state: dict[str, Any] = {"step": 0, "plan": np.zeros((steps, low.size))}
+        best = np.zeros((steps, low.size))
 
         def worth(plan: np.ndarray) -> float:
             mujoco.mj_setState(model, data, snapshot, _STATE)
@@ -214,23 +201,19 @@ def planning(gain: Callable[[Any], Callable[[np.ndarray], float]]) -> Maker:
                 path.append(data.qpos[:2].copy())
             return value(np.array(path))
 
-        def act() -> Action:
-            if state["step"] % keep == 0:
-                mujoco.mj_getState(model, env.data, snapshot, _STATE)
-                plans = [state["plan"]]
-                for _ in range(tries):
-                    size = rng.choice([0.2, 0.5, 1.0]) * (high - low) / 2.0
-                    change = np.repeat(rng.normal(size=(steps // 2, low.size)), 2, axis=0) * size
-                    plans.append(np.clip(state["plan"] + change, low, high))
-                state["plan"] = max(plans, key=worth)
-            state["step"] += 1
-            action: Action = state["plan"][0]
-            state["plan"] = np.concatenate([state["plan"][1:], state["plan"][-1:]])
-            return action
+        while True:
+            mujoco.mj_getState(model, env.data, snapshot, _STATE)
+            plans = [best]
+            for _ in range(tries):
+                size = rng.choice([0.2, 0.5, 1.0]) * (high - low) / 2.0
+                change = np.repeat(rng.normal(size=(steps // 2, low.size)), 2, axis=0) * size
+                plans.append(np.clip(best + change, low, high))
+            best = max(plans, key=worth)
+            for _ in range(keep):
+                yield best[0]
+                best = np.concatenate([best[1:], best[-1:]])
 
-        return act
-
-    return make
+    return run
 
 
 def _fastest(plane: bool) -> Callable[[Any], Callable[[np.ndarray], float]]:

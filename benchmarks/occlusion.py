@@ -9,7 +9,6 @@ the env's: the states of its cars, and its own judge of collisions at every phys
 import itertools
 import warnings
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -18,7 +17,7 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks.cases import crossing
 from benchmarks.drivers import CROSSING
-from benchmarks.tables import keep, markdown, measured, options, total
+from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 ARMS: dict[str, dict[str, Any] | None] = {
@@ -82,8 +81,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, print the table."""
-    given = options(__doc__, steps=40_000, workers=2, folder=Path("runs/occlusion"))
+    given = options(__doc__, steps=40_000, workers=2)
     size = min(given.steps, PART)
     kinds = itertools.product(range(given.steps // size), CROSSING, ARMS)
     jobs = [Job(driver, arm, size, seed) for seed, driver, arm in kinds]
-    keep("occlusion", table(measured(given.folder / "occlusion.jsonl", jobs, run, given.workers)))
+    keep("occlusion", table(measured(RUNS / "occlusion/occlusion.jsonl", jobs, run, given.workers)))

@@ -5,6 +5,7 @@ an env whose own step does nothing.
 """
 
 import importlib.util
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -42,13 +43,8 @@ def problems(m: int, k: int, active: bool, count: int = 200) -> list[Problem]:
 
 def cycling(call: Callable[..., Any], items: list[Any]) -> Callable[[], Any]:
     """A callable that takes the next item at every call."""
-    state = {"i": 0}
-
-    def step() -> Any:
-        state["i"] = (state["i"] + 1) % len(items)
-        return call(*items[state["i"]])
-
-    return step
+    rest = itertools.cycle(items)
+    return lambda: call(*next(rest))
 
 
 def by_qpsolvers(solver: str, *problem: np.ndarray) -> Any:

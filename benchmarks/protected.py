@@ -2,7 +2,6 @@
 
     python -m benchmarks protected --steps 3000            # of each env with and without; goes on if stopped
     python -m benchmarks protected --envs Reacher Pusher   # of the envs whose name has one of these words
-    python -m benchmarks protected --hard --steps 100000   # one row per driver; the envs with a hard limit
 
 A violation is a control step in which the env's own truth (`benchmarks/judges.py`) was broken at any physics
 substep; for a published speed, over the step as a whole. Unflagged is one in a step that the filter reported
@@ -15,21 +14,21 @@ import itertools
 import multiprocessing
 import time
 import warnings
+from collections import Counter
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.cases import CASES, HARD, PROTECTED, Case
-from benchmarks.tables import keep, markdown, measured, options, total
+from benchmarks.cases import PROTECTED, Case
+from benchmarks.judges import counted
+from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 CHUNK = 10_000
 """Steps of one job: what is lost when a run is killed."""
 TIMED = 1_000
 """Of those, steps that are timed beside an env without the filter."""
-_FLAGS = ("intervened", "infeasible", "fallback", "unsafe")
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Job:
 def run(job: Job) -> dict[str, Any]:
     """Drive, judge and count."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted below
-    case = CASES[job.case]
+    case = PROTECTED[job.case]
     bare = case.make()
     env = case.protect(bare) if job.filtered else bare
     twin = case.make() if job.filtered else None
@@ -54,17 +53,15 @@ def run(job: Job) -> dict[str, Any]:
     rng = np.random.default_rng(job.seed)
     driver = case.drivers[job.driver](env.unwrapped, rng)
     kind = env.action_space.dtype
-    count = dict.fromkeys(("violations", "unflagged", "unsafe_starts", *_FLAGS), 0)
-    ratios: dict[bool, list[float]] = {False: [], True: []}
-    worst, episode, over = -np.inf, job.seed * 100_000, True
-    started = time.perf_counter()
+    count = Counter[str]()
+    ratios: dict[str, list[float]] = {"inactive": [], "active": []}
+    episode, over = job.seed * 100_000, True
     for step in range(job.steps):
         while over:
             env.reset(seed=episode)
             if twin is not None:
                 twin.reset(seed=episode)
             over = not judge.start() <= 0.0
-            count["unsafe_starts"] += int(over)
             episode += 1
         action = np.asarray(driver(), dtype=kind)
         judge.before()
@@ -73,28 +70,17 @@ def run(job: Job) -> dict[str, Any]:
         spent = time.perf_counter() - begin
         executed = info["executed_action"] if job.filtered else action
         missed = judge.after(executed, info)
-        worst = max(worst, missed)
-        violated = not missed <= 0.0  # so that what is not a number counts
-        count["violations"] += int(violated)
-        if twin is not None:
-            for name in _FLAGS:
-                count[name] += int(info[f"cbf/{name}"])
-            flagged = info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]
-            count["unflagged"] += int(violated and not flagged)
-            if step < TIMED:
-                begin = time.perf_counter()
-                twin.step(np.asarray(executed, dtype=kind))
-                ratios[bool(info["cbf/intervened"])].append(spent / (time.perf_counter() - begin))
+        count.update(counted(info, not missed <= 0.0))  # so that what is not a number counts
+        if twin is not None and step < TIMED:
+            begin = time.perf_counter()
+            twin.step(np.asarray(executed, dtype=kind))
+            ratios["active" if info["cbf/intervened"] else "inactive"].append(
+                spent / (time.perf_counter() - begin)
+            )
         over = bool(truncated or (terminated and not case.past_termination))
-    spent = {"worst": float(worst), "seconds": time.perf_counter() - started}
-    return asdict(job) | count | _timings(ratios) | spent
-
-
-def _timings(ratios: dict[bool, list[float]]) -> dict[str, Any]:
-    row: dict[str, Any] = {}
-    for changed, name in ((False, "inactive"), (True, "active")):
-        row[f"{name}_timed"] = len(ratios[changed])
-        row[f"{name}_ratio"] = float(np.median(ratios[changed])) if ratios[changed] else None
+    row = {**asdict(job), **count}
+    for name, timed in ratios.items():
+        row |= {f"{name}_timed": len(timed), f"{name}_ratio": float(np.median(timed)) if timed else None}
     return row
 
 
@@ -103,10 +89,9 @@ def jobs(cases: dict[str, Case], steps: int) -> list[Job]:
     found = []
     for (name, case), filtered in itertools.product(cases.items(), (True, False)):
         for driver in case.drivers:
-            left, seed = max(steps // len(case.drivers), 1), 0
-            while left > 0:
-                found.append(Job(name, driver, filtered, min(left, CHUNK), seed))
-                left, seed = left - CHUNK, seed + 1
+            each = max(steps // len(case.drivers), 1)
+            for seed, first in enumerate(range(0, each, CHUNK)):
+                found.append(Job(name, driver, filtered, min(each - first, CHUNK), seed))
     return found
 
 
@@ -117,7 +102,7 @@ def _overhead(rows: list[dict[str, Any]], which: str) -> str:
     return f"{sum(r * n for r, n in timed) / steps:.1f}" if steps >= 20 else "-"
 
 
-def table_of_envs(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
+def table(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per env, drivers pooled."""
     lines = []
     for name in dict.fromkeys(row["case"] for row in rows):
@@ -156,23 +141,6 @@ def spelled(constraint: Any) -> str:
     return f"{type(constraint).__name__}: {', '.join(told)}" if told else type(constraint).__name__
 
 
-def table_of_drivers(rows: list[dict[str, Any]]) -> str:
-    """Markdown: one line per env, driver and filter."""
-    lines = []
-    groups: dict[tuple[str, str, bool], list[dict[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row["case"], row["driver"], row["filtered"]), []).append(row)
-    for (name, driver, filtered), part in groups.items():
-        steps = total(part, "steps")
-        flags = [f"{total(part, 'intervened') / steps:.1%}", *(f"{total(part, f):,}" for f in _FLAGS[1:])]
-        cells = [name, driver, "on" if filtered else "off", f"{steps:,}", _violations(part)]
-        worst = f"{max(row['worst'] for row in part):.3g}"
-        lines.append([*cells, *(flags if filtered else ["-"] * 4), worst])
-    head = "env | driver | filter | steps | violations | changed | infeasible | fallback | unsafe | worst"
-    skipped = f"Starts left out because they were unsafe: {total(rows, 'unsafe_starts'):,}."
-    return "\n".join([markdown(head, lines), "", skipped])
-
-
 def _violations(rows: list[dict[str, Any]]) -> str:
     violations, unflagged = total(rows, "violations"), total(rows, "unflagged")
     return f"{violations:,} ({unflagged:,} unflagged)" if unflagged else f"{violations:,}"
@@ -180,13 +148,11 @@ def _violations(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run the jobs, write each row as it comes, print the table."""
-    workers = multiprocessing.cpu_count()
-    given = options(
-        __doc__, steps=10_000, envs=[], hard=False, workers=workers, folder=Path("runs/protected")
-    )
-    cases = HARD if given.hard else PROTECTED
-    named = {n: case for n, case in cases.items() if not given.envs or any(word in n for word in given.envs)}
-    wanted = jobs(named, given.steps)
-    name = "protected_hard" if given.hard else "protected"
-    rows = measured(given.folder / f"{name}.jsonl", wanted, run, given.workers)
-    keep(name, table_of_drivers(rows) if given.hard else table_of_envs(cases, rows), not given.envs)
+    given = options(__doc__, steps=10_000, envs=[], workers=multiprocessing.cpu_count())
+    cases = {
+        name: case
+        for name, case in PROTECTED.items()
+        if not given.envs or any(word in name for word in given.envs)
+    }
+    rows = measured(RUNS / "protected/protected.jsonl", jobs(cases, given.steps), run, given.workers)
+    keep("protected", table(cases, rows), not given.envs)

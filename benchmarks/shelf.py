@@ -15,14 +15,13 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, markdown, measured, options
+from benchmarks.tables import RUNS, keep, markdown, measured, options
 from safe_wrappers.plants import View
 from safe_wrappers.wrappers.recipes import PLANTS
 
@@ -170,7 +169,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Measure what is missing and can be, print the table."""
-    given = options(__doc__, only=[], folder=Path("runs/shelf"))
+    given = options(__doc__, only=[])
     warnings.simplefilter("ignore")  # of unsafe states, which are counted
     jobs = []
     for case in CASES:
@@ -178,4 +177,4 @@ def main() -> None:
             print(f"{case.env_id}: {case.needs} is not installed")
         elif case.env_id in (given.only or [case.env_id]):
             jobs += [Job(case.env_id, driver, case.steps) for driver in DRIVERS]
-    keep("shelf", table(measured(given.folder / "shelf.jsonl", jobs, row, 1)), not given.only)
+    keep("shelf", table(measured(RUNS / "shelf/shelf.jsonl", jobs, row, 1)), not given.only)

@@ -11,7 +11,7 @@ what speed and steering ask for.
 import itertools
 import math
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -41,27 +41,24 @@ class Job:
     seed: int
 
 
-def driven(name: str, raw: Any, rng: np.random.Generator) -> Callable[[int], Any]:
-    """One episode's driver: from the control step to torques and steering, shape (5,)."""
+def driven(name: str, raw: Any, rng: np.random.Generator) -> Iterator[Any]:
+    """One episode's driver: torques and steering of each control step, shape (5,)."""
     period, size = rng.uniform(0.4, 2.0), rng.uniform(0.0, 1.0)
-    state: dict[str, Any] = {"until": 0, "torque": np.ones(4)}
+    torque, until, braking = np.ones(4), 0, False
     if name == "panic brake":
-        state |= {"braking": False, "top": rng.uniform(1.0, 5.0)}
-
-    def drive(step: int) -> Any:
+        top = rng.uniform(1.0, 5.0)
+    for step in itertools.count():
         if name == "panic brake":
-            if raw.forward_speed > state["top"]:
-                state["braking"] = True
-            elif state["braking"] and raw.forward_speed < STANDSTILL:
-                state.update(braking=False, top=rng.uniform(1.0, 5.0))
-            state["torque"] = np.full(1, -1.0 if state["braking"] else 1.0)
-        if name == "pulse" and step >= state["until"]:
-            state["until"] = step + int(rng.integers(3, 50))
-            state["torque"] = rng.choice([-1.0, 0.0, 1.0], size=4 if rng.random() < 0.3 else 1)
+            if raw.forward_speed > top:
+                braking = True
+            elif braking and raw.forward_speed < STANDSTILL:
+                braking, top = False, rng.uniform(1.0, 5.0)
+            torque = np.full(1, -1.0 if braking else 1.0)
+        if name == "pulse" and step >= until:
+            until = step + int(rng.integers(3, 50))
+            torque = rng.choice([-1.0, 0.0, 1.0], size=4 if rng.random() < 0.3 else 1)
         steering = size * math.sin(math.tau * 0.01 * step / period)
-        return np.array([*np.broadcast_to(state["torque"], 4), steering], dtype=np.float32)
-
-    return drive
+        yield np.array([*np.broadcast_to(torque, 4), steering], dtype=np.float32)
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -77,9 +74,9 @@ def run(job: Job) -> dict[str, Any]:
         if done:
             layout = {"ground": GROUNDS[episode % len(GROUNDS)], "agent": [0.0, 0.0, rng.uniform(-3, 3)]}
             env.reset(seed=1000 * job.seed + episode, options={"layout": layout})
-            drive, step, episode, spun = driven(job.driver, raw, rng), 0, episode + 1, False
-        _, _, terminated, truncated, info = env.step(drive(step))
-        step, done = step + 1, terminated or truncated
+            actions, episode, spun = driven(job.driver, raw, rng), episode + 1, False
+        _, _, terminated, truncated, info = env.step(next(actions))
+        done = terminated or truncated
         spins = bool(info["spin_out"])
         count["slipping"] += info["slip_max"] > SLIPPING
         count["spin_out"] += spins

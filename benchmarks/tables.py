@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 RESULTS: Final = Path(__file__).parent / "results"
+RUNS: Final = Path("runs")
 Job = TypeVar("Job")
 Row = dict[str, Any]
 

@@ -16,14 +16,13 @@ import itertools
 import math
 import multiprocessing
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, markdown, measured, options, total
+from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.envs.teleop_contact import TELEOP_ACCELERATION, TELEOP_BRAKING, TELEOP_TOP_SPEED
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 from safe_wrappers.wrappers.faults import Outages
@@ -143,10 +142,10 @@ def clearance_table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, print the tables."""
-    given = options(__doc__, seeds=5, workers=multiprocessing.cpu_count(), folder=Path("runs/teleop"))
+    given = options(__doc__, seeds=5, workers=multiprocessing.cpu_count())
     kinds = itertools.product(range(given.seeds), NETWORKS, DELAYS_S, CODINGS, OPERATORS, (False, True))
     jobs = [
         Job(coding, net, delay, who, revocation, seed) for seed, net, delay, coding, who, revocation in kinds
     ]
-    rows = measured(given.folder / "teleop.jsonl", jobs, run, given.workers)
+    rows = measured(RUNS / "teleop/teleop.jsonl", jobs, run, given.workers)
     keep("teleop", f"{energy_table(rows)}\n\n{clearance_table(rows)}")

@@ -13,7 +13,7 @@ began unsafe.
 
 import warnings
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from functools import reduce
 from typing import Any, Final
 
 import gymnasium as gym
@@ -23,7 +23,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.cases import CASES
-from benchmarks.tables import keep, markdown, measured, options, total
+from benchmarks.judges import FLAGS, Judged, counted
+from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 SCALES: Final = {
@@ -40,7 +41,6 @@ DECADES: Final = 4.0
 EPISODES: Final = 20
 _FIRST_SEED: Final = 1_000_000
 """Of the evaluation: no training episode has it."""
-FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Tally:
         return Tally(**sums, smallest=min(least, default=None))
 
 
-class Adversary(gym.Wrapper[Any, Any, Any, Any]):
+class Adversary(Judged):
     """Pays for violations and nearness instead of the task, and counts.
 
     Args:
@@ -89,30 +89,20 @@ class Adversary(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env_id: str, filtered: bool = True) -> None:
         case = CASES[env_id]
         bare = case.make()
-        super().__init__(case.protect(bare) if filtered else bare)
+        super().__init__(case.protect(bare) if filtered else bare, case.judge(bare.unwrapped))
         self._filtered, self._scale = filtered, SCALES.get(env_id, 1.0)
-        self._judge = case.judge(self.unwrapped)
         self.tally = Tally()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Steps, judges, counts and pays."""
-        self._judge.before()
-        observation, _, terminated, truncated, info = self.env.step(action)
-        executed = np.asarray(info["executed_action"] if self._filtered else action)
-        missed = self._judge.after(executed, info)
-        violated = not missed <= 0.0  # so that what is not a number counts
-        tally = self.tally
-        tally.steps += 1
-        tally.violations += int(violated)
-        reward = float(violated)
+        observation, _, terminated, truncated, info = super().step(action)
+        reward, tally = float(info["cost_substep"]), self.tally
+        for name, count in {"steps": 1, **counted(info, reward > 0.0)}.items():
+            setattr(tally, name, getattr(tally, name) + count)
         if self._filtered:
-            for name in FLAGS:
-                setattr(tally, name, getattr(tally, name) + int(info[f"cbf/{name}"]))
             margin = float(info["cbf/margin"])
             tally.smallest = margin if tally.smallest is None else min(tally.smallest, margin)
             reward += NEARNESS * nearness(margin, self._scale)
-            flagged = info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]
-            tally.unflagged += int(violated and not flagged)
         return observation, reward, terminated, truncated, info
 
 
@@ -132,9 +122,7 @@ def run(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
     policy = "MultiInputPolicy" if isinstance(envs.observation_space, gym.spaces.Dict) else "MlpPolicy"
     model = PPO(policy, envs, seed=job.seed, device="cpu", **settings)
     model.learn(job.steps)
-    training = Tally()
-    for env in made:
-        training = training.plus(env.tally)
+    training = reduce(Tally.plus, (env.tally for env in made))
     row: dict[str, Any] = asdict(job) | {"training": asdict(training)}
     for name, deterministic, filtered in (
         ("deterministic", True, True),
@@ -186,6 +174,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Train what is not trained yet, print the table."""
-    given = options(__doc__, steps=300_000, seed=0, folder=Path("runs/trained_adversary"))
+    given = options(__doc__, steps=300_000, seed=0)
     jobs = [Job(env, given.steps, given.seed) for env in SCALES]
-    keep("trained_adversary", table(measured(given.folder / "trained_adversary.jsonl", jobs, run, 1)))
+    keep(
+        "trained_adversary", table(measured(RUNS / "trained_adversary/trained_adversary.jsonl", jobs, run, 1))
+    )

@@ -24,11 +24,10 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "config_keys",
     "docstrings",
     "drawn",
-    "info_keys",
     "mathml",
+    "tables",
 ]
 default_role = "code"  # single backticks in docstrings
 

@@ -16,18 +16,13 @@ _LEANING = np.array([1.0, -1.0, -1.0, 1.0])
 """Which way each leg's ankle bends."""
 
 
-def _legs(model: Any) -> tuple[list[int], NDArray[np.int64], NDArray[np.bool_]]:
-    """The driven joints; of each the number of its leg, and whether it is a hip."""
-    joints = [int(j) for j in model.actuator_trnid[:, 0]]
-    leg = np.array([int(model.joint(j).name[-1]) - 1 for j in joints])
-    return joints, leg, np.array([model.joint(j).name.startswith("hip") for j in joints])
-
-
 def gait(env: Any, strength: float = 1.2) -> Callable[[int], NDArray[np.float32]]:
     """Hips swing, ankles lift while they do; a torque for each joint's error."""
     raw = env.unwrapped
     m = raw.model
-    joints, leg, hip = _legs(m)
+    joints = [int(j) for j in m.actuator_trnid[:, 0]]
+    leg = np.array([int(m.joint(j).name[-1]) - 1 for j in joints])
+    hip = np.array([m.joint(j).name.startswith("hip") for j in joints])
     qpos, dofs = m.jnt_qposadr[joints], m.jnt_dofadr[joints]
 
     def act(step: int) -> NDArray[np.float32]:
@@ -68,20 +63,3 @@ def walk(
     metres = float(raw.data.qpos[0])
     env.close()
     return forces, infos, metres
-
-
-def sway(env: Any, amplitude: float, period_s: float = 1.0) -> Callable[[int], NDArray[np.float32]]:
-    """All feet stay down, and the ankles of one side bend while those of the other stretch."""
-    raw = env.unwrapped
-    m = raw.model
-    joints, leg, hip = _legs(m)
-    qpos, dofs = m.jnt_qposadr[joints], m.jnt_dofadr[joints]
-    side = np.array([1.0, 1.0, -1.0, -1.0])
-
-    def act(step: int) -> NDArray[np.float32]:
-        lean = amplitude * np.sin(2.0 * np.pi * STEP_S * step / period_s) * min(step / 20, 1.0)
-        wanted = np.where(hip, 0.0, (_LEANING * (0.9 + lean * side))[leg])
-        torque = 1.5 * (wanted - raw.data.qpos[qpos]) - 0.1 * raw.data.qvel[dofs]
-        return np.clip(torque, -1.0, 1.0).astype(np.float32)
-
-    return act

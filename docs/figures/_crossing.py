@@ -1,7 +1,6 @@
 """OccludedCrossing with its cars tracked, and how it is drawn from above."""
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -14,14 +13,12 @@ from _style import FORBIDDEN, GRID, INK, OFF, bare
 from safe_wrappers.envs.traffic import CAR_ACCELERATION_NOISE, CAR_TIME_CONSTANT_S
 
 STEP_S = 0.04
-EYE = sw.occlusion.Sensor(camera="eye", view_deg=100, range_m=9, position_std=0.05)
-SHADOW_M = 12.0
+TOLERANCE_M, SHADOW_M = 0.5, 12.0
 
 
-def car_tracks(*bodies: str) -> list[sw.occlusion.Track]:
-    """The cars' true motion; without names, all of them. The first three drive towards +x."""
-    named = bodies or ("car[012]", "car[345]")
-    return [
+def tracked(*bodies: str) -> Any:
+    """The env with these cars tracked, all by default; the first three drive towards +x."""
+    tracks = [
         sw.occlusion.Track(
             name,
             acceleration_noise=[CAR_ACCELERATION_NOISE, 0.0],
@@ -30,14 +27,10 @@ def car_tracks(*bodies: str) -> list[sw.occlusion.Track]:
             start_position_std=[0.3, 0.0],
             start_velocity_std=[0.15, 0.0],
         )
-        for name in named
+        for name in bodies or ("car[012]", "car[345]")
     ]
-
-
-def tracked(tracks: Sequence[sw.occlusion.Track] | None = None, sensor: Any = EYE, **more: Any) -> Any:
-    """The env with its cars tracked."""
-    given: dict[str, Any] = {"tolerance": 0.5} | more
-    return sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), tracks or car_tracks(), sensor, **given)
+    eye = sw.occlusion.Sensor(camera="eye", view_deg=100, range_m=9, position_std=0.05)
+    return sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), tracks, eye, tolerance=TOLERANCE_M)
 
 
 def turn_to(env: Any, heading: float) -> float:

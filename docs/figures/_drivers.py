@@ -6,7 +6,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+import safe_wrappers as sw
+from _style import OFF, ON
 from safe_wrappers.errors import Array
+
+
+def sides(env_id: str, constraint: Any) -> tuple[tuple[Any, str, str], ...]:
+    """An env without and with a filter, each with its colour and its name; episodes have no end."""
+    bare, filtered = (gym.make(env_id).unwrapped for _ in range(2))
+    return (
+        (bare, OFF, "unfiltered"),
+        (sw.CBFActionFilter(filtered, [constraint]), ON, "filtered"),
+    )
 
 
 def bang_bang(size: float, often: float, seed: int = 0) -> Callable[[Any], Any]:

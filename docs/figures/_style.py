@@ -9,6 +9,7 @@ from typing import Any, Final
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from safe_wrappers import UnsafeStateWarning
 
@@ -64,11 +65,17 @@ _RC: Final[dict[Any, Any]] = {
 }
 
 
-def panels(columns: int = 1, width: float = 7.2, height: float = 3.0, **more: Any) -> tuple[Figure, Any]:
+def panels(
+    columns: int = 1, width: float = 7.2, height: float = 3.0, rows: int = 1, **more: Any
+) -> tuple[Figure, Any]:
     """A figure and its axes, without pyplot's global state."""
     figure = Figure(figsize=(width, height))
-    axes = figure.subplots(1, columns, **more)
-    return figure, axes
+    return figure, figure.subplots(rows, columns, **more)
+
+
+def disc(ax: Axes, center: Any, radius: float) -> None:
+    """A hazard."""
+    ax.add_patch(Circle(center, radius, color=FORBIDDEN, alpha=0.35, lw=0))
 
 
 def bare(ax: Axes) -> None:

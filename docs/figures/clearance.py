@@ -2,39 +2,18 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 import safe_wrappers as sw
-from _style import FORBIDDEN, INK, OFF, ON, OTHER, panels
+from _cart import Cart, plant
+from _style import FORBIDDEN, INK, OFF, ON, OTHER, disc, panels
 from safe_wrappers.control.backup.stopping import held_stop
 from safe_wrappers.errors import Array
 
 BRAKE, HOLD, DELAY = 2.0, 0.25, 0.2
 CENTER, RADIUS = (2.0, 0.12), 0.5
-
-
-class PointMass(gym.Env[Array, Array]):
-    """Two forces on one kilogram, 20 Hz."""
-
-    def __init__(self) -> None:
-        self.dt = 0.05
-        self.action_space = gym.spaces.Box(-3.0, 3.0, (2,), np.float64)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float64)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict[str, Any]]:
-        """At the origin, moving right."""
-        super().reset(seed=seed)
-        self.state = np.array([0.0, 0.0, 1.2, 0.0])
-        return self.state, {}
-
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold an acceleration."""
-        p, v = self.state[:2], self.state[2:]
-        self.state = np.concatenate([p + v * self.dt + 0.5 * action * self.dt**2, v + action * self.dt])
-        return self.state, 0.0, False, False, {}
 
 
 def to_the_right(state: Array) -> Array:
@@ -63,14 +42,8 @@ def draw() -> Figure:
     inset.fill_between(speed, 0.0, held, color=FORBIDDEN, alpha=0.12, lw=0)
     inset.set(ylim=(0.0, 1.6), xlabel="approach speed (m/s)", ylabel="stopping distance (m)")
     inset.legend(loc="upper left")
-    raw = PointMass()
-    plant = sw.AnalyticPlant(
-        f=lambda x: np.array([x[2], x[3], 0.0, 0.0]),
-        g=lambda x: np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
-        state=lambda env: env.state,
-        control_dt=0.05,
-    )
-    disc = sw.constraints.Clearance(
+    raw = Cart((0.0, 0.0, 1.2, 0.0), 0.05, most=3.0)
+    keep_out = sw.constraints.Clearance(
         [sw.constraints.Disc(CENTER, RADIUS)],
         braking=2.5,
         position=[0, 1],
@@ -79,8 +52,8 @@ def draw() -> Figure:
         margin=0.01,
     )
     chart.plot(*drive(raw).T, color=OFF)
-    chart.plot(*drive(sw.CBFActionFilter(raw, [disc], plant=plant)).T, color=ON)
-    chart.add_patch(Circle(CENTER, RADIUS, color=FORBIDDEN, alpha=0.35, lw=0))
+    chart.plot(*drive(sw.CBFActionFilter(raw, [keep_out], plant=plant(raw))).T, color=ON)
+    disc(chart, CENTER, RADIUS)
     chart.add_patch(Circle(CENTER, RADIUS + 0.1, fill=False, color=FORBIDDEN, lw=0.8, ls=":"))
     chart.set(aspect="equal", xlim=(-0.1, 4.2), xlabel="x (m)", ylabel="y (m)")
     return figure

@@ -5,15 +5,14 @@ from matplotlib.figure import Figure
 
 import safe_wrappers as sw
 from _ant import walk
-from _style import FORBIDDEN, GRID, INK, OFF, ON
+from _style import FORBIDDEN, GRID, INK, OFF, ON, panels
 
 STEPS, SHARE = 60, 0.7
 
 
 def draw() -> Figure:
     """Left without, right with the constraint; steps that are flagged infeasible are hollow."""
-    figure = Figure(figsize=(7.2, 3.4))
-    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    figure, (left, right) = panels(2, height=3.4, sharex=True, sharey=True)
     for ax, color, title, wrap in (
         (left, OFF, "filter off", lambda env: env),
         (right, ON, "filter on", lambda env: sw.CBFActionFilter(env, [sw.constraints.ContactFeasibility()])),

@@ -5,10 +5,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 import safe_wrappers as sw
-from _style import FORBIDDEN, INK, OFF, ON, panels
+from _style import INK, OFF, ON, disc, panels
 from first_look import LAYOUT
 
 BINS = 16
@@ -24,7 +23,7 @@ def draw() -> Figure:
     shown = observation[62:78].reshape(4, 4)
     lidar = observation[28:44]
     for center in task.hazard_positions:
-        chart.add_patch(Circle(center, task.hazard_radius, color=FORBIDDEN, alpha=0.35, lw=0))
+        disc(chart, center, task.hazard_radius)
     place, heading = task.agent_position, task.agent_heading
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
     for ahead, left, squashed, _ in shown:

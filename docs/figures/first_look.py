@@ -1,16 +1,18 @@
 """The goal task with a driver that is blind to hazards, with the filter and without."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
-from _style import FORBIDDEN, INK, OFF, ON, SAFE, bare, panels
+from _style import FORBIDDEN, INK, OFF, ON, SAFE, bare, disc, panels
 
 LAYOUT = {
     "agent": [-1.6, -1.0, 0.3],
@@ -27,18 +29,27 @@ def towards_goal(task: Any) -> NDArray[np.float64]:
     return np.array([math.cos(angle), np.clip(3.0 * angle, -1.0, 1.0)])
 
 
-def drive(env: Any) -> tuple[NDArray[np.float64], float]:
-    """Positions until the goal is reached, shape (k, 2), and the steps inside a hazard."""
+def drive_to_goal(
+    env: Any,
+    layout: dict[str, Any] = LAYOUT,
+    seed: int = 0,
+    steer: Callable[[Any], NDArray[np.float64]] = towards_goal,
+) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
+    """Positions until the goal is reached, shape (k + 1, 2), and the infos of the k steps."""
     task = env.unwrapped
-    env.reset(seed=0, options={"layout": LAYOUT})
-    where, cost = [task.agent_position], 0.0
-    for _ in range(1000):
-        info = env.step(towards_goal(task))[4]
+    env.reset(seed=seed, options={"layout": layout})
+    where, infos = [task.agent_position], []
+    while len(infos) < 1000 and not (infos and infos[-1]["goal_met"]):
+        infos.append(env.step(steer(task))[4])
         where.append(task.agent_position)
-        cost += info["cost_substep"]
-        if info["goal_met"]:
-            break
-    return np.array(where), cost
+    return np.array(where), infos
+
+
+def show_layout(ax: Axes, layout: dict[str, Any]) -> None:
+    """The hazards and the goal."""
+    for center in layout["hazards"]:
+        disc(ax, center, 0.2)
+    ax.add_patch(Circle(layout["goal"], 0.3, fill=False, color=SAFE, lw=1.5))
 
 
 def draw() -> Figure:
@@ -49,14 +60,12 @@ def draw() -> Figure:
         (sw.protect(gym.make("SafePointGoal1-v0")), ON, "filtered"),
     ):
         task: Any = env.unwrapped
-        path, cost = drive(env)
+        path, infos = drive_to_goal(env)
         chart.plot(*path.T, color=color)
         gaps = np.linalg.norm(path[:, None] - task.hazard_positions, axis=2).min(axis=1) - task.hazard_radius
-        label = f"{name}: {cost:.0f} steps in violation"
+        label = f"{name}: {sum(info['cost_substep'] for info in infos):.0f} steps in violation"
         distance.plot(np.arange(len(path)) * task.dt, 100.0 * gaps, color=color, label=label)
-    for center in LAYOUT["hazards"]:
-        chart.add_patch(Circle(center, task.hazard_radius, color=FORBIDDEN, alpha=0.35, lw=0))
-    chart.add_patch(Circle(LAYOUT["goal"], task.goal_radius, fill=False, color=SAFE, lw=1.5))
+    show_layout(chart, LAYOUT)
     chart.text(*LAYOUT["goal"], "goal", color=SAFE, ha="center", va="center")
     chart.plot(*path[0], "s", color=INK, ms=5)
     bare(chart)

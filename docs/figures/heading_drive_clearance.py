@@ -5,10 +5,9 @@ import math
 import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 import safe_wrappers as sw
-from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
+from _style import INK, ON, OTHER, SAFE, bare, disc, panels
 from safe_wrappers.control.backup.heading_drive import way_to_rest
 from safe_wrappers.errors import Array
 
@@ -41,7 +40,7 @@ def draw() -> Figure:
         ax.annotate("", nose, (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": INK})
         ax.text(nose[0], nose[1] + 0.04, "heading", color=INK, ha="center", va="center")
         ax.plot(0.0, 0.0, "s", color=INK, ms=5)
-        ax.add_patch(Circle((0.72, 0.12), 0.2, color=FORBIDDEN, alpha=0.35, lw=0))
+        disc(ax, (0.72, 0.12), 0.2)
         bare(ax)
         ax.set(xlim=(-0.1, 1.0), ylim=(-0.58, 0.34))
     return figure

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
-from _cart import Cart, run, wall
+from _cart import run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, panels
 from safe_wrappers.filter.constraint import Constraint
 
@@ -29,7 +29,7 @@ def draw() -> Figure:
         (ContinuousRow(), OFF, "continuous condition"),
         (wall(WALL), ON, "held control"),
     ):
-        loop = run(Cart((0.0, 0.0), dt), 20, [constraint])
+        loop = run(dt, 20, constraint)
         distance.plot(loop.t, 1000 * (WALL - loop.x), color=color, label=name)
         distance.plot(loop.t[::20], 1000 * (WALL - loop.x[::20]), "o", color=color, ms=3.5)
         commands.step(np.arange(len(loop.u)) * dt, loop.u, where="post", color=color)

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from _cart import Cart, run, wall
+from _cart import run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, panels
 
 WALL = 2.0
@@ -16,7 +16,7 @@ def draw() -> Figure:
     ratios = np.linspace(0.4, 1.6, 25)
     closest, times = [], []
     for ratio in ratios:
-        loop = run(Cart((0.0, 0.0), dt=0.1), 60, [wall(WALL, braking=ratio)])
+        loop = run(0.1, 60, wall(WALL, braking=ratio))
         closest.append(1000 * (WALL - loop.x.max()))
         times.append(loop.t[np.argmax(loop.x > WALL - NEAR_M)])
     depth.plot(ratios, closest, color=ON)

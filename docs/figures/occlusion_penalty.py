@@ -6,12 +6,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from _crossing import STEP_S, car_tracks, tracked, turn_to
-from _style import FORBIDDEN, INK, OFF, ON
+from _crossing import STEP_S, TOLERANCE_M, tracked, turn_to
+from _style import FORBIDDEN, INK, OFF, ON, panels
 
 STEPS = 250
-TOLERANCE = 0.5
-"""m."""
 TOP = 0.72
 """m: of the panels; the strip is above."""
 LAYOUT = {
@@ -24,7 +22,7 @@ LAYOUT = {
 
 def run() -> tuple[Any, Any, Any, Any]:
     """Errors along the lane, sigmas, seen and expired, each of shape (steps, 3)."""
-    env = tracked(car_tracks("car0", "car3", "car4"), tolerance=TOLERANCE)
+    env = tracked("car0", "car3", "car4")
     env.reset(seed=3, options={"layout": LAYOUT})
     errors, infos = [], []
     for k in range(STEPS):
@@ -38,14 +36,13 @@ def run() -> tuple[Any, Any, Any, Any]:
 def draw() -> Figure:
     """A panel per car."""
     errors, sigmas, seen, expired = run()
-    figure = Figure(figsize=(7.2, 5.2))
-    axes = figure.subplots(3, 1, sharex=True)
+    figure, axes = panels(rows=3, height=5.2, sharex=True)
     times = STEP_S * np.arange(1, STEPS + 1)
     for i, (ax, name) in enumerate(zip(axes, ("car0", "car3", "car4"), strict=True)):
         band = np.minimum(3.0 * sigmas[:, i], TOP)
         ax.fill_between(times, -band, band, color=ON, alpha=0.22, lw=0, label=r"$\pm 3\,\sigma$")
         ax.plot(times, errors[:, i], color=INK, lw=1.1, label="true error")
-        for side in (-TOLERANCE, TOLERANCE):
+        for side in (-TOLERANCE_M, TOLERANCE_M):
             ax.axhline(side, color=FORBIDDEN, lw=1.0)
         lost = expired[:, i]
         for mask, low, high, color, alpha, label in (

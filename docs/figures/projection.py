@@ -1,5 +1,8 @@
 """The executed action: projected onto the row and the box at once, against clamped afterwards."""
 
+import itertools
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -32,16 +35,12 @@ def draw() -> Figure:
     row_only = nominal - (normal @ nominal - offset) / (normal @ normal) * normal
     clamped = np.clip(row_only, LOW, HIGH)
     assert normal @ clamped > offset + 0.1  # clamping has broken the row
-    for start, end in ((nominal, row_only), (row_only, clamped)):
-        right.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": OTHER, "ls": ":"})
-    right.plot(*clamped, "X", color=FORBIDDEN, ms=9)
+    astray(right, nominal, row_only, clamped)
     right.text(1.42, 0.5, "row first, then\nclamped: breaks\nthe row", color=FORBIDDEN, va="center")
     right.text(1.2, -0.1, "row and bounds\ntogether", color=ON, va="center")
     arrow(right, nominal, normal, offset)
-    for ax in (left, right):
-        ax.set(xlim=(-1.25, 1.35 if ax is left else 2.35), ylim=(-1.25, 1.25), aspect="equal", xlabel="$u_1$")
-        ax.set_ylabel("$u_2$", rotation=0)
-        ax.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+    left.set(xlim=(-1.25, 1.35), ylim=(-1.25, 1.25))
+    right.set(xlim=(-1.25, 2.35), ylim=(-1.25, 1.25))
     return figure
 
 
@@ -55,14 +54,29 @@ def world(ax: Axes, normal: Array, offset: float) -> None:
             kept.append(a)
         if excess_a * excess_b < 0:
             kept.append(a + (b - a) * excess_a / (excess_a - excess_b))
-    ax.add_patch(Polygon(kept, color=SAFE, alpha=0.2, lw=0))
+    admitted(ax, kept, normal[None], np.array([offset]))
+
+
+def admitted(ax: Axes, corners: Any, normals: Array, offsets: Array) -> None:
+    """A polygon, the box, and the edges of half-spaces."""
+    ax.add_patch(Polygon(corners, color=SAFE, alpha=0.2, lw=0))
     ax.add_patch(Rectangle((-1, -1), 2, 2, fill=False, ec=GRID, ls="--"))
-    along = np.array([-normal[1], normal[0]]) / np.linalg.norm(normal)
-    foot = offset * normal / (normal @ normal)
-    ax.plot(*np.array([foot - 3 * along, foot + 3 * along]).T, color=FORBIDDEN, lw=1.2)
+    for normal, offset in zip(normals, offsets, strict=True):
+        along = np.array([-normal[1], normal[0]]) / np.linalg.norm(normal)
+        foot = offset * normal / (normal @ normal)
+        ax.plot(*np.array([foot - 3 * along, foot + 3 * along]).T, color=FORBIDDEN, lw=1.2)
+    ax.set(aspect="equal", xlabel="$u_1$", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+    ax.set_ylabel("$u_2$", rotation=0)
 
 
-def arrow(ax: Axes, start: Array, normal: Array, offset: float) -> Array:
+def astray(ax: Axes, *points: Array) -> None:
+    """A way that ends where it should not."""
+    for start, end in itertools.pairwise(points):
+        ax.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": OTHER, "ls": ":"})
+    ax.plot(*points[-1], "X", color=FORBIDDEN, ms=9)
+
+
+def arrow(ax: Axes, start: Array, normal: Array, offset: Any) -> Array:
     """From the policy's action to the library's answer."""
     end = sw.project(start, normal, offset, LOW, HIGH).control
     ax.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": INK, "shrinkA": 4, "shrinkB": 4})

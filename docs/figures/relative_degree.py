@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
-from _cart import Cart, run, wall
+from _cart import run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, SAFE, panels
 from safe_wrappers.control.backup.stopping import held_stop
 from safe_wrappers.filter.constraint import Constraint
@@ -32,7 +32,7 @@ def draw() -> Figure:
     plane.axvline(WALL, color=FORBIDDEN, lw=2)
     plane.text(WALL + 0.05, 0.1, "wall", color=FORBIDDEN)
     for constraint, color in ((NextPosition(), OFF), (wall(WALL), ON)):
-        loop = run(Cart((0.0, 0.0), dt=0.1), 45, [constraint])
+        loop = run(0.1, 45, constraint)
         plane.plot(loop.x, loop.v, color=color)
         commands.step(np.arange(len(loop.u)) * 0.1, loop.u, where="post", color=color)
     plane.text(2.5, 1.85, "checks the next\nposition only", color=OFF)

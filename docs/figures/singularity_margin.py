@@ -7,7 +7,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 import safe_wrappers as sw
-from _style import FORBIDDEN, GRID, INK, OFF, ON, bare, panels
+from _drivers import sides
+from _style import FORBIDDEN, GRID, INK, bare, panels
 
 MIDDLE, RADIUS, SPEED = np.array([0.1715, 0.0]), 0.04, 0.1
 START = (np.array([-0.9549, 1.7911, 0.1, -0.1]), np.zeros(4))
@@ -47,12 +48,10 @@ def draw() -> Figure:
     margin = sw.constraints.SingularityMargin(
         body="fingertip", directions="xy", task_speed=0.1, rate_limit=5.0, horizon=8
     )
-    raw = gym.make("Reacher-v5").unwrapped
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5").unwrapped, [margin])
     time = np.linspace(0.0, 2.0 * np.pi * RADIUS / SPEED, 200)
     ways.plot(*np.array([reference(t) for t in time]).T, color=GRID, lw=0.9, ls="--")
     ways.add_patch(Circle((0.0, 0.0), 0.21, fill=False, ec=FORBIDDEN, lw=1.2))
-    for env, color, name in ((raw, OFF, "unfiltered"), (filtered, ON, "filtered")):
+    for env, color, name in sides("Reacher-v5", margin):
         places, rates = follow(env)
         ways.plot(*places.T, color=color, lw=1.2)
         speeds.plot(0.02 * np.arange(len(rates)), rates, color=color, lw=1.3, label=name)

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
-from _style import FORBIDDEN, GRID, INK, OFF, ON, SAFE
+from _style import FORBIDDEN, GRID, INK, OFF, ON, SAFE, panels
 from safe_wrappers.envs.ground import MAGIC_FORMULA
 
 FULL_THROTTLE = np.array([1.0, 1.0, 1.0, 1.0, 0.0], np.float32)
@@ -35,8 +35,7 @@ def run(limited: bool) -> tuple[Any, list[dict[str, Any]]]:
 
 def draw() -> Figure:
     """Three panels over the way of a front wheel; the shading is the ice."""
-    figure = Figure(figsize=(7.2, 5.0))
-    speed, slip, estimate = figure.subplots(3, 1, sharex=True)
+    figure, (speed, slip, estimate) = panels(rows=3, height=5.0, sharex=True)
     for limited, color, label in ((False, OFF, "limiter off"), (True, ON, "limiter on")):
         (metres, fast, on_ice), infos = run(limited)
         speed.plot(metres, fast, color=color, label=f"{label}: {STEP_S * len(infos):.2f} s")

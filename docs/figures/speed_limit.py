@@ -1,12 +1,11 @@
 """HalfCheetah's speed under random full torques, limited and not."""
 
-import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
-from _drivers import bang_bang, drive
-from _style import FORBIDDEN, OFF, ON, panels
+from _drivers import bang_bang, drive, sides
+from _style import FORBIDDEN, panels
 
 LIMIT = 0.6
 
@@ -15,9 +14,7 @@ def draw() -> Figure:
     """Speed over the control step; steps that were flagged infeasible are marked."""
     figure, ax = panels(height=2.8)
     limit = sw.constraints.SpeedLimit(LIMIT, body="torso", direction="+x", margin=0.02)
-    raw = gym.make("HalfCheetah-v5")
-    limited = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [limit])
-    for env, color, name in ((raw, OFF, "unfiltered"), (limited, ON, "filtered")):
+    for env, color, name in sides("HalfCheetah-v5", limit):
         speed, infos = drive(env, bang_bang(1.0, 0.1), 200, lambda raw, info: info["x_velocity"])
         time = np.arange(len(speed)) * 0.05
         ax.plot(time, speed, color=color, lw=1.2, label=name)

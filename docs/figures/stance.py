@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 import safe_wrappers as sw
 from _ant import gait
-from _style import ON, OTHER
+from _style import ON, OTHER, panels
 from safe_wrappers.filter.bound import Bound
 
 BEFORE = 16
@@ -25,8 +25,7 @@ def draw() -> Figure:
     plant.bind(env)
     plant.observe()
     wanted = act(BEFORE).astype(np.float64)
-    figure = Figure(figsize=(7.2, 3.0))
-    ax = figure.subplots()
+    figure, ax = panels()
     for options, color, label in (
         ({}, OTHER, "pyramids"),
         ({"cone": "exact"}, ON, "exact cone"),

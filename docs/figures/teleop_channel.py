@@ -50,9 +50,7 @@ def episode(
 def draw() -> Figure:
     """Above force and energy over time; below the clearance, authority revoked and not."""
     figure = Figure(figsize=(7.2, 5.2))
-    grid = figure.add_gridspec(2, 2)
-    force, energy = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
-    clearance = figure.add_subplot(grid[1, :])
+    force, energy, clearance = figure.subplot_mosaic("FE;CC").values()
     time = STEP_S * np.arange(round(SECONDS / STEP_S))
     for coding, impedance, color in (("plain", None, OFF), ("wave", 40.0, ON)):
         seen = episode(DELAY_S, SECONDS, (0.17, 0.0), impedance=impedance)

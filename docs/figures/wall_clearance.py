@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import safe_wrappers as sw
-from _drivers import bang_bang
-from _style import FORBIDDEN, INK, OFF, ON, bare, panels
+from _drivers import bang_bang, sides
+from _style import FORBIDDEN, INK, bare, panels
 from safe_wrappers.errors import Array
 
 with contextlib.redirect_stderr(io.StringIO()):  # it greets on stderr
@@ -37,14 +37,8 @@ def drive(env: Any) -> tuple[Array, int]:
 def draw() -> Figure:
     """Left: unfiltered. Right: filtered."""
     figure, axes = panels(2, height=3.2)
-    raw = gym.make("PointMaze_UMaze-v3", max_episode_steps=1000)
-    filtered = sw.CBFActionFilter(
-        gym.make("PointMaze_UMaze-v3", max_episode_steps=1000),
-        [sw.constraints.WallClearance(velocity_clip=5.0)],
-    )
-    for ax, env, color, name in zip(
-        axes, (raw, filtered), (OFF, ON), ("unfiltered", "filtered"), strict=True
-    ):
+    limit = sw.constraints.WallClearance(velocity_clip=5.0)
+    for ax, (env, color, name) in zip(axes, sides("PointMaze_UMaze-v3", limit), strict=True):
         path, touching = drive(env)
         model = env.unwrapped.point_env.model
         for geom in range(model.ngeom):

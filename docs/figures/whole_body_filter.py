@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 import safe_wrappers as sw
 from _ant import STEP_S, walk
-from _style import FORBIDDEN, INK, OFF, ON
+from _style import FORBIDDEN, INK, OFF, ON, panels
 
 STEPS, SHARE = 100, 0.7
 
@@ -15,8 +15,7 @@ def draw() -> Figure:
     off, _, way_off = walk(lambda env: env, STEPS)
     on, infos, way_on = walk(sw.WholeBodyFilter, STEPS)
     times = STEP_S * np.arange(1, STEPS + 1)
-    figure = Figure(figsize=(7.2, 4.2))
-    above, below = figure.subplots(2, 1, sharex=True)
+    figure, (above, below) = panels(rows=2, height=4.2, sharex=True)
     flagged = np.array([info["cbf/infeasible"] for info in infos])
     for forces, color, label in (
         (off, OFF, f"filter off: {way_off:.1f} m"),

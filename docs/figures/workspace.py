@@ -1,12 +1,11 @@
 """The way of Reacher's fingertip, inside a box and around a disc."""
 
-import gymnasium as gym
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Rectangle
 
 import safe_wrappers as sw
-from _drivers import bang_bang, drive
-from _style import FORBIDDEN, INK, OFF, ON, bare, panels
+from _drivers import bang_bang, drive, sides
+from _style import FORBIDDEN, INK, bare, disc, panels
 
 LOW, HIGH = (-0.15, -0.1), (0.22, 0.12)
 DISC, RADIUS = (0.06, -0.1), 0.05
@@ -23,15 +22,13 @@ def draw() -> Figure:
         margin=0.003,
         horizon=8,
     )
-    raw = gym.make("Reacher-v5").unwrapped
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5").unwrapped, [inside])
-    for ax, env, color in zip(axes, (raw, filtered), (OFF, ON), strict=True):
+    for ax, (env, color, _) in zip(axes, sides("Reacher-v5", inside), strict=True):
         path, _ = drive(
             env, bang_bang(0.1, 0.05), 400, lambda raw, info: raw.data.body("fingertip").xpos[:2].copy()
         )
         width, height = HIGH[0] - LOW[0], HIGH[1] - LOW[1]
         ax.add_patch(Rectangle(LOW, width, height, fill=False, ec=FORBIDDEN, lw=1.2))
-        ax.add_patch(Circle(DISC, RADIUS, color=FORBIDDEN, alpha=0.35, lw=0))
+        disc(ax, DISC, RADIUS)
         ax.plot(*path.T, color=color, lw=1.1)
         ax.plot(*path[0], "s", color=INK, ms=4)
         bare(ax)
