@@ -164,6 +164,7 @@ def test_the_flexible_arms_resonances_are_those_of_finite_differences_and_of_two
     check, arm = rigid_model_check(env), env.unwrapped.arm
     frequencies, ratios = ringing_of_finite_differences(env)
     np.testing.assert_allclose(check.resonances, frequencies, rtol=1e-3)
+    assert all(f"{frequency / (2.0 * np.pi):.3g} Hz" in str(check) for frequency in check.resonances)
     np.testing.assert_allclose(check.damping_ratios, ratios, rtol=0.02)
     inertia = inertia_of(arm, np.array([0.4, elbow]))
     np.testing.assert_allclose(

@@ -115,6 +115,7 @@ def test_a_point_at_the_sensor_is_seen_points_that_are_none_are_not_and_what_is_
     nan, far, near, behind = [np.nan, 0, 0], [np.inf, 0, 0], [1, 0, 0.5], [3, 0, 0.5]
     assert sees(sight, sight.position, nan, far, near, behind) == [True, False, False, True, False]
     assert sees(around, nan, near, behind) == [False, True, False]
+    assert sees(around, behind, bodies=[0]) == [True]  # the world's, whose wall it is
     # A sensor does not see its own body, but it sees what is fixed where it is fixed itself.
     assert sees(looking(model, data, camera="fixed"), [0.1, 0, 0.5], behind) == [True, False]
     assert sees(looking(*world(WALL.format(alpha=0))), behind) == [True]

@@ -101,6 +101,7 @@ def found(world, ball=BALL):
 def test_a_box_is_a_wall_and_reach_is_where_a_contact_is_reported():
     (wall,), reach = found(WALL)
     assert wall == pytest.approx((1.5, 2.5, -1.0, 1.0))
+    assert found(WALL, BALL.replace("/>", ' pos="0 0 0.15"/>'))[1] == reach  # seen from above
     plant = observing(xml())
     data = mujoco.MjData(plant.model)
     # Versions of MuJoCo differ in whether two contact margins add up: between these two a contact may be reported.
