@@ -159,8 +159,9 @@ def tests_of(where: Path, file: str) -> list[str]:
     stem = Path(file).stem
     names += [name.removeprefix("Bound") for name in names]
     word = re.compile(rf"\b({'|'.join(names)})\b")
-    folders = ("filter", "constraints", "control", "plants", "wrappers", "vector", "contract", "train")
-    paths = [path for folder in folders for path in sorted((where / "tests" / folder).rglob("test_*.py"))]
+    paths = sorted((where / "tests").glob("test_*.py"))
+    for folder in ("filter", "constraints", "control", "plants", "wrappers", "vector", "contract", "train"):
+        paths += sorted((where / "tests" / folder).rglob("test_*.py"))
     texts = {path: path.read_text() for path in paths}
     counts = {
         path: len(word.findall(text)) / len(text) + (stem in path.stem) + (f"{stem} import" in text)

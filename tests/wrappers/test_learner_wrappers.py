@@ -96,6 +96,8 @@ def test_of_hazards_the_nearest_are_shown_in_the_robots_frame():
         observation, _, _, _, info = env.step(env.action_space.sample())
         share = (info[keys.EXECUTED_ACTION] - info[keys.PROPOSED_ACTION]) / 2.0
         np.testing.assert_allclose(features_of(env, observation)[-2:], share, atol=1e-7)
+    alone = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")), neighbours=0)
+    assert alone.observation_space.shape[0] == env.observation_space.shape[0] - 12
 
 
 def test_a_detour_is_shown_with_the_time_that_is_left_of_it():
