@@ -70,6 +70,20 @@ def test_what_a_fetch_arm_keeps_can_be_chosen():
     assert len(clear.keep_out) == 2 and clear.keep_out[1] == ball
 
 
+def test_an_ant_keeps_out_of_its_mazes_blocks_and_of_nothing_else():
+    env = sw.protect(make("AntMaze_UMaze-v5"))
+    model, points = env.unwrapped.model, np.random.default_rng(0).uniform(-14.0, 14.0, (2000, 1, 2))
+    blocks = [g for g in range(model.ngeom) if model.geom(g).name.startswith("block")]
+
+    def inside(centers, halves):
+        return (np.abs(points - centers) < halves).all(axis=2).any(axis=1)
+
+    kept_out = env.constraints[0].keep_out
+    found = inside([box.center for box in kept_out], [box.half_size for box in kept_out])
+    np.testing.assert_array_equal(found, inside(model.geom_pos[blocks, :2], model.geom_size[blocks, :2]))
+    assert 0.1 < found.mean() < 0.9
+
+
 def test_hulls_are_as_large_as_the_geoms():
     assert POINT.radius <= POINT_HULL_RADIUS_M < POINT.radius + 1e-3
     assert np.hypot(VASE_HALF_SIZE, VASE_HALF_SIZE) <= VASE_HULL_RADIUS_M < np.sqrt(2) * VASE_HALF_SIZE + 1e-3

@@ -59,6 +59,7 @@ def test_a_rollout_goes_through_the_wrappers_inside_and_changes_none_of_them():
     env = NormalizeObservation(RecordEpisodeStatistics(TimeLimit(Cart(), 5)))
     plant = bound(env)
     before = env.obs_rms.mean.copy(), env.obs_rms.count
+    assert 1000 <= plant.checked_steps < 1010  # at binding, to the end of a stretch
     ahead = plant.rollout(FULL, 9)
     assert len(ahead.observations) == 5 and ahead.ended  # the time limit ends the episode
     assert (env.obs_rms.mean == before[0]).all() and env.obs_rms.count == before[1]
