@@ -54,6 +54,8 @@ class Task:
 SLOWER = ("action_repeat=8", "hyperparameters.gamma=0.97")
 """An action for eight control steps: half the decisions, and half the updates."""
 SBX = "algorithm=sbx.SAC"
+HALF = "hyperparameters.gradient_steps=2"
+"""Half an update for an action: twice the actions in the same time."""
 TASKS = (
     Task("SafePointGoal1-v0", "goal_sac", 5),
     Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000",), "_1m"),
@@ -73,6 +75,7 @@ TASKS = (
     Task("SafeAntVelocity-v0", "velocity_sac", 3),
     Task("SafeHumanoidVelocity-v0", "velocity_sac", 3),
     Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000", SBX), "_sbx_1m"),
+    Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=500000", SBX, HALF), "_sbx_2m"),
     Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=50000", SBX, *SLOWER), "_sbx_8"),
     Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=125000", SBX, *SLOWER), "_sbx_8_1m"),
     Task("SafeCarGoal1-v0", "goal_sac", 3, (SBX,), "_sbx"),
