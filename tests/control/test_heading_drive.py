@@ -122,6 +122,15 @@ def random_scenes(count):
         (lambda m: setattr(m.opt, "integrator", mujoco.mjtIntegrator.mjINT_RK4), "must be Euler"),
         (lambda m: m.body_ipos[:, 1].fill(0.01), "centre of mass must lie on the heading"),
         (lambda m: m.jnt_axis[0].fill(0.1), "'agent' must slide along world x and y"),
+        (lambda m: m.site_quat.fill(0.5), "needs one actuator along its heading"),
+        (lambda m: m.dof_damping.__setitem__(2, 0.0), "hinge needs damping above zero"),
+        (lambda m: m.dof_armature.fill(0.1), "no armature or stiffness"),
+        (lambda m: m.jnt_stiffness.fill(0.1), "no armature or stiffness"),
+        (
+            lambda m: m.actuator_biastype.fill(int(mujoco.mjtBias.mjBIAS_AFFINE)),
+            "drive must be a plain motor",
+        ),
+        (lambda m: m.actuator_biasprm[:, 2].fill(0.0), "turning actuator must be a speed servo"),
     ],
 )
 def test_refusals_name_what_does_not_fit(change, words):
