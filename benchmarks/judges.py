@@ -5,7 +5,7 @@ requirement's own unit: above 0, or not a number, is a violation.
 """
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import gymnasium as gym
 import mujoco
@@ -20,7 +20,7 @@ FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-class Judge:
+class Judge(Protocol):
     """What says whether a step broke the requirement."""
 
     def start(self) -> float:
@@ -32,7 +32,6 @@ class Judge:
 
     def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
         """By how much the step missed it: what the env was given, and the info that it returned."""
-        raise NotImplementedError
 
 
 class Judged(gym.Wrapper[Any, Any, Any, Any]):

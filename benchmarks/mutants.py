@@ -155,9 +155,9 @@ def named_tests(mutant: Mutant) -> str:
 def tests_of(where: Path, file: str) -> list[str]:
     """The test files that import a module or are named after it, then those that mention most of its names."""
     tree = ast.parse((where / "safe_wrappers" / file).read_text())
-    names = [n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef) if n.name[0] != "_"]
     stem = Path(file).stem
-    names += [name.removeprefix("Bound") for name in names]
+    names = [n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef) if n.name[0] != "_"]
+    names += [f"{stem} import", *(name.removeprefix("Bound") for name in names)]
     word = re.compile(rf"\b({'|'.join(names)})\b")
     paths = sorted((where / "tests").glob("test_*.py"))
     for folder in ("filter", "constraints", "control", "plants", "wrappers", "vector", "contract", "train"):

@@ -47,22 +47,19 @@ RIGHT = {
 
 
 NUMBERS = float, int, float | None, float | Sequence[float]
-MAY_BE_0 = {
-    "margin",
-    "state_error",
-    "tolerance",
-    "uncertainty",
-    "sigmas",
-    "candidates",
+MAY_BE_0 = (
+    *("margin", "state_error", "tolerance", "uncertainty", "sigmas", "candidates"),
     "max_decrease_per_speed",
-}
+)
 
 
-def numbers(kind):
-    return [field.name for field in fields(kind) if field.init and field.type in NUMBERS]
+def options(*types):
+    """Every kind with each of its fields of one of the types."""
+    found = [(kind, field) for kind in RIGHT for field in fields(kind) if field.init and field.type in types]
+    return pytest.mark.parametrize(("kind", "name"), [(kind, field.name) for kind, field in found])
 
 
-@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in RIGHT for name in numbers(kind)])
+@options(*NUMBERS)
 def test_a_number_that_is_none_or_negative_is_refused_by_its_name(kind, name):
     kind(**RIGHT[kind])
     radius_0 = name == "radius" and hasattr(kind, "margin")  # of a machine, not of a disc
@@ -71,11 +68,12 @@ def test_a_number_that_is_none_or_negative_is_refused_by_its_name(kind, name):
             kind(**RIGHT[kind] | {name: wrong})
 
 
-@pytest.mark.parametrize("kind", RIGHT)
-def test_what_is_neither_true_nor_false_is_refused_by_its_name(kind):
-    for name in (field.name for field in fields(kind) if field.init and field.type is bool):
+@options(bool)
+def test_what_is_neither_true_nor_false_is_refused_by_its_name(kind, name):
+    kind(**RIGHT[kind] | {name: True})
+    for wrong in ("no", 1, None):
         with pytest.raises(ConfigurationError, match=name):
-            kind(**RIGHT[kind] | {name: 1})
+            kind(**RIGHT[kind] | {name: wrong})
 
 
 MADE = [

@@ -65,19 +65,9 @@ def own_substeps(env, action, substeps):
 
 LEFT_ALONE = (
     *("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied", "qacc"),
-    *(
-        "qacc_warmstart",
-        "xpos",
-        "xquat",
-        "xipos",
-        "xmat",
-        "geom_xpos",
-        "site_xpos",
-        "subtree_com",
-        "cvel",
-        "qM",
-    ),
-    *("qfrc_bias", "qfrc_constraint", "actuator_length", "actuator_velocity", "actuator_force", "sensordata"),
+    *("qacc_warmstart", "xpos", "xquat", "xipos", "xmat", "geom_xpos", "site_xpos", "subtree_com", "cvel"),
+    *("qM", "qfrc_bias", "qfrc_constraint", "actuator_length", "actuator_velocity", "actuator_force"),
+    "sensordata",
 )
 
 
