@@ -25,7 +25,7 @@ class Rail(gym.Env):
 
 @dataclass
 class Shifted(sw.Constraint, Model):
-    """h is the place; two controls shift it by themselves: one on the way, the other at the end."""
+    """h is the place, and 0.4 farther; two controls shift it by themselves: one on the way, the other at the end."""
 
     margin: float = 0.0
     horizon: int = 3
@@ -48,7 +48,7 @@ class Shifted(sw.Constraint, Model):
         return Trajectory(control, self.plant.state + shifts)
 
     def h_along(self, path):
-        return path.states[:, :0] if (path.states > 100.0).any() else path.states
+        return path.states[:, :0] if (path.states > 100.0).any() else path.states + np.array([0.0, 0.4])
 
     def proposals(self, control):
         return [] if control is not None or self.backup is None else [np.array(self.backup)]
