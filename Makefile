@@ -23,12 +23,12 @@ endif
 ENJOY = $(BIN)/safe-wrappers enjoy configs/policies/
 FILM = --episodes 20 --output runs/demo/shipped_
 demo: .venv/installed
-	@echo "1 of 2: two policies that ship with the repository (configs/policies), each trained for 1,000,000 control steps:"
+	@echo "1 of 2: two policies that ship with the repository (configs/policies), each trained for 2,000,000 control steps:"
 	@($(ENJOY)unfiltered --filter none $(FILM)unfiltered.webp && $(ENJOY)unfiltered --filter protect $(FILM)afterwards.webp) & \
 		unfiltered=$$!; $(ENJOY)filtered $(FILM)filtered.webp; filtered=$$?; wait $$unfiltered && exit $$filtered
 	@echo "2 of 2: two policies that are trained here, for two minutes each, then evaluated over 20 episodes:"
 	@$(BIN)/safe-wrappers compare configs/demo.yaml --report
-	@echo "This verdict is of the policies that were trained here; those of 1,000,000 control steps are at the top."
+	@echo "This verdict is of the policies that were trained here; those of 2,000,000 control steps are at the top."
 
 # The order of files is that of tests/conftest.py.
 PARALLEL = -n 2 --dist loadfile --no-loadscope-reorder
