@@ -1,4 +1,4 @@
-"""A policy of sbx.SAC as one of Stable-Baselines3's SAC, which acts without JAX: the same actor; critics are left out.
+"""A policy of sbx.SAC as one of Stable-Baselines3's SAC, which acts without JAX: the same actor, untrained critics.
 
     python -m benchmarks as_sb3 --run runs/SafePointGoal1_sac_sbx_2m/filtered/seed_0 --to configs/policies/filtered
 
