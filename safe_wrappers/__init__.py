@@ -18,7 +18,7 @@ from safe_wrappers.plants import AnalyticPlant, MujocoPlant, Plant, SimulatorPla
 from safe_wrappers.wrappers import faults, occlusion, teleop
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
-from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation, StuckEscape
+from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation, StuckMonitor
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.monitors import BalanceMonitor, ContactMonitor
 from safe_wrappers.wrappers.occlusion import OcclusionPenalty
@@ -54,7 +54,7 @@ __all__ = [
     "SimulatorPlant",
     "SlipLimiter",
     "StoppingBudget",
-    "StuckEscape",
+    "StuckMonitor",
     "TeleopChannel",
     "UnsafeStateWarning",
     "VectorCBFActionFilter",

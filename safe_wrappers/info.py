@@ -115,8 +115,6 @@ CBF_FLOATS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "float64"
 
 CBF_STUCK: Final = _key("cbf/stuck", "bool", chunk="any", log="stuck")
 """For `after_s` the filter has changed most actions, and the rewards have not added up to more than `progress`."""
-CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
-"""A drawn action was proposed in the policy's place."""
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")

@@ -160,7 +160,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             lambda: {"wheels": ["rear_left", "rear_right"], "max_slip": 0.1, "friction": 0.05},
         ),
     },
-    "StuckEscape": {"sooner": (TASK, lambda: {"after_s": 0.5, "progress": 0.1, "escape_s": 0.2})},
+    "StuckMonitor": {"sooner": (TASK, lambda: {"after_s": 0.5, "progress": 0.1})},
     "TeleopChannel": {
         "plain, any env": (
             "Reacher-v5",
@@ -196,7 +196,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
 INSIDE: dict[str, Callable[[Env], Env]] = dict.fromkeys(
-    ("AdaptionPenalty", "SafetyOverlay", "StuckEscape"), lambda env: sw.CBFActionFilter(env, [clearance()])
+    ("AdaptionPenalty", "SafetyOverlay", "StuckMonitor"), lambda env: sw.CBFActionFilter(env, [clearance()])
 )
 """Wrapper name -> the wrapper that it needs inside."""
 

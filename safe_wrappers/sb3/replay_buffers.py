@@ -72,8 +72,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         executed = self._scaled(infos, keys.EXECUTED_ACTION)
         if not np.isfinite(executed).all():
             raise ActionError(f"an executed action is not finite: {[i[keys.EXECUTED_ACTION] for i in infos]}")
-        replaced = np.array([bool(info.get(keys.CBF_ESCAPING, False)) for info in infos])
-        replaced |= ~np.isfinite(policy).all(axis=1)
+        replaced = ~np.isfinite(policy).all(axis=1)
         chosen, given = policy[~replaced], self._scaled(infos, keys.PROPOSED_ACTION)[~replaced]
         if not (np.abs(chosen - given) < _SAME).all():
             raise _foreign(f"scaled to [-1, 1], the policy chose {chosen} and the filter got {given}")

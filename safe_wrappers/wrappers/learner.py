@@ -8,11 +8,11 @@ import numpy as np
 from gymnasium import spaces
 
 from safe_wrappers import info as keys
-from safe_wrappers.errors import Array, ConfigurationError, non_negative, positive, whole_number
+from safe_wrappers.errors import Array, ConfigurationError, positive, whole_number
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
-from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step, WrapperRng, action_array
+from safe_wrappers.wrappers.layer import Env, LayerWrapper, Step
 from safe_wrappers.wrappers.stack import Layer
 
 
@@ -48,7 +48,7 @@ class ActionRepeat(LayerWrapper):
 
 
 class AdaptionPenalty(LayerWrapper):
-    """Takes a penalty off the reward at every step at which the filter changed the action, or an escape replaced it.
+    """Takes a penalty off the reward at every step at which the filter changed the action.
 
     The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty` (Krasowski et al., Provably Safe
     Reinforcement Learning, TMLR 2023).
@@ -90,93 +90,61 @@ class AdaptionPenalty(LayerWrapper):
     def step(self, action: Any) -> Step:
         """Steps the env; an unchanged step's reward passes through untouched."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        # StuckEscape gives the filter another action than this one.
-        changed = info[keys.CBF_INTERVENED] or info.get(keys.CBF_ESCAPING, False)
+        changed = info[keys.CBF_INTERVENED]
         if changed:
             reward = float(reward) - self.penalty
         info[keys.ADAPTION_PENALTY] = self.penalty if changed else 0.0
         return observation, reward, terminated, truncated, info
 
 
-class StuckEscape(LayerWrapper):
-    """Proposes another action for a while, in the policy's place, where policy and filter are stuck.
+class StuckMonitor(LayerWrapper):
+    """Reports where policy and filter block each other. Changes nothing.
 
-    Stuck means: in the last `after_s` more than half of the policy's actions were changed by the filter or replaced
-    by this wrapper, and the rewards of these steps add up to `progress` at most. Then an action that was drawn at
-    random is proposed for `escape_s`, which the filter inside checks like any other. A deadlock is ended by chance,
-    not by a plan. Meanwhile the filter's keys are about the drawn action: an escape is `cbf/escaping`, not
-    `cbf/intervened`.
+    Stuck means: in the last `after_s` the filter changed more than half of the actions, and the rewards of these
+    steps add up to `progress` at most.
 
     Args:
         env: With a `CBFActionFilter` inside.
         after_s: The time without progress, s.
         progress: The sum of rewards, in the task's units, up to which there is none.
-        escape_s: For how long another action is proposed, s; 0 reports alone.
 
-    Info, at every step: ``cbf/stuck``, ``cbf/escaping`` (bool).
+    Info, at every step: ``cbf/stuck`` (bool).
 
     Raises:
-        ConfigurationError: No filter inside, or times that are not.
+        ConfigurationError: No filter inside, or a time or a sum that is not one.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
-        >>> env = sw.StuckEscape(sw.protect(gym.make("SafePointGoal1-v0")), after_s=2.0, progress=0.1)
+        >>> env = sw.StuckMonitor(sw.protect(gym.make("SafePointGoal1-v0")), after_s=2.0, progress=0.1)
         >>> _ = env.reset(seed=0)
         >>> env.step(env.action_space.sample())[4]["cbf/stuck"]
         False
     """
 
-    layer: ClassVar = Layer.ESCAPE
+    layer: ClassVar = Layer.STUCK
 
-    _drawn: Array
-
-    def __init__(
-        self,
-        env: Env,
-        after_s: float = 2.0,
-        progress: float = 0.0,
-        escape_s: float = 1.0,
-    ) -> None:
+    def __init__(self, env: Env, after_s: float = 2.0, progress: float = 0.0) -> None:
         LayerWrapper.__init__(self, env)
-        self._inside = needed_filter(env, "StuckEscape(sw.protect(env))")
+        inside = needed_filter(env, "StuckMonitor(sw.protect(env))")
         if not (isinstance(progress, int | float | np.number) and np.isfinite(progress)):
             raise ConfigurationError(f"progress is a finite sum of rewards, got {progress!r}")
-        control_dt = self._inside.plant.control_dt
-        self._window = max(1, round(positive("after_s", after_s, "s") / control_dt))
-        self._escape = round(non_negative("escape_s", escape_s, "s") / control_dt)
+        self._window = max(1, round(positive("after_s", after_s, "s") / inside.plant.control_dt))
         self.progress = float(progress)
-        self._rng = WrapperRng("StuckEscape")
 
     def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
-        self._rng.reset(self.env, seed)
         self._rewards: deque[float] = deque(maxlen=self._window)
         self._changed: deque[bool] = deque(maxlen=self._window)
-        self._left = 0
-        info[keys.CBF_STUCK] = info[keys.CBF_ESCAPING] = False
+        info[keys.CBF_STUCK] = False
         return observation
 
     def step(self, action: Any) -> Step:
-        """Step the env with the policy's action, or with the drawn one."""
-        escaping = self._left > 0
-        sent = action
-        if escaping:
-            own = action_array(action, self._drawn.shape, np.float64)
-            sent = self._drawn
-        observation, reward, terminated, truncated, info = self.env.step(sent)
-        if escaping:
-            self._left -= 1
-            info[keys.CBF_NONFINITE] |= not np.isfinite(own).all()
+        """Step the env, and look at the last `after_s`."""
+        observation, reward, terminated, truncated, info = self._pass_on(action)
         self._rewards.append(float(reward))
-        self._changed.append(info[keys.CBF_INTERVENED] or escaping)
+        self._changed.append(info[keys.CBF_INTERVENED])
         full = len(self._rewards) == self._window
-        stuck = full and 2 * sum(self._changed) > self._window and sum(self._rewards) <= self.progress
-        if stuck and self._escape and self._left == 0 and not escaping:
-            plant, space = self._inside.plant, self._inside.action_space
-            assert isinstance(space, spaces.Box)  # the filter takes no other
-            low, high = np.maximum(plant.lower, space.low), np.minimum(plant.upper, space.high)
-            self._drawn = self._rng.draw.uniform(low, high).astype(space.dtype)
-            self._left = self._escape
-        info[keys.CBF_STUCK], info[keys.CBF_ESCAPING] = stuck, escaping
+        many = 2 * sum(self._changed) > self._window
+        info[keys.CBF_STUCK] = full and many and sum(self._rewards) <= self.progress
         return observation, reward, terminated, truncated, info
 
 

@@ -17,7 +17,7 @@ class Layer(Enum):
     FILTER = auto()
     LEASE = auto()
     CHANNEL = auto()
-    ESCAPE = auto()
+    STUCK = auto()
     OBSERVATION = auto()
     MONITOR = auto()
     ADAPTION = auto()
@@ -28,20 +28,16 @@ class Layer(Enum):
 
 
 _WATCHED: Final = (Layer.COST, Layer.OCCLUSION, Layer.FILTER, Layer.LEASE, Layer.CHANNEL)
-_STEPPED: Final = (Layer.ESCAPE, Layer.OBSERVATION, Layer.MONITOR)
+_STEPPED: Final = (Layer.STUCK, Layer.OBSERVATION, Layer.MONITOR)
 _TOLD: Final = (Layer.ADAPTION, Layer.OVERLAY, Layer.RECORDER)
 _LAST_WORD: Final = "it changes actions that the filter has checked, and the filter has the last word"
-_AUTHORITY: Final = "the actions that it draws need authority as the policy's do"
 
 _BELONGS_OUTSIDE: Final = (
     (Layer.HANDOVER, (*_WATCHED, *_STEPPED, *_TOLD), "its step is a whole chunk, not a control step"),
-    (Layer.RECORDER, (*_WATCHED, Layer.ESCAPE), "it would count nothing of what is outside of it"),
+    (Layer.RECORDER, (*_WATCHED, Layer.STUCK), "it would count nothing of what is outside of it"),
     (Layer.OVERLAY, _WATCHED, "it would draw nothing of what is outside of it"),
     (Layer.OBSERVATION, (Layer.FILTER,), "it shows what the filter inside of it decides by"),
-    *(
-        (layer, (Layer.FILTER,), _LAST_WORD)
-        for layer in (Layer.LEASE, Layer.CHANNEL, Layer.ESCAPE, Layer.FAULT)
-    ),
+    *((layer, (Layer.FILTER,), _LAST_WORD) for layer in (Layer.LEASE, Layer.CHANNEL, Layer.FAULT)),
     (
         Layer.FILTER,
         (Layer.OCCLUSION,),
@@ -53,12 +49,7 @@ _BELONGS_OUTSIDE: Final = (
         (Layer.OCCLUSION, Layer.OBSERVATION),
         "what is seen now would stand beside a delayed image",
     ),
-    (Layer.ESCAPE, (Layer.LEASE, Layer.CHANNEL), _AUTHORITY),
-    (
-        Layer.ADAPTION,
-        (Layer.ESCAPE,),
-        "it would take a penalty for an action that the policy has not proposed",
-    ),
+    (Layer.ADAPTION, (Layer.STUCK,), "its penalties would be taken for a lack of progress"),
 )
 """A layer, those that may not be outside of it, and why. The reverse is right."""
 
@@ -75,7 +66,7 @@ _NOT_TOGETHER: Final = {
     frozenset({Layer.CHANNEL}): "one network is between operator and machine; give one channel all the delay",
     frozenset({Layer.ADAPTION}): "the env has an AdaptionPenalty already, whose penalty would be taken twice",
     frozenset({Layer.OVERLAY}): "the frames have an overlay already",
-    frozenset({Layer.ESCAPE}): "both would act in the policy's place; use one",
+    frozenset({Layer.STUCK}): "the outer one would overwrite the info key of the inner one",
     frozenset({Layer.OBSERVATION}): "the observation shows what the filter decides by already",
     frozenset({Layer.HANDOVER}): "this env takes chunks already, and a chunk of chunks has no meaning",
 }

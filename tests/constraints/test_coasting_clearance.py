@@ -155,7 +155,7 @@ def test_a_detour_keeps_its_side_and_else_passes_on_the_right_what_is_on_the_lef
 
 def test_a_car_that_is_wedged_between_obstacles_turns_the_other_way():
     """Without that it stands there in 248 of these steps."""
-    env = sw.StuckEscape(sw.protect(gym.make("SafeCarGoal2-v0")), progress=0.1, escape_s=0)
+    env = sw.StuckMonitor(sw.protect(gym.make("SafeCarGoal2-v0")), progress=0.1)
     driver = goal_seeking(env.unwrapped, np.random.default_rng(0))
     env.reset(seed=1_000_002)
     assert sum(env.step(driver())[4]["cbf/stuck"] for _ in range(400)) < 180

@@ -58,7 +58,7 @@ def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
 
 def test_who_drives_straight_at_goals_seldom_stands_before_a_disc():
     """Without backing out 41 % of the steps."""
-    env = sw.StuckEscape(sw.protect(gym.make("SafePointGoal1-v0")), progress=0.1, escape_s=0)
+    env = sw.StuckMonitor(sw.protect(gym.make("SafePointGoal1-v0")), progress=0.1)
     task, stuck = env.unwrapped, 0
     for seed in range(2):
         env.reset(seed=1_000_000 + seed)

@@ -344,23 +344,6 @@ def test_an_action_that_is_not_finite_is_never_stored():
     np.testing.assert_array_equal(buffer.rewards[0], [4.0, 5.0, 6.0])
 
 
-def test_what_an_escape_executed_is_stored_in_place_of_the_policys_action():
-    env = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
-    env = sw.StuckEscape(env, after_s=0.5, progress=0.05, escape_s=0.5)
-    layout = {"agent": [0, 0, 0], "hazards": [[0.5, 0.0]], "goal": [1.3, 0.0]}
-    observation, _ = env.reset(seed=0, options={"layout": layout})
-    buffer = ExecutedActionReplayBuffer(200, env.observation_space, env.action_space, device="cpu")
-    push, executed, replaced = np.array([1.0, 0.0], np.float32), [], 0
-    for _ in range(200):
-        following, reward, _, _, told = env.step(push)
-        add(buffer, observation, following, push, reward, told)
-        executed.append(told[keys.EXECUTED_ACTION])
-        replaced += told["cbf/escaping"] and not told[keys.CBF_INTERVENED]
-        observation = following
-    assert replaced > 10
-    np.testing.assert_allclose(buffer.actions[:, 0], executed, atol=1e-6)
-
-
 def test_of_a_repeated_action_what_its_last_control_step_executed_is_stored():
     env = sw.ActionRepeat(filtered(), 4)
     before, _ = env.reset(seed=0)

@@ -385,12 +385,12 @@ def test_every_command_and_option_is_on_its_page():
 def test_the_stack_has_every_layer_in_its_place():
     outages = {"mean_between_s": 0.2, "mean_length_s": 0.2}
     faults = {"Outages": outages, "RepeatedCommands": {"share": 0.1}}
-    filtered = FilterConfig(protect={"margin": 0.1}, lease=LEASE, escape={"progress": 0.1})
+    filtered = FilterConfig(protect={"margin": 0.1}, lease=LEASE, stuck={"progress": 0.1})
     learner = LearnerConfig("adaption_penalty", penalty=2.0)
     stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), filtered, learner)
     assert stack.penalty == 2.0
     order = ["AdaptionPenalty", "Monitor", "RepeatedCommands", "Outages", "RecordInterventions"]
-    order += ["StuckEscape", "LeaseExpiry", "CBFActionFilter", "OcclusionPenalty"]
+    order += ["StuckMonitor", "LeaseExpiry", "CBFActionFilter", "OcclusionPenalty"]
     kinds = [type(wrapper).__name__ for wrapper in wrappers_of(stack)]
     assert [kind for kind in kinds if kind in order] == order[:-1]
     occlusion = {

@@ -1,4 +1,4 @@
-"""Wrappers of a learner: repeated actions, penalties, what the filter shows, and a way out where it is stuck."""
+"""Wrappers of a learner: repeated actions, penalties, what the filter shows, and where a policy is stuck."""
 
 import gymnasium as gym
 import numpy as np
@@ -190,70 +190,31 @@ def test_what_was_not_judged_is_not_a_number():
 # Stuck ------------------------------------------------------------------------------------------------------------
 
 
-def pushing(escape_s, steps=400, wrap=lambda env: env):
-    """The point robot pushes against a hazard without a detour; infos, rewards and the env."""
-    env = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
-    env = wrap(sw.StuckEscape(env, after_s=1.0, progress=0.05, escape_s=escape_s))
-    env.reset(seed=0, options=BEFORE_A_HAZARD)
-    answers = [env.step(PUSH) for _ in range(steps)]
-    return [answer[4] for answer in answers], [answer[1] for answer in answers], env
-
-
-def test_stuck_is_what_its_definition_says_and_reporting_alone_changes_nothing():
-    infos, rewards, _ = pushing(escape_s=0.0)
-    plain = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
-    plain.reset(seed=0, options=BEFORE_A_HAZARD)
-    window, stuck = 50, 0
-    for k, info in enumerate(infos):
-        last = slice(k + 1 - window, k + 1)
-        full = k + 1 >= window
-        changed = full and sum(i[keys.CBF_INTERVENED] for i in infos[last]) > window / 2
-        assert info[keys.CBF_STUCK] == bool(changed and sum(rewards[last]) <= 0.05)
-        assert not info[keys.CBF_ESCAPING]
+def test_stuck_is_what_its_definition_says_and_nothing_is_changed():
+    plain = sw.protect(
+        gym.make("SafePointGoal1-v0"), detour=False
+    )  # a point robot that pushes against a hazard
+    watched = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
+    watched = sw.StuckMonitor(watched, after_s=1.0, progress=0.05)
+    for env in (plain, watched):
+        env.reset(seed=0, options=BEFORE_A_HAZARD)
+    window, rewards, changed, stuck = 50, [], [], 0
+    for k in range(400):
+        _, reward, _, _, info = watched.step(PUSH)
+        rewards.append(reward)
+        changed.append(info[keys.CBF_INTERVENED])
+        most = k + 1 >= window and sum(changed[-window:]) > window / 2
+        assert info[keys.CBF_STUCK] == bool(most and sum(rewards[-window:]) <= 0.05)
         same = plain.step(PUSH)[4]
         assert all(np.array_equal(info[key], same[key]) for key in same)
         stuck += info[keys.CBF_STUCK]
     assert 100 < stuck < 350
 
 
-def test_a_drawn_action_is_held_filtered_and_not_counted_as_the_filters_change():
-    infos, _, _ = pushing(escape_s=0.5)
-    escaping = [i[keys.CBF_ESCAPING] for i in infos]
-    began = escaping.index(True)
-    assert infos[began - 1][keys.CBF_STUCK]
-    assert escaping[began : began + 26] == [True] * 25 + [False]
-    drawn = infos[began][keys.PROPOSED_ACTION]
-    assert not np.array_equal(drawn, PUSH)
-    for info in infos[began : began + 25]:
-        np.testing.assert_array_equal(info[keys.PROPOSED_ACTION], drawn)
-        away = np.linalg.norm(info[keys.EXECUTED_ACTION] - drawn)
-        assert info[keys.CBF_CORRECTION] == pytest.approx(away, abs=1e-12)
-        assert info[keys.CBF_INTERVENED] == (away > 0.0)
-    assert sum(i[keys.CBF_ESCAPING] and not i[keys.CBF_INTERVENED] for i in infos) > 10
-    assert not any(i["cost_substep"] for i in infos)
-    alone = pushing(escape_s=0.0)[0]
-    assert sum(i[keys.CBF_STUCK] for i in infos) < sum(i[keys.CBF_STUCK] for i in alone)
-
-
-def test_a_learner_is_told_that_its_action_was_replaced():
-    infos, _, _ = pushing(escape_s=0.5, steps=200, wrap=lambda env: sw.AdaptionPenalty(env, penalty=0.1))
-    escaping = [i for i in infos if i[keys.CBF_ESCAPING]]
-    assert any(not info[keys.CBF_INTERVENED] for info in escaping)
-    assert {info[keys.ADAPTION_PENALTY] for info in escaping} == {0.1}
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_policy_that_is_not_finite_while_it_acts_is_counted(bad):
-    _, _, env = pushing(escape_s=2.0, steps=100)
-    info = env.step(np.array([bad, 0.5], dtype=np.float32))[4]
-    assert info[keys.CBF_ESCAPING] and info[keys.CBF_NONFINITE]
-    assert np.isfinite(info[keys.EXECUTED_ACTION]).all()
-
-
 @pytest.mark.parametrize("paid", [0.0, 1.0])
 def test_a_policy_that_makes_progress_is_not_stuck(paid):
     # The filter holds the cart's speed down at every step; stuck it is only where that pays nothing.
-    env = sw.StuckEscape(filtered(lambda _: paid), after_s=0.5, escape_s=0)
+    env = sw.StuckMonitor(filtered(lambda _: paid), after_s=0.5)
     env.reset(seed=0)
     infos = [env.step(np.ones(1, dtype=np.float32))[4] for _ in range(30)]
     assert infos[-1][keys.CBF_INTERVENED] and infos[-1][keys.CBF_STUCK] == (paid == 0.0)

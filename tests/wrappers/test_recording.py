@@ -89,7 +89,7 @@ def test_counts_of_an_episode():
             "goals_reached": 2,
             "success": True,
         }
-    # Of a task without wheels, cars and tracks, and without StuckEscape.
+    # Of a task without wheels, cars and tracks, and without StuckMonitor.
     assert summary.keys() == set(COLUMNS) - {"stuck", "mismatch", "spin_outs", "collisions", "seen"}
     assert env.filter_time_us == pytest.approx(5.0)
 

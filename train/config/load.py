@@ -205,5 +205,5 @@ def _with_constraints(arm: ArmConfig, experiment: ExperimentConfig) -> ArmConfig
             f"env.{wanted[0]}: there is no filter whose constraints could be used; give an arm or the evaluation one "
             f"(evaluation: {{filter: protect}}){instead}."
         )
-    settings: dict[str, Any] = dict.fromkeys(wanted, replace(chosen, lease=None, escape=None))
+    settings: dict[str, Any] = dict.fromkeys(wanted, replace(chosen, lease=None, stuck=None))
     return replace(arm, env=replace(arm.env, **settings))

@@ -116,8 +116,8 @@ class FilterConfig(Section):
     """Further arguments of the factory."""
     lease: Options | None = None
     """Arguments of a [LeaseExpiry](wrappers/late-commands.md#leaseexpiry) around the filter."""
-    escape: Options | None = None
-    """Arguments of a [StuckEscape](wrappers/learner.md#stuckescape) around the filter."""
+    stuck: Options | None = None
+    """Arguments of a [StuckMonitor](wrappers/learner.md#stuckmonitor) around the filter."""
 
     @model_validator(mode="before")
     @classmethod
@@ -131,12 +131,12 @@ class FilterConfig(Section):
     @model_validator(mode="after")
     def _is_one_filter(self) -> FilterConfig:
         both = self.protect is not None and self.factory is not None
-        around = self.lease is not None or self.escape is not None
+        around = self.lease is not None or self.stuck is not None
         idle = (self.kwargs and self.factory is None) or (around and self.kind == "none")
         if both or idle:
             raise ConfigurationError(
                 "expected none, protect, {protect: {...}} or {factory: 'module:function', kwargs: {...}}, with "
-                f"lease: {{...}} and escape: {{...}} beside it if there is one; got {asdict(self)}."
+                f"lease: {{...}} and stuck: {{...}} beside it if there is one; got {asdict(self)}."
             )
         return self
 

@@ -20,7 +20,7 @@ from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.plants import MujocoPlant, default_plant
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation, StuckEscape
+from safe_wrappers.wrappers.learner import ActionRepeat, AdaptionPenalty, FilterObservation, StuckMonitor
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion import OcclusionPenalty
 from safe_wrappers.wrappers.protect import protect
@@ -87,8 +87,8 @@ def make_stack(
         task = _leased(task, action_filter.lease)
     if observed is not None:
         task = _with_features(task, observed)
-    if action_filter.escape is not None:
-        task = _called("filter.escape", StuckEscape, task, action_filter.escape)
+    if action_filter.stuck is not None:
+        task = _called("filter.stuck", StuckMonitor, task, action_filter.stuck)
     recorded: gym.Env[Any, Any] = RecordInterventions(task)
     for name, arguments in env.faults.items():
         fault = FAULTS[check_name(name, FAULTS, "env.faults")]
