@@ -17,7 +17,7 @@ from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.envs.goal_env import HAZARD_RADIUS, VASE_HALF_SIZE
 from safe_wrappers.envs.goal_robots import CAR, POINT
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.wrappers.recipes import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
+from safe_wrappers.wrappers.recipes import POINT_PARTS_M, VASE_HULL_RADIUS_M
 
 RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
 KNOWN = sorted({env_id for case in PROTECTED.values() for env_id in (case.env_id, *case.also)})
@@ -85,13 +85,23 @@ def test_an_ant_keeps_out_of_its_mazes_blocks_and_of_nothing_else():
 
 
 def test_hulls_are_as_large_as_the_geoms():
-    assert POINT.radius <= POINT_HULL_RADIUS_M < POINT.radius + 1e-3
+    turn, rim = np.linspace(0.0, 2.0 * np.pi, 200), POINT.hull_radius - 1e-9
+    sphere = rim * np.column_stack([np.cos(turn), np.sin(turn)])
+    nose = np.column_stack([np.full(99, POINT.hull_corners[0][0]), np.linspace(-0.05, 0.05, 99)])
+    nose = np.concatenate([nose, np.column_stack([np.linspace(0.05, 0.15, 99), np.full(99, 0.05)])])
+    covered = [
+        np.hypot(*(np.concatenate([sphere, nose]) - (ahead, 0.0)).T) <= r for ahead, r in POINT_PARTS_M
+    ]
+    assert np.any(covered, axis=0).all() and POINT_PARTS_M[1][1] < np.hypot(0.08, 0.05) + 1e-3
     assert np.hypot(VASE_HALF_SIZE, VASE_HALF_SIZE) <= VASE_HULL_RADIUS_M < np.sqrt(2) * VASE_HALF_SIZE + 1e-3
     (point,), (car,) = (
         sw.protect(gym.make(f"Safe{robot}Goal2-v0")).constraints for robot in ("Point", "Car")
     )
-    radii = [HAZARD_RADIUS, POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M]
-    assert [discs.radius for discs in point.obstacles] == radii
+    assert [discs.radius for discs in point.obstacles + point.untouched] == [
+        HAZARD_RADIUS,
+        VASE_HULL_RADIUS_M,
+    ]
+    assert point.parts == POINT_PARTS_M
     both_sides = {(side * x, y) for x, y in CAR.hull_corners for side in (1.0, -1.0)}
     assert set(map(tuple, car.outline)) == both_sides
     assert [discs.radius for discs in car.keep_out + car.untouched] == [HAZARD_RADIUS, VASE_HULL_RADIUS_M]

@@ -39,17 +39,18 @@ from safe_wrappers.plants.simulator import View
 Env = gym.Env[Any, Any]
 Recommended = list[Constraint]
 
-POINT_HULL_RADIUS_M = 0.1585
-"""Around the Point robot's turning axis: the far corners of its nose, sqrt(0.15^2 + 0.05^2), rounded up."""
+POINT_PARTS_M = [[0.0, 0.1], [0.07, 0.0945]]
+"""The Point robot's sphere, and its nose, whose far corners are 0.15 m ahead and 0.05 m aside: hypot(0.08, 0.05)."""
 VASE_HULL_RADIUS_M = 0.1415
 """Around a vase's centre: the corners of a square of side 0.2, rounded up."""
 
 
 def _point_goal(env: Env, detour: bool = True, uncertainty: float = 0.0) -> Recommended:
-    obstacles: list[Any] = [Discs("hazard_positions", radius=0.2)]
+    hazards, options = [Discs("hazard_positions", radius=0.2)], {}
     if env.unwrapped.level.vases_cost:  # type: ignore[attr-defined]
-        obstacles.append(Discs("vase_positions", radius=POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M))
-    return [HeadingDriveClearance(obstacles, margin=0.004, detour=detour, uncertainty=uncertainty)]
+        vases = [Discs("vase_positions", radius=VASE_HULL_RADIUS_M)]
+        options = {"untouched": vases, "parts": POINT_PARTS_M}
+    return [HeadingDriveClearance(hazards, margin=0.004, detour=detour, uncertainty=uncertainty, **options)]
 
 
 def _car_goal(env: Env, detour: bool = True) -> Recommended:

@@ -10,7 +10,14 @@ from safe_wrappers.constraints.detour import Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup.heading_drive import clearances, look, way_to_rest
 from safe_wrappers.control.numerics.shapes import nearest_discs
-from safe_wrappers.errors import Array, ConfigurationError, check_fields, non_negative, true_or_false
+from safe_wrappers.errors import (
+    Array,
+    ConfigurationError,
+    check_fields,
+    finite_array,
+    non_negative,
+    true_or_false,
+)
 from safe_wrappers.filter.constraint import HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
 from safe_wrappers.plants.mujoco.plant import require_mujoco
@@ -19,7 +26,7 @@ from safe_wrappers.plants.plant import Model, Plant, Trajectory
 
 @dataclass
 class HeadingDriveClearance(Detour, Model):
-    """Keep a planar robot out of every disc until it rests.
+    """Keep the turning axis of a planar robot, and its parts, out of discs until it rests.
 
     The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading only.
     A trajectory is a control held for one control step, and then the backup until rest: brake along the heading, no
@@ -32,7 +39,9 @@ class HeadingDriveClearance(Detour, Model):
     that models between them are safe, is tested and not proved.
 
     Args:
-        obstacles: `Disc` and `Discs`; they stand still.
+        obstacles: `Disc` and `Discs` for the axis; they stand still.
+        untouched: `Disc` and `Discs` for the parts; likewise.
+        parts: Discs that cover the robot: [how far ahead of the axis, radius], m.
         body: Name of the robot's body.
         margin: Fixed protective distance, m.
         state_error: Bound on the error of the measured position, m.
@@ -41,7 +50,9 @@ class HeadingDriveClearance(Detour, Model):
             the disc in the way, then turning alone, then backing out; each only if admitted. No safety measure.
     """
 
-    obstacles: Sequence[Any]
+    obstacles: Sequence[Any] = ()
+    untouched: Sequence[Any] = ()
+    parts: Sequence[Sequence[float]] = ()
     body: str = "agent"
     margin: float = 0.002
     state_error: float = 0.0
@@ -53,7 +64,18 @@ class HeadingDriveClearance(Detour, Model):
     detour_steps: ClassVar[int] = 50
 
     def __post_init__(self) -> None:
-        self.obstacles = obstacles_from(self.obstacles, kinds=(Disc, Discs))
+        for name in ("obstacles", "untouched"):
+            setattr(self, name, obstacles_from(getattr(self, name), name, (Disc, Discs), optional=True))
+        self.parts = finite_array("parts", self.parts).tolist()
+        if any(len(part) != 2 or part[1] <= 0.0 for part in self.parts) or bool(self.parts) != bool(
+            self.untouched
+        ):
+            raise ConfigurationError(
+                "untouched needs the robot's parts, parts need untouched: [[ahead, radius], ...] in m, got "
+                f"parts={self.parts!r}"
+            )
+        if not (self.obstacles or self.untouched):
+            raise ConfigurationError("give obstacles (for the axis) or untouched (for the robot's parts)")
         check_fields(self, non_negative, ("margin", "state_error"), "m")
         self.detour = true_or_false("detour", self.detour)
         self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
@@ -67,7 +89,7 @@ class HeadingDriveClearance(Detour, Model):
         self.plant.named("body", self.body, "body")
         self._frame, self.drive = PlanarFrame(self.plant, self.body), heading_drive(self.plant, self.body)
         self.models = np.array([self.drive, *self.drive.corners(self.uncertainty)], dtype=np.float64)
-        self._discs, self._full = np.zeros((0, 3)), self.drive.drive_limit / self.drive.drive_gain
+        self._discs, self._full = np.zeros((0, 4)), self.drive.drive_limit / self.drive.drive_gain
         # Compiled here, and not in a step.
         joints = np.zeros(self.plant.model.nq), np.zeros(self.plant.model.nv), self._frame.place
         look(self.models, *joints, self._discs, self.margin)
@@ -80,12 +102,17 @@ class HeadingDriveClearance(Detour, Model):
         self._least = self._now.clearances[0].min(initial=np.inf)
 
     def _all_discs(self) -> Array:
-        """Centre, and radius with the state error in it, m, shape (n, 3)."""
-        centers = [obstacle.centers(self.plant)[:, :2] for obstacle in self.obstacles]
+        """Of each disc the centre, the radius with the state error in it, and where it counts, m, shape (n, 4)."""
+        pairs = [(o, 0.0, 0.0) for o in self.obstacles]
+        pairs += [(o, radius, ahead) for ahead, radius in self.parts for o in self.untouched]
+        centers = [obstacle.centers(self.plant)[:, :2] for obstacle, _, _ in pairs]
         counts = [len(group) for group in centers]
         if sum(counts) != len(self._discs):
-            self._discs = np.zeros((sum(counts), 3))
-            self._discs[:, 2] = np.repeat([o.radius + self.state_error for o in self.obstacles], counts)
+            self._discs = np.zeros((sum(counts), 4))
+            self._discs[:, 2] = np.repeat(
+                [o.radius + more + self.state_error for o, more, _ in pairs], counts
+            )
+            self._discs[:, 3] = np.repeat([ahead for _, _, ahead in pairs], counts)
         np.concatenate(centers, out=self._discs[:, :2])
         return self._discs
 
@@ -127,9 +154,9 @@ class HeadingDriveClearance(Detour, Model):
 
     def nearest(self, neighbours: int) -> Array:
         x, y, heading, vx, vy, _ = self._now.motion.tolist()
-        return nearest_discs(
-            self._discs + np.array([0.0, 0.0, self.margin]), x, y, heading, vx, vy, neighbours
-        )
+        own = self._discs[self._discs[:, 3] == 0.0, :3]  # a part ahead has the same centres
+        own[:, 2] += self.margin
+        return nearest_discs(own, x, y, heading, vx, vy, neighbours)
 
     def points(self, path: Trajectory) -> Array:
         """Where braking leads, m, shape (instants, 1, 2)."""

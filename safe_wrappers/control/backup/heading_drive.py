@@ -103,7 +103,8 @@ def brake_control(body: HeadingDrive, motion: Motion) -> float:
 def advance(body: HeadingDrive, motion: Motion, drive: float, turn: float, places: Array) -> Motion:
     """Motion after both controls were held for one control step.
 
-    Writes the position at the end of every physics step, m, into `places`, shape (substeps, 2).
+    Writes the position at the end of every physics step, m, and the heading's cosine and sine into `places`, shape
+    (substeps, 4).
     """
     x, y, heading, vx, vy, yaw_rate = motion
     h, r, m = body.timestep, body.com_offset, body.mass
@@ -134,7 +135,7 @@ def advance(body: HeadingDrive, motion: Motion, drive: float, turn: float, place
             cos, sin = cos * c - sin * s, sin * c + cos * s
         else:
             cos, sin = math.cos(heading), math.sin(heading)
-        places[i, 0], places[i, 1] = x, y
+        places[i, 0], places[i, 1], places[i, 2], places[i, 3] = x, y, cos, sin
     return Motion(x, y, heading, vx, vy, yaw_rate)
 
 
@@ -146,29 +147,40 @@ def _com_speed(body: HeadingDrive, motion: Motion) -> float:
 
 
 @compiled
-def reach(body: HeadingDrive, motion: Motion) -> float:
-    """A bound on how far the turning axis still gets while the body brakes, m.
+def _coasting(body: HeadingDrive, motion: Motion) -> tuple[float, float]:
+    """Bounds on how far the centre of mass still gets while the body brakes, m, and on the angle that it turns, rad.
 
-    The centre of mass coasts to rest within `m v / c`, and braking only shortens that. The axis swings about it by
-    the angle that the body still turns; the hinge's damping alone ends that within `(I w + r m v) / d`, where `r m v`
-    is what the damping of the axis does.
+    The centre of mass coasts to rest within `m v / c`, and braking only shortens that. The hinge's damping alone ends
+    the turning within `(I w + r m v) / d`, where `r m v` is what the damping of the axis does.
     """
     speed, r = _com_speed(body, motion), abs(body.com_offset)
     angle = (body.yaw_inertia * abs(motion.yaw_rate) + r * body.mass * speed) / body.yaw_damping
-    return body.mass / body.damping * speed + 2.0 * r * angle
+    return body.mass / body.damping * speed, angle
 
 
 @compiled
-def _gap(disc: Array, x: float, y: float) -> float:
-    return hypot(disc[0] - x, disc[1] - y) - float(disc[2])
+def reach(body: HeadingDrive, motion: Motion, ahead: float) -> float:
+    """A bound on how far a place ahead of the turning axis still gets while the body brakes, m.
+
+    It swings about the centre of mass by the angle that the body still turns.
+    """
+    way, angle = _coasting(body, motion)
+    return way + 2.0 * abs(ahead - body.com_offset) * angle
 
 
 @compiled
-def _turning_gap(body: HeadingDrive, motion: Motion, disc: Array) -> float:
-    """What is left while the body turns in place: the axis then circles about the centre of mass."""
-    x = motion.x + body.com_offset * math.cos(motion.heading)
-    y = motion.y + body.com_offset * math.sin(motion.heading)
-    return _gap(disc, x, y) - abs(body.com_offset)
+def _gap(disc: Array, x: float, y: float, cos: float, sin: float) -> float:
+    """From where the disc counts: at the turning axis, or ahead of it."""
+    return hypot(disc[0] - x - disc[3] * cos, disc[1] - y - disc[3] * sin) - float(disc[2])
+
+
+@compiled
+def _end_gap(body: HeadingDrive, motion: Motion, disc: Array) -> float:
+    """What is left at rest; at the axis, while the body turns in place: it then circles about the centre of mass."""
+    cos, sin, r = math.cos(motion.heading), math.sin(motion.heading), body.com_offset
+    if disc[3] != 0.0:
+        return _gap(disc, motion.x, motion.y, cos, sin)
+    return _gap(disc, motion.x + r * cos, motion.y + r * sin, cos, sin) - abs(r)
 
 
 @compiled
@@ -178,41 +190,49 @@ def clearances(models: Array, start: Array, drive: float, turn: float, discs: Ar
     The first row is the least at any physics step, the present one included; the second what is left at the end. A
     trajectory is followed as long as it can come closer to a disc than it was.
 
+    A disc counts for a place on the heading. For the axis the end must be where the body can turn in place: else it
+    could stand before a disc for good. For places ahead it need not: the body can back out.
+
     Args:
         models: Constants of bodies, shape (c, 12): of the one by which it brakes, and of others that it may be. The
             discs of the first come first.
         start: As `Motion`, shape (6,).
         drive: Held for one control step.
         turn: Likewise.
-        discs: Centre and radius of each, m, shape (n, 3).
+        discs: Of each centre, radius, and how far ahead of the axis it counts, m, shape (n, 4).
         to_rest: Whether all trajectories are followed until rest.
     """
     n = len(discs)
     every, gaps, brakes = np.full((2, len(models) * n), math.inf), np.empty(n), _body(models[0])
-    places = np.empty((brakes.substeps, 2))
+    places, lever = np.empty((brakes.substeps, 4)), np.empty(n)
     for which, model in enumerate(models):
         left = every[:, which * n : which * n + n]
-        body, motion, far = _body(model), _motion(start), math.inf
-        ahead, around, swivel = drive, turn, 2.0 * abs(body.com_offset)
+        body, motion, way, angle = _body(model), _motion(start), math.inf, 0.0
+        ahead, around, longest = drive, turn, 2.0 * abs(body.com_offset)
+        cos, sin = math.cos(motion.heading), math.sin(motion.heading)
         for i in range(n):
-            left[0, i] = gaps[i] = _gap(discs[i], motion.x, motion.y)
+            left[0, i] = gaps[i] = _gap(discs[i], motion.x, motion.y, cos, sin)
+            lever[i] = 2.0 * abs(discs[i, 3] - body.com_offset)
+            longest = max(longest, lever[i])
         holds = int(_LONGEST * body.mass / (body.damping * body.timestep * body.substeps)) + 1
         for _ in range(holds):
             motion = advance(body, motion, ahead, around, places)
-            moved, far, nears = far, reach(body, motion), to_rest
+            before, turned, nears = way, angle, to_rest
+            way, angle = _coasting(body, motion)
             for i in range(n):
-                if gaps[i] - moved - swivel >= left[0, i]:
+                if gaps[i] - (before + lever[i] * turned) - lever[i] >= left[0, i]:
                     continue
                 for k in range(body.substeps):
-                    gaps[i] = _gap(discs[i], places[k, 0], places[k, 1])
+                    gaps[i] = _gap(discs[i], places[k, 0], places[k, 1], places[k, 2], places[k, 3])
                     if not gaps[i] >= left[0, i]:  # what is not a number stays
                         left[0, i] = gaps[i]
-                nears = nears or gaps[i] - far - swivel < left[0, i]
-            if far < REST_M or not nears:
+                nears = nears or gaps[i] - (way + lever[i] * angle) - lever[i] < left[0, i]
+            if way + longest * angle < REST_M or not nears:
                 break
             ahead, around = brake_control(brakes, motion), 0.0
         for i in range(n):
-            left[1, i] = end = _turning_gap(body, motion, discs[i])
+            left[1, i] = end = _end_gap(body, motion, discs[i])
+            far = way + lever[i] * angle
             if not end - far >= left[0, i]:
                 left[0, i] = end - far
     return every
@@ -224,7 +244,7 @@ class Sight(NamedTuple):
     Attributes:
         motion: As `Motion`, shape (6,).
         brake: The drive control that brakes.
-        discs: Those that one control step and braking after it can come near, or the nearest: shape (k, 3).
+        discs: Those that one control step and braking after it can come near, or the nearest: shape (k, 4).
         clearances: What braking leaves of them, shape (2, c k).
         loss: The most that another control can leave less, m.
     """
@@ -245,7 +265,7 @@ def look(models: Array, qpos: Array, qvel: Array, place: Array, discs: Array, ma
         qpos: Of the whole model.
         qvel: Likewise.
         place: Indices of the body's first joint in both, and where the body is at qpos = 0, m.
-        discs: Centre and radius of each, m, shape (n, 3).
+        discs: As of `clearances`, shape (n, 4).
         margin: Kept free of them, m.
     """
     start = np.empty(6)
@@ -253,20 +273,29 @@ def look(models: Array, qpos: Array, qvel: Array, place: Array, discs: Array, ma
         start[i], start[3 + i] = qpos[int(place[0]) + i], qvel[int(place[1]) + i]
     start[0] += place[2]
     start[1] += place[3]
-    now, loss, farthest = _motion(start), 0.0, 0.0
+    now, loss, farthest, outermost = _motion(start), 0.0, np.zeros(len(discs)), 0.0
+    for i in range(len(discs)):
+        outermost = max(outermost, abs(discs[i, 3]))
     for model in models:
         body = _body(model)
         control_dt, coast = body.timestep * body.substeps, body.mass / body.damping
         change = body.drive_limit / body.mass * control_dt
         turn = min(control_dt * body.yaw_limit / body.yaw_damping, math.pi)
         speed = _com_speed(body, now)
-        # Full drive instead of full braking, and as much turning one way as the other.
-        loss = max(loss, 2.0 * (change * (control_dt + coast) + speed * (control_dt + turn * coast)))
-        pushed = change * (control_dt + coast) + 2.0 * abs(body.com_offset)
-        farthest = max(farthest, reach(body, now) + pushed)
+        rate = max(abs(now.yaw_rate), body.yaw_limit / body.yaw_damping)
+        momentum = body.yaw_inertia * rate + abs(body.com_offset) * body.mass * (speed + change)
+        angle = control_dt * rate + momentum / body.yaw_damping
+        # Full drive instead of full braking, as much turning one way as the other, and what that swings ahead.
+        other = change * (control_dt + coast) + speed * (control_dt + turn * coast)
+        loss = max(loss, 2.0 * (other + outermost * min(angle, 1.0)))
+        pushed = change * (control_dt + coast)
+        for i in range(len(discs)):
+            swing = 2.0 * abs(discs[i, 3] - body.com_offset)
+            farthest[i] = max(farthest[i], reach(body, now, discs[i, 3]) + (pushed + swing))
     gaps, nearest = np.empty(len(discs)), margin
+    cos, sin = math.cos(now.heading), math.sin(now.heading)
     for i in range(len(discs)):
-        gaps[i] = _gap(discs[i], now.x, now.y)
+        gaps[i] = _gap(discs[i], now.x, now.y, cos, sin)
     if len(discs):
         nearest = max(nearest, gaps.min())
     near = discs[~(gaps - farthest > nearest)]
@@ -277,8 +306,8 @@ def look(models: Array, qpos: Array, qvel: Array, place: Array, discs: Array, ma
 def way_to_rest(body: HeadingDrive, start: Array) -> Array:
     """Where the body is while it brakes, from a motion on, m, shape (instants, 2)."""
     motion, places = Motion(*start.tolist()), [start[None, :2]]
-    while reach(body, motion) >= REST_M:
-        step = np.empty((body.substeps, 2))
+    while reach(body, motion, 0.0) >= REST_M:
+        step = np.empty((body.substeps, 4))
         motion = advance(body, motion, brake_control(body, motion), 0.0, step)
-        places.append(step)
+        places.append(step[:, :2])
     return np.concatenate(places)
