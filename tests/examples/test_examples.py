@@ -38,15 +38,6 @@ STEPS_AND_WORDS = {
 }
 
 
-def run(name, words, capsys, monkeypatch):
-    """What the script prints, run as a person would."""
-    torch.set_num_threads(1)
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
-    with mock.patch.dict(gym.registry):
-        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
-    return capsys.readouterr().out
-
-
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", STEPS_AND_WORDS)
 def test_it_runs_and_shows_what_it_says(name, tmp_path, capsys, monkeypatch):
@@ -54,28 +45,19 @@ def test_it_runs_and_shows_what_it_says(name, tmp_path, capsys, monkeypatch):
         pytest.importorskip("gymnasium_robotics")
     monkeypatch.chdir(tmp_path)
     steps, words = STEPS_AND_WORDS[name]
-    out = run(name, ["--steps", steps], capsys, monkeypatch)
+    torch.set_num_threads(1)
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--steps", str(steps)])
+    with mock.patch.dict(gym.registry):
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    out = capsys.readouterr().out
     assert re.search(words, out), out
     assert not list(tmp_path.iterdir()), "it leaves nothing behind"
 
 
 def test_every_script_and_notebook_is_in_the_table():
     table = (EXAMPLES / "README.md").read_text(encoding="utf-8")
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == STEPS_AND_WORDS.keys() | {"enjoy"}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == STEPS_AND_WORDS.keys()
     assert all(f"({path.relative_to(EXAMPLES)})" in table for path in (*EXAMPLES.glob("*.py"), *NOTEBOOKS))
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_trained_policy_acts_again(tmp_path, capsys, monkeypatch):
-    from safe_wrappers.train.config import parse_experiment
-    from safe_wrappers.train.run import Progress, train_run
-
-    settings = {"name": "a", "env": "Reacher-v5", "algorithm": "PPO", "total_steps": 64, "seeds": [0]}
-    arms = {"filtered": {"filter": "protect", "hyperparameters": {"n_steps": 64}}}
-    (arm,) = parse_experiment({**settings, "arms": arms}).arms
-    train_run(arm, 0, tmp_path / "seed_0", Progress(lambda steps: None, print))
-    out = run("enjoy", [tmp_path / "seed_0", "--episodes", 2], capsys, monkeypatch)
-    assert re.fullmatch(r"(seed [01]: return -[\d.]+, \d+% changed\n){2}", out), out
 
 
 def code_cells(path):
