@@ -30,7 +30,9 @@ CONSTRAINTS = [
     of.CoastingClearance([DISC], [of.Discs("vases", 0.1)], SQUARE, "car", "model", 0.01, 20, 0.1, 0.5, True),
     of.ContactFeasibility(0.6, 0.02),
     of.EscapeClearance("robot", [OBSTACLES[5], DISCS, OBSTACLES[3]], 0.2, 0.1, 2.0),
-    of.HeadingDriveClearance([of.Discs("hazards", 0.2)], "robot", 0.004, 0.01, 0.1, True),
+    of.HeadingDriveClearance(
+        [of.Discs("hazards", 0.2)], "robot", 0.004, 0.01, 0.1, True, [of.Discs("vases", 0.1)], [[0.1, 0.05]]
+    ),
     of.ImpactSpeedLimit(["body1"], ["sideE"], 100.0, 1e4, 1.0, 4),
     of.JointPositionLimit([-1.0, -math.inf], 2.0, ["joint1", "joint0"], 0.1, 7, 0.5),
     of.JointSpeedLimit([4.0, 3.0], ["joint1", "joint0"], 0.1, 2, 0.5),

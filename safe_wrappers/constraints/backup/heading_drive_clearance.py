@@ -40,24 +40,24 @@ class HeadingDriveClearance(Detour, Model):
 
     Args:
         obstacles: `Disc` and `Discs` for the axis; they stand still.
-        untouched: `Disc` and `Discs` for the parts; likewise.
-        parts: Discs that cover the robot: [how far ahead of the axis, radius], m.
         body: Name of the robot's body.
         margin: Fixed protective distance, m.
         state_error: Bound on the error of the measured position, m.
         uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
         detour: When a driving action is refused, first try the same drive while turning towards the nearer tangent of
             the disc in the way, then turning alone, then backing out; each only if admitted. No safety measure.
+        untouched: `Disc` and `Discs` that no part of the robot may touch; they stand still.
+        parts: Discs that cover the robot, for `untouched`: [how far ahead of the axis, radius], m.
     """
 
     obstacles: Sequence[Any] = ()
-    untouched: Sequence[Any] = ()
-    parts: Sequence[Sequence[float]] = ()
     body: str = "agent"
     margin: float = 0.002
     state_error: float = 0.0
     uncertainty: float = 0.0
     detour: bool = False
+    untouched: Sequence[Any] = ()
+    parts: Sequence[Sequence[float]] = ()
 
     smooth: ClassVar[bool] = False  # a speed servo chatters
     rounding = 1e-7  # braking is rounded to the action's dtype
@@ -66,16 +66,16 @@ class HeadingDriveClearance(Detour, Model):
     def __post_init__(self) -> None:
         for name in ("obstacles", "untouched"):
             setattr(self, name, obstacles_from(getattr(self, name), name, (Disc, Discs), optional=True))
-        self.parts = finite_array("parts", self.parts).tolist()
-        if any(len(part) != 2 or part[1] <= 0.0 for part in self.parts) or bool(self.parts) != bool(
-            self.untouched
-        ):
-            raise ConfigurationError(
-                "untouched needs the robot's parts, parts need untouched: [[ahead, radius], ...] in m, got "
-                f"parts={self.parts!r}"
-            )
         if not (self.obstacles or self.untouched):
             raise ConfigurationError("give obstacles (for the axis) or untouched (for the robot's parts)")
+        parts = finite_array("parts", self.parts)
+        if bool(parts.size) != bool(self.untouched):
+            raise ConfigurationError("untouched needs the robot's parts, and parts are for untouched alone")
+        if parts.size and not (parts.ndim == 2 and parts.shape[1] == 2 and (parts[:, 1] > 0.0).all()):
+            raise ConfigurationError(
+                f"parts are [[ahead, radius], ...], m, radii above 0; got {self.parts!r}"
+            )
+        self.parts = parts.tolist()
         check_fields(self, non_negative, ("margin", "state_error"), "m")
         self.detour = true_or_false("detour", self.detour)
         self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
