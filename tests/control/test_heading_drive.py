@@ -120,7 +120,9 @@ def test_no_control_takes_more_than_is_said_or_comes_near_what_is_left_out():
         motion = np.array(random_motion(rng, yaw=10.0))
         motion[3:5] *= rng.choice([0.0, 0.2, 1.0])
         discs = random_discs(rng)
-        discs[:, :2] = motion[:2] + 0.6 * discs[:, :2]
+        discs[:, 3] *= 100.0  # m: swings farther than it drives
+        heading = math.cos(motion[2]), math.sin(motion[2])
+        discs[:, :2] = motion[:2] + discs[:, 3:] * heading + 0.6 * discs[:, :2]
         seen = look(models, motion, motion, joint, discs, 0.004)
         far = discs[(discs[:, None] != seen.discs).any(axis=2).all(axis=1)]
         left_out += len(far)
