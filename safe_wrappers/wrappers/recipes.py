@@ -46,11 +46,17 @@ VASE_HULL_RADIUS_M = 0.1415
 
 
 def _point_goal(env: Env, detour: bool = True, uncertainty: float = 0.0) -> Recommended:
-    hazards, options = [Discs("hazard_positions", radius=0.2)], {}
-    if env.unwrapped.level.vases_cost:  # type: ignore[attr-defined]
-        vases = [Discs("vase_positions", radius=VASE_HULL_RADIUS_M)]
-        options = {"untouched": vases, "parts": POINT_PARTS_M}
-    return [HeadingDriveClearance(hazards, margin=0.004, detour=detour, uncertainty=uncertainty, **options)]
+    vases = env.unwrapped.level.vases_cost  # type: ignore[attr-defined]
+    return [
+        HeadingDriveClearance(
+            [Discs("hazard_positions", radius=0.2)],
+            margin=0.004,
+            uncertainty=uncertainty,
+            detour=detour,
+            untouched=[Discs("vase_positions", radius=VASE_HULL_RADIUS_M)] if vases else [],
+            parts=POINT_PARTS_M if vases else [],
+        )
+    ]
 
 
 def _car_goal(env: Env, detour: bool = True) -> Recommended:
