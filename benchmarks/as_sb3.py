@@ -23,8 +23,10 @@ from safe_wrappers.train.run.model import new_model
 from safe_wrappers.train.run.policy import CONFIG, SpacesEnv, write_policy
 
 
-def converted(run: Path, to: Path) -> None:
-    """Writes the policy's folder anew."""
+def main() -> None:
+    """Write the policy's folder anew."""
+    arguments = options(__doc__, run=Path, to=Path)
+    run, to = arguments.run, arguments.to
     trained = load_policy(run / POLICY, other_filter=True)
     arm, spaces = trained.arm, SpacesEnv(trained.model.observation_space, trained.model.action_space)
     sb3 = replace(arm, algorithm="SAC")
@@ -49,8 +51,3 @@ def converted(run: Path, to: Path) -> None:
         shutil.copytree(write_policy(sb3, config["seed"], Path(made), model), to)
     write_card(arm, config["seed"], run)
     shutil.copy(run / POLICY / CARD, to / CARD)
-
-
-def main() -> None:
-    arguments = options(__doc__, run=Path, to=Path)
-    converted(arguments.run, arguments.to)

@@ -25,21 +25,15 @@ _QUARTER_TURN: Final = math.pi / 2.0
 
 
 @dataclass(frozen=True)
-class Hull:
+class _Robot:
     """A robot whose root body is called "agent"; every geom in its subtree counts as the robot."""
 
     name: str  # prefix of its assets: <name>_goal<level>.xml
     n_sensors: int  # how many readings open the observation
-    hull_corners: tuple[tuple[float, float], ...]  # of its outline, in the body's frame seen from above, m
-    hull_radius: float = 0.0  # of a disc around its centre that belongs to the outline, too, m
-
-    @property
-    def radius(self) -> float:
-        """Largest horizontal distance of any point of the upright robot from its centre, m."""
-        return max(self.hull_radius, *(math.hypot(x, y) for x, y in self.hull_corners))
+    hull_corners: tuple[tuple[float, float], ...] = ()  # of a car's outline, in its frame seen from above, m
 
 
-class PlanarRobot(Hull):
+class PlanarRobot(_Robot):
     """A robot whose first three joints are world x, world y and heading."""
 
     def place(self, qpos: Array, pose: Array) -> None:
@@ -66,13 +60,11 @@ class PlanarRobot(Hull):
 POINT: Final = PlanarRobot(
     name="point",
     n_sensors=12,  # accelerometer, velocimeter, gyro, magnetometer
-    hull_corners=((0.15, 0.05), (0.15, -0.05)),
-    hull_radius=0.1,
 )
 """A sphere that pushes along its heading and turns, with a box for a nose."""
 
 
-class WheeledCar(Hull):
+class WheeledCar(_Robot):
     """A car on a free joint, which opens the configuration: x, y, z, quaternion.
 
     Its wheels' axle is the x axis of its body, and positive controls drive it along -y: `heading` is that

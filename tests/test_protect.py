@@ -15,9 +15,9 @@ from benchmarks import shelf
 from benchmarks.cases import PROTECTED
 from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.envs.goal_env import HAZARD_RADIUS, VASE_HALF_SIZE
-from safe_wrappers.envs.goal_robots import CAR, POINT
+from safe_wrappers.envs.goal_robots import CAR
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.wrappers.recipes import POINT_PARTS_M, VASE_HULL_RADIUS_M
+from safe_wrappers.wrappers.recipes import VASE_HULL_RADIUS_M
 
 RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
 KNOWN = sorted({env_id for case in PROTECTED.values() for env_id in (case.env_id, *case.also)})
@@ -85,23 +85,15 @@ def test_an_ant_keeps_out_of_its_mazes_blocks_and_of_nothing_else():
 
 
 def test_hulls_are_as_large_as_the_geoms():
-    turn, rim = np.linspace(0.0, 2.0 * np.pi, 200), POINT.hull_radius - 1e-9
-    sphere = rim * np.column_stack([np.cos(turn), np.sin(turn)])
-    nose = np.column_stack([np.full(99, POINT.hull_corners[0][0]), np.linspace(-0.05, 0.05, 99)])
-    nose = np.concatenate([nose, np.column_stack([np.linspace(0.05, 0.15, 99), np.full(99, 0.05)])])
-    covered = [
-        np.hypot(*(np.concatenate([sphere, nose]) - (ahead, 0.0)).T) <= r for ahead, r in POINT_PARTS_M
-    ]
-    assert np.any(covered, axis=0).all() and POINT_PARTS_M[1][1] < np.hypot(0.08, 0.05) + 1e-3
+    envs = [gym.make(f"Safe{robot}Goal2-v0") for robot in ("Point", "Car")]
+    (point,), (car,) = (sw.protect(env).constraints for env in envs)
+    sphere, nose = (envs[0].unwrapped.model.geom(name) for name in ("agent", "pointarrow"))
+    own, (ahead, radius) = point.parts
+    corners = [np.hypot(nose.pos[0] + side * nose.size[0] - ahead, nose.size[1]) for side in (-1.0, 1.0)]
+    assert own == [0.0, sphere.size[0]] and max(corners) <= radius < max(corners) + 1e-3
     assert np.hypot(VASE_HALF_SIZE, VASE_HALF_SIZE) <= VASE_HULL_RADIUS_M < np.sqrt(2) * VASE_HALF_SIZE + 1e-3
-    (point,), (car,) = (
-        sw.protect(gym.make(f"Safe{robot}Goal2-v0")).constraints for robot in ("Point", "Car")
-    )
-    assert [discs.radius for discs in point.obstacles + point.untouched] == [
-        HAZARD_RADIUS,
-        VASE_HULL_RADIUS_M,
-    ]
-    assert point.parts == POINT_PARTS_M
+    (hazards,), (vases,) = point.obstacles, point.untouched
+    assert (hazards.radius, vases.radius) == (HAZARD_RADIUS, VASE_HULL_RADIUS_M)
     both_sides = {(side * x, y) for x, y in CAR.hull_corners for side in (1.0, -1.0)}
     assert set(map(tuple, car.outline)) == both_sides
     assert [discs.radius for discs in car.keep_out + car.untouched] == [HAZARD_RADIUS, VASE_HULL_RADIUS_M]

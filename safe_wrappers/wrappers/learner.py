@@ -111,7 +111,7 @@ class StuckMonitor(LayerWrapper):
     Info, at every step: ``cbf/stuck`` (bool).
 
     Raises:
-        ConfigurationError: No filter inside, or a time or a sum that is not one.
+        ConfigurationError: No filter inside, `after_s` is not above 0, or `progress` is not finite.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw

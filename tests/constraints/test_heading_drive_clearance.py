@@ -1,4 +1,4 @@
-"""HeadingDriveClearance: the corners of the uncertainty, the side of a `Detour`, and the way out of a disc."""
+"""HeadingDriveClearance: uncertain models, the side of a `Detour`, the way out of a disc, and the robot's parts."""
 
 import math
 
@@ -110,3 +110,30 @@ def test_from_inside_a_disc_the_filter_and_the_backup_alone_lead_out(alone):
     assert values[0] < -0.15 and values[-1] > 0.04
     assert np.diff(values)[np.array(values[:-1]) < limit.spec.margin].min() > 1e-4
     assert changed >= 5 or alone
+
+
+def test_no_part_touches_a_vase_and_none_is_kept_farther_than_needed():
+    env = sw.protect(gym.make("SafePointGoal2-v0"), detour=False)
+    rng, turned, changed = np.random.default_rng(0), [], 0
+    for side in (-1.0, 1.0, -1.0, 1.0):
+        vase = [0.0, 0.29 * side]  # a disc about the axis that holds the nose would reach it
+        layout = {"agent": [0.0, 0.0, 0.0], "goal": [3.0, 3.0], "hazards": [], "vases": [vase]}
+        _, info = env.reset(seed=0, options={"layout": layout})
+        assert info["cbf/margin"] > 0.004
+        for _ in range(60):  # drives and turns at it
+            info = env.step(np.array([rng.uniform(-1.0, 1.0), side]))[4]
+            changed += info["cbf/intervened"]
+            assert not (info["cbf/infeasible"] or info["cost_vases"] or info["cost_substep"])
+        turned.append(abs(env.unwrapped.agent_heading))
+    assert changed > 40 and max(turned) > 0.5
+
+
+def test_what_is_seen_of_the_untouched_is_the_first_parts_clearance():
+    discs, parts = [sw.constraints.Disc([0.0, 0.5], 0.1)], [[0.05, 0.1], [0.2, 0.05]]
+    clearance = sw.constraints.HeadingDriveClearance([HAZARDS], untouched=discs, parts=parts)
+    env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [clearance])
+    start(env, [[1.0, 0.0]])
+    seen = env.filter.bound[0].spec.nearest(3).reshape(3, 4)
+    np.testing.assert_allclose(seen[:2, :2], [[0.0, 1.0], [1.0, 0.0]], atol=1e-12)
+    left = np.array([0.5 - 0.1 - 0.1, 1.0 - RADIUS]) - clearance.margin
+    np.testing.assert_allclose(seen[:, 2], [*(left / (1.0 + left)), 1.0], atol=1e-12)

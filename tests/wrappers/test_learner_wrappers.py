@@ -191,12 +191,9 @@ def test_what_was_not_judged_is_not_a_number():
 
 
 def test_stuck_is_what_its_definition_says_and_nothing_is_changed():
-    plain = sw.protect(
-        gym.make("SafePointGoal1-v0"), detour=False
-    )  # a point robot that pushes against a hazard
-    watched = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
+    plain, watched = (sw.protect(gym.make("SafePointGoal1-v0"), detour=False) for _ in range(2))
     watched = sw.StuckMonitor(watched, after_s=1.0, progress=0.05)
-    for env in (plain, watched):
+    for env in (plain, watched):  # the point robot pushes against a hazard
         env.reset(seed=0, options=BEFORE_A_HAZARD)
     window, rewards, changed, stuck = 50, [], [], 0
     for k in range(400):

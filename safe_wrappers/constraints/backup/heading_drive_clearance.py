@@ -89,7 +89,8 @@ class HeadingDriveClearance(Detour, Model):
         self.plant.named("body", self.body, "body")
         self._frame, self.drive = PlanarFrame(self.plant, self.body), heading_drive(self.plant, self.body)
         self.models = np.array([self.drive, *self.drive.corners(self.uncertainty)], dtype=np.float64)
-        self._discs, self._full = np.zeros((0, 4)), self.drive.drive_limit / self.drive.drive_gain
+        self._discs, self._shown = np.zeros((0, 4)), 0
+        self._full = self.drive.drive_limit / self.drive.drive_gain
         # Compiled here, and not in a step.
         joints = np.zeros(self.plant.model.nq), np.zeros(self.plant.model.nv), self._frame.place
         look(self.models, *joints, self._discs, self.margin)
@@ -113,6 +114,7 @@ class HeadingDriveClearance(Detour, Model):
                 [o.radius + more + self.state_error for o, more, _ in pairs], counts
             )
             self._discs[:, 3] = np.repeat([ahead for _, _, ahead in pairs], counts)
+            self._shown = sum(counts[: len(self.obstacles) + len(self.untouched)])  # the first part's, too
         np.concatenate(centers, out=self._discs[:, :2])
         return self._discs
 
@@ -154,9 +156,8 @@ class HeadingDriveClearance(Detour, Model):
 
     def nearest(self, neighbours: int) -> Array:
         x, y, heading, vx, vy, _ = self._now.motion.tolist()
-        own = self._discs[self._discs[:, 3] == 0.0, :3]  # a part ahead has the same centres
-        own[:, 2] += self.margin
-        return nearest_discs(own, x, y, heading, vx, vy, neighbours)
+        shown = self._discs[: self._shown, :3] + np.array([0.0, 0.0, self.margin])
+        return nearest_discs(shown, x, y, heading, vx, vy, neighbours)
 
     def points(self, path: Trajectory) -> Array:
         """Where braking leads, m, shape (instants, 1, 2)."""

@@ -212,7 +212,7 @@ def clearances(models: Array, start: Array, drive: float, turn: float, discs: Ar
         cos, sin = math.cos(motion.heading), math.sin(motion.heading)
         for i in range(n):
             left[0, i] = gaps[i] = _gap(discs[i], motion.x, motion.y, cos, sin)
-            lever[i] = 2.0 * abs(discs[i, 3] - body.com_offset)
+            lever[i] = 2.0 * abs(discs[i, 3] - body.com_offset)  # about the centre of mass, the widest swing
             longest = max(longest, lever[i])
         holds = int(_LONGEST * body.mass / (body.damping * body.timestep * body.substeps)) + 1
         for _ in range(holds):
