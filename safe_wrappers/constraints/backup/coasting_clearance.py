@@ -59,8 +59,9 @@ class CoastingClearance(Detour, Model):
             for one interval from rest; states with more clearance need no forecast. Checked at every forecast, and
             dropped with a warning when broken.
         max_decrease_per_speed: What the speed of the origin or a corner adds to that, m per m/s.
-        detour: When a driving action of a machine with two actuators is refused, first try to turn while driving, or
-            to reverse while turning, around the obstacle. No safety measure.
+        detour: When an action of a machine with two driven wheels is refused, first try to turn while driving, or to
+            reverse while turning, around the obstacle; or, in place of a turn on the spot, to make room for it. No
+            safety measure.
     """
 
     keep_out: Sequence[Any] = ()
@@ -193,7 +194,7 @@ class CoastingClearance(Detour, Model):
         return np.concatenate([self._here[None], course.places])[:, None]
 
     def proposals(self, control: Array | None) -> list[Array]:
-        """What to try for a refused control: ways around, less of the same, none.
+        """What to try for a refused control: ways around, half of it and of them, none.
 
         The backup is no control at all; where that is not clear, what ends farthest out: full control of all
         actuators together or of one, either way.
@@ -206,13 +207,20 @@ class CoastingClearance(Detour, Model):
             return [self._still]
         acting = np.clip(control, *self.plant.acting_range)
         around = self._around(acting) if self.detour and acting.size == 2 else []
-        return [*around, 0.5 * acting, self._still]
+        # A machine that is wedged leaves in smaller steps than it came in.
+        return [*around, *(0.5 * one for one in (acting, *around)), self._still]
 
     def _around(self, acting: Array) -> list[Array]:
-        """The drive turning ever more, then backing out while turning, to the side that leads around; then away."""
+        """The drive turning ever more, then backing out while turning, to the side that leads around; then away.
+
+        In place of turning on the spot: one wheel of it, then straight on or back; first what ends farther out.
+        """
         drive = float(acting[np.abs(acting).argmax()])
+        if drive == 0.0:
+            return []
         if float(acting.sum()) * drive <= 0.0:
-            return []  # turning on the spot, or no drive at all
+            pairs = np.diag(acting), np.array([[drive, drive], [-drive, -drive]])
+            return [one for pair in pairs for one in sorted(pair, key=lambda u: -self._end(u))]
 
         def beside_the_nearest() -> float:
             way = self._course(acting).places[-1] - self._here
