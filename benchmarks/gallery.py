@@ -16,8 +16,9 @@ from PIL import Image, ImageDraw
 import safe_wrappers as sw
 from benchmarks.cases import PROTECTED
 from benchmarks.judges import Judged
-from benchmarks.moving_picture import CHANGED_TEXT, INK, PAPER, VIOLATED, Count, beside, encode, font
+from benchmarks.moving_picture import CHANGED_TEXT, INK, PAPER, VIOLATED, Count, beside, font
 from benchmarks.tables import options
+from safe_wrappers.train.videos import encode
 from safe_wrappers.wrappers.safety_overlay import find_renderer, set_size
 
 ROOT = Path(__file__).parents[1]
@@ -111,8 +112,8 @@ class Side:
     def step(self) -> None:
         """One control step; a new episode where this one ends."""
         action = np.asarray(self._scene.strength * self._act(), dtype=self.env.action_space.dtype)
-        _, reward, terminated, truncated, info = self.env.step(action)
-        self.count.add(reward, info)
+        _, _, terminated, truncated, info = self.env.step(action)
+        self.count.add(info)
         if terminated or truncated:
             self.reset()
 

@@ -3,14 +3,11 @@
     MUJOCO_GL=osmesa python -m benchmarks moving_picture
 
 The policies are those of `configs/policies`, deterministic, each as it was trained. The film shows the first seconds
-of the episodes with seeds 0, 1 and 2, each from the same reset on both sides. Whole episodes of the first hundred
-seeds are counted beside it, for the README's caption. Colours, rings and trails are the renderer's alone; the
-physics is the env's.
+of the episodes with seeds 0, 1 and 2, each from the same reset on both sides. Colours, rings and trails are the
+renderer's alone; the physics is the env's.
 """
 
-import io
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from benchmarks.tables import RESULTS, options
+from benchmarks.tables import options
 from safe_wrappers.envs.patrolled_maze import MarkingRenderer
 from safe_wrappers.train.policies import load_policy
+from safe_wrappers.train.videos import encode
 from safe_wrappers.wrappers.safety_overlay import set_size
 
 ROOT = Path(__file__).parents[1]
-FILM, COUNTS = ROOT / "docs" / "static" / "filter.webp", RESULTS / "moving_picture.json"
+FILM = ROOT / "docs" / "static" / "filter.webp"
 POLICIES = ROOT / "configs" / "policies"
 SEEDS, STEPS, SPEED, STRIDE = (0, 1, 2), 400, 2.0, 6
 """What is filmed: the first steps of each seed's episode, times real time, a frame every so many steps."""
-COUNTED = range(100)
-"""Seeds of the whole episodes that are counted."""
 
 PANEL, GAP, HEAD, FOOT, STRIP = 400, 12, 30, 54, 10
 """Pixels: a side's picture, what is between the two, the lines above and below it, the strip of time."""
@@ -54,15 +50,13 @@ class Count:
     violations: int = 0
     changed: int = 0
     goals: int = 0
-    reward: float = 0.0
 
-    def add(self, reward: Any, info: dict[str, Any]) -> None:
+    def add(self, info: dict[str, Any]) -> None:
         """Count a step."""
         self.steps += 1
         self.violations += info["cost_substep"] > 0
         self.changed += bool(info.get("cbf/intervened", False))
         self.goals += bool(info.get("goal_met", False))
-        self.reward += float(reward)
 
 
 class Side:
@@ -98,8 +92,8 @@ class Side:
 
     def step(self) -> None:
         """One control step."""
-        self.observation, reward, _, _, info = self.env.step(self.policy(self.observation))
-        self.count.add(reward, info)
+        self.observation, _, _, _, info = self.env.step(self.policy(self.observation))
+        self.count.add(info)
         self.trail.append(self.task.agent_position)
         changed, violated = bool(info.get("cbf/intervened", False)), info["cost_substep"] > 0
         self.flags.append((changed, violated))
@@ -186,47 +180,9 @@ def strip(flags: list[tuple[bool, bool]]) -> Image.Image:
     return Image.fromarray(np.tile(row[None], (STRIP, 1, 1)))
 
 
-def encode(frames: list[Image.Image], frame_ms: float, quality: int = QUALITY) -> bytes:
-    """An endless animated WebP."""
-    data = io.BytesIO()
-    frames[0].save(
-        data,
-        "WEBP",
-        save_all=True,
-        append_images=frames[1:],
-        duration=round(frame_ms),
-        loop=0,
-        quality=quality,
-        method=6,
-    )
-    return data.getvalue()
-
-
-def whole_episodes() -> dict[str, Any]:
-    """Whole episodes on both sides."""
-    found = {}
-    for name in SIDES:
-        trained = load_policy(POLICIES / name, other_filter=True)
-        env, total = trained.make_env(), Count()
-        for seed in COUNTED:
-            observation, _ = env.reset(seed=seed)
-            trained.reset()
-            truncated = False
-            while not truncated:
-                observation, reward, _, truncated, info = env.step(trained(observation))
-                total.add(reward, info)
-        steps = trained.arm.total_steps * trained.arm.action_repeat
-        about = {"algorithm": trained.arm.algorithm, "trained_for": steps, "episodes": len(COUNTED)}
-        found[name] = about | asdict(total)
-    return found
-
-
 def main() -> None:
-    """Film, count."""
+    """Film."""
     options(__doc__)
     frames = film()
-    FILM.write_bytes(encode(frames, 1000 * STRIDE * 0.02 / SPEED))
-    counts = whole_episodes()
-    COUNTS.write_text(json.dumps(counts, indent=1) + "\n")
+    FILM.write_bytes(encode(frames, 1000 * STRIDE * 0.02 / SPEED, QUALITY))
     print(f"{FILM}: {len(frames)} frames, {FILM.stat().st_size / 1e6:.2f} MB")
-    print(json.dumps(counts, indent=1))

@@ -135,16 +135,20 @@ def film_episode(policy: TrainedPolicy, env: gym.Env[Any, Any], seed: int) -> tu
         _with_strip(frame, at * stride, np.array(changed), np.array(violated))
         for at, frame in enumerate(frames)
     ]
-    data, duration = io.BytesIO(), max(1, round(1000 * stride * shown_s / max(longest, steps)))
-    pictures[0].save(
-        data, "WEBP", save_all=True, append_images=pictures[1:], duration=duration, loop=0, quality=_QUALITY
-    )  # fmt: skip
+    data = encode(pictures, 1000 * stride * shown_s / max(longest, steps), _QUALITY)
     figures = info[keys.EPISODE_SUMMARY]
     hurt = f"{figures['violations']:,} in violation, " if "violations" in figures else ""
     said = (
         f"Episode {seed}, return {figures['return']:.1f}: of {steps:,} steps {hurt}{sum(changed):,} changed."
     )
-    return data.getvalue(), f"{said} Shown {real_s / shown_s:.1f} times as fast as real."
+    return data, f"{said} Shown {real_s / shown_s:.1f} times as fast as real."
+
+
+def encode(frames: list[Image.Image], frame_ms: float, quality: int) -> bytes:
+    """An endless animated WebP."""
+    data, how = io.BytesIO(), {"save_all": True, "loop": 0, "quality": quality}
+    frames[0].save(data, "WEBP", append_images=frames[1:], duration=max(1, round(frame_ms)), **how)
+    return data.getvalue()
 
 
 def _sized(pixels: Any) -> Image.Image:
