@@ -219,8 +219,8 @@ class CoastingClearance(Detour, Model):
         if drive == 0.0:
             return []
         if float(acting.sum()) * drive <= 0.0:
-            pairs = np.diag(acting), np.array([[drive, drive], [-drive, -drive]])
-            return [one for pair in pairs for one in sorted(pair, key=lambda u: -self._end(u))]
+            wheels, straight = list(np.diag(acting)), [np.full(2, drive), np.full(2, -drive)]
+            return [one for pair in (wheels, straight) for one in sorted(pair, key=lambda u: -self._end(u))]
 
         def beside_the_nearest() -> float:
             way = self._course(acting).places[-1] - self._here
