@@ -156,7 +156,7 @@ def main() -> None:
     for name in options(__doc__, only=list(SCENES)).only:
         frames, times, counts = film(SCENES[name])
         for quality in QUALITIES:
-            data = encode(frames, FRAME_MS, quality)
+            data = encode(frames, FRAME_MS, quality, method=6)
             if len(data) <= MOST_BYTES:
                 break
         (FILMS / f"{name}.webp").write_bytes(data)

@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 from benchmarks.tables import options
 from safe_wrappers.envs.patrolled_maze import MarkingRenderer
 from safe_wrappers.train.policies import load_policy
-from safe_wrappers.train.videos import encode
+from safe_wrappers.train.videos import encode, with_strip
 from safe_wrappers.wrappers.safety_overlay import set_size
 
 ROOT = Path(__file__).parents[1]
@@ -29,10 +29,10 @@ POLICIES = ROOT / "configs" / "policies"
 SEEDS, STEPS, SPEED, STRIDE = (0, 1, 2), 400, 2.0, 6
 """What is filmed: the first steps of each seed's episode, times real time, a frame every so many steps."""
 
-PANEL, GAP, HEAD, FOOT, STRIP = 400, 12, 30, 54, 10
-"""Pixels: a side's picture, what is between the two, the lines above and below it, the strip of time."""
+PANEL, GAP, HEAD, FOOT = 400, 12, 30, 54
+"""Pixels: a side's picture, what is between the two, the lines above and below it."""
 CAMERA = {"distance": 4.3, "elevation": -72.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.08, 0.0])}
-INK, PAPER, BARE = (29, 35, 43), (255, 255, 255), (205, 210, 216)
+INK, PAPER = (29, 35, 43), (255, 255, 255)
 CHANGED, CHANGED_TEXT, VIOLATED = (240, 165, 0), (184, 116, 0), (208, 32, 48)
 SIDES = {
     "unfiltered": ("trained without a filter", (217, 114, 46)),
@@ -70,7 +70,7 @@ class Side:
         self.policy = load_policy(POLICIES / name, other_filter=True)
         self.title, self.colour = SIDES[name]
         self.filtered, self.count = self.policy.arm.filter.kind != "none", Count()
-        self.flags: list[tuple[bool, bool]] = []
+        self.flags = np.zeros((2, len(SEEDS) * STEPS), bool)  # changed, in violation
         self.env = self.policy.make_env("trained", "rgb_array")
         set_size(self.env, PANEL, PANEL)
         self.task: Any = self.env.unwrapped
@@ -96,12 +96,12 @@ class Side:
         self.count.add(info)
         self.trail.append(self.task.agent_position)
         changed, violated = bool(info.get("cbf/intervened", False)), info["cost_substep"] > 0
-        self.flags.append((changed, violated))
+        self.flags[:, self.count.steps - 1] = changed, violated
         self.mark = VIOLATED if violated else CHANGED if changed else None
 
     def frame(self) -> Image.Image:
         """The picture of now, between words, and the strip of time."""
-        whole = Image.new("RGB", (PANEL, HEAD + PANEL + FOOT + STRIP), PAPER)
+        whole = Image.new("RGB", (PANEL, HEAD + PANEL + FOOT), PAPER)
         whole.paste(Image.fromarray(np.asarray(self.env.render(), dtype=np.uint8)), (0, HEAD))
         draw, count, top = ImageDraw.Draw(whole), self.count, HEAD + PANEL + 6
         draw.text((4, 5), self.title, self.colour, font(17, bold=True))
@@ -112,8 +112,7 @@ class Side:
         if self.filtered:
             changed = f"the filter changed {count.changed / count.steps:.0%} of the actions"
             draw.text((4, top + 24), changed, CHANGED_TEXT, font(15))
-        whole.paste(strip(self.flags), (0, HEAD + PANEL + FOOT))
-        return whole
+        return with_strip(whole, self.count.steps - 1, *self.flags)
 
     def _markers(self) -> list[dict[str, Any]]:
         """Where it came from in the last two seconds, and a ring while the filter acts or a hazard is entered."""
@@ -168,21 +167,9 @@ def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(Path(mpl.get_data_path()) / "fonts" / "ttf" / name, size)
 
 
-def strip(flags: list[tuple[bool, bool]]) -> Image.Image:
-    """What happened at every step of the film, up to now."""
-    row, steps = np.tile(np.array(BARE, np.uint8), (PANEL, 1)), len(SEEDS) * STEPS
-    for k, (changed, violated) in enumerate(flags):
-        first, last = k * PANEL // steps, (k + 1) * PANEL // steps
-        if changed or violated:
-            row[first : max(last, first + 2)] = VIOLATED if violated else CHANGED
-    now = (len(flags) - 1) * PANEL // steps
-    row[max(0, now - 1) : now + 2] = INK
-    return Image.fromarray(np.tile(row[None], (STRIP, 1, 1)))
-
-
 def main() -> None:
     """Film."""
     options(__doc__)
     frames = film()
-    FILM.write_bytes(encode(frames, 1000 * STRIDE * 0.02 / SPEED, QUALITY))
+    FILM.write_bytes(encode(frames, 1000 * STRIDE * 0.02 / SPEED, QUALITY, method=6))
     print(f"{FILM}: {len(frames)} frames, {FILM.stat().st_size / 1e6:.2f} MB")
