@@ -51,6 +51,25 @@ def test_the_forecast_is_what_the_env_then_does_to_its_rest(level, seed):
             assert np.linalg.norm(env.agent_position - course.places[-1]) < 1e-3
 
 
+def test_a_car_that_stands_for_an_instant_while_it_reverses_does_not_rest():
+    """It tips back and rolls on by 4 mm; a state that an attacker found."""
+    env, plant = car(0, 0)
+    tilted, wheels, caster = (
+        [-0.9594, 0.0017, -0.0012, -0.2821],
+        [333.0, 195.8],
+        [-0.9104, -0.142, 0.2321, 0.3116],
+    )
+    body = [0.0731, -0.0907, -0.0261, -0.2886, 0.5017, -0.2943]
+    env.set_state(
+        np.array([0.0, 0.0, 0.0995, *tilted, *wheels, *caster]),
+        np.array([*body, 1.312, 8.8369, 2.4305, 0.3726, -1.078]),
+    )
+    plant.observe()
+    runs = [Coasting(plant, "agent").run(np.array([-0.01, -0.02]), 15, radius) for radius in (RADIUS, np.inf)]
+    course, long = (run.places for run in runs)
+    assert runs[0].rests and np.linalg.norm(long[len(course) :] - course[-1], axis=1).max() < 1e-3
+
+
 def test_the_machine_alone_takes_over_what_the_plant_has_wrong_on_purpose():
     env, plant = car(1, 25)
     right = Coasting(plant, "agent", env.robot_model).run(np.ones(2), 12, RADIUS).places

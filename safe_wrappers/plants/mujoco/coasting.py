@@ -109,8 +109,10 @@ class Coasting:
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)
                 poses[i] = data.qpos[at : at + 7]
-            vx, vy, vz, _, _, turn = data.qvel[self._moving : self._moving + 6].tolist()
-            if math.sqrt(vx * vx + vy * vy + vz * vz) + abs(turn) * turning_radius < _REST_SPEED:
+            # Tilting counts: where it reverses a car stands for an instant, and rolls on as it tips back.
+            vx, vy, vz, wx, wy, wz = data.qvel[self._moving : self._moving + 6].tolist()
+            turning = math.sqrt(wx * wx + wy * wy + wz * wz) * turning_radius
+            if math.sqrt(vx * vx + vy * vy + vz * vz) + turning < _REST_SPEED:
                 rests = True
                 break
             data.ctrl[:] = self._none
