@@ -39,7 +39,6 @@ SIDES = {
     "filtered": ("trained through the filter", (47, 134, 201)),
 }
 """By the name of the policy: the words above it, and its colour."""
-QUALITY = 62
 
 
 @dataclass
@@ -155,10 +154,8 @@ def film() -> list[Image.Image]:
 
 def beside(left: Image.Image, right: Image.Image) -> Image.Image:
     """Two pictures of the same height as one."""
-    whole = Image.new("RGB", (left.width + GAP + right.width, left.height), PAPER)
-    whole.paste(left, (0, 0))
-    whole.paste(right, (left.width + GAP, 0))
-    return whole
+    gap = np.full((left.height, GAP, 3), PAPER, np.uint8)
+    return Image.fromarray(np.hstack([np.asarray(left), gap, np.asarray(right)]))
 
 
 def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
@@ -171,5 +168,5 @@ def main() -> None:
     """Film."""
     options(__doc__)
     frames = film()
-    FILM.write_bytes(encode(frames, 1000 * STRIDE * 0.02 / SPEED, QUALITY, method=6))
+    FILM.write_bytes(encode(frames, 1000 * STRIDE * 0.02 / SPEED, quality=62, method=6))
     print(f"{FILM}: {len(frames)} frames, {FILM.stat().st_size / 1e6:.2f} MB")

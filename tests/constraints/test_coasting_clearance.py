@@ -161,35 +161,33 @@ def test_a_car_that_is_wedged_between_obstacles_turns_the_other_way():
     assert sum(env.step(driver())[4]["cbf/stuck"] for _ in range(1000)) < 500
 
 
+def protected(agent, **obstacles):
+    env = sw.protect(gym.make("SafeCarGoal2-v0"))
+    layout = {"agent": agent, "goal": [9.0, 9.0], "hazards": [], **obstacles}
+    env.reset(seed=0, options={"layout": layout})
+    return env
+
+
 @pytest.mark.parametrize(("side", "ahead"), [(1.0, 0.12), (1.0, -0.1), (-1.0, -0.1)])
 def test_a_refused_turn_on_the_spot_makes_room_for_itself(side, ahead):
     """Without that the car turns by less than 0.8 rad, and stands."""
-    env = sw.protect(gym.make("SafeCarGoal2-v0"))
-    vases = [[ahead, 0.155 + 0.1415 + 0.008]]
-    layout = {"agent": [0.0, 0.0, 0.0], "goal": [9.0, 9.0], "hazards": [], "vases": vases}
-    env.reset(seed=0, options={"layout": layout})
-    limit, turn = Asked(env.constraints[0], env.plant), np.array([side, -side])
+    env, turn = protected([0.0, 0.0, 0.0], vases=[[ahead, 0.155 + 0.1415 + 0.008]]), np.array([side, -side])
+    limit = Asked(env.constraints[0], env.plant)
     limit.bound.observe({})
     wheel, other, away, back = (limit.slack(way) for way in limit.bound.candidates(turn)[:4])
     assert wheel >= other and away >= back  # what leaves more comes first
-    headings = []
-    for _ in range(100):
-        info = env.step(turn.astype(np.float32))[4]
-        assert info["cbf/margin"] >= 0.0 and not info["cost_substep"]
-        headings.append(env.unwrapped.agent_heading)
-    assert abs(np.unwrap(headings)[-1]) > 3.5
+    infos = [env.step(turn)[4] | {"heading": env.unwrapped.agent_heading} for _ in range(100)]
+    assert all(info["cbf/margin"] >= 0.0 and not info["cost_substep"] for info in infos)
+    assert abs(np.unwrap([info["heading"] for info in infos])[-1]) > 3.5
 
 
 @pytest.mark.parametrize("x", [0.3335, 0.33356, 0.334])
 def test_a_wedged_car_leaves_in_halved_steps(x):
     """Between a hazard and a vase, where every full step that a turn on the spot leads to is refused."""
-    env = sw.protect(gym.make("SafeCarGoal2-v0"))
-    layout = {"agent": [x, -1.2588, -0.3418], "goal": [9.0, 9.0]}
-    layout |= {"hazards": [[0.3844, -1.0589]], "vases": [[0.2588, -1.5346]]}
-    env.reset(seed=0, options={"layout": layout})
+    env = protected([x, -1.2588, -0.3418], hazards=[[0.3844, -1.0589]], vases=[[0.2588, -1.5346]])
     for _ in range(150):
-        env.step(np.array([0.73, -0.26], dtype=np.float32))
-    assert np.hypot(*(env.unwrapped.agent_position - layout["agent"][:2])) > 0.05
+        env.step(np.array([0.73, -0.26]))
+    assert np.hypot(*(env.unwrapped.agent_position - [x, -1.2588])) > 0.05
 
 
 def test_what_does_not_rest_within_the_horizon_is_refused_however_far_it_stays_away():

@@ -216,8 +216,6 @@ class CoastingClearance(Detour, Model):
         In place of turning on the spot: one wheel of it, then straight on or back; first what ends farther out.
         """
         drive = float(acting[np.abs(acting).argmax()])
-        if drive == 0.0:
-            return []
         if float(acting.sum()) * drive <= 0.0:
             wheels, straight = list(np.diag(acting)), [np.full(2, drive), np.full(2, -drive)]
             return [one for pair in (wheels, straight) for one in sorted(pair, key=lambda u: -self._end(u))]

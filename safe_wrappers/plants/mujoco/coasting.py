@@ -110,9 +110,8 @@ class Coasting:
                 mujoco.mj_step(m, data)
                 poses[i] = data.qpos[at : at + 7]
             # Tilting counts: where it reverses a car stands for an instant, and rolls on as it tips back.
-            vx, vy, vz, wx, wy, wz = data.qvel[self._moving : self._moving + 6].tolist()
-            turning = math.sqrt(wx * wx + wy * wy + wz * wz) * turning_radius
-            if math.sqrt(vx * vx + vy * vy + vz * vz) + turning < _REST_SPEED:
+            moving, turning = data.qvel[self._moving : self._moving + 6].reshape(2, 3)
+            if math.hypot(*moving) + math.hypot(*turning) * turning_radius < _REST_SPEED:
                 rests = True
                 break
             data.ctrl[:] = self._none
