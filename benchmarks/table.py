@@ -197,15 +197,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    arguments = options(
-        __doc__,
-        only=[task.name for task in TASKS],
-        arms=[],
-        seeds=[],
-        workers=int,
-        output="runs",
-        collect=False,
-    )
+    names = [task.name for task in TASKS]
+    arguments = options(__doc__, only=names, arms=[], seeds=[], workers=int, output="runs", collect=False)
     rows = []
     for task in TASKS:
         whole = experiment_of(task, arguments.output)
