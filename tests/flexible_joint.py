@@ -10,21 +10,6 @@ import numpy as np
 from safe_wrappers.errors import Array
 
 
-def manifold(torque: Array, rotor_inertia: Array, link_inertia: Array, taken: Array | float = 0.0) -> Array:
-    """z0, shape (..., n), N m: what the gears of a rigid arm carry.
-
-    Args:
-        torque: Of the motors less their friction, shape (..., n), N m.
-        rotor_inertia: See the module.
-        link_inertia: See the module.
-        taken: C(q, q') q' + g(q), shape (..., n), N m.
-    """
-    net = np.asarray(torque - np.asarray(taken))
-    both = link_inertia + np.diag(rotor_inertia)
-    # The rotors keep J q'' of the torque to themselves.
-    return np.asarray(torque - rotor_inertia * np.linalg.solve(both, net[..., None])[..., 0])
-
-
 def resonances(stiffness: Array, rotor_inertia: Array, link_inertia: Array) -> Array:
     """Eigenvalues of the square root of K W, ascending, shape (..., n), rad/s."""
     root = np.sqrt(stiffness)
@@ -50,8 +35,9 @@ def bias_of(arm, q, q_dot):
 def vibration_energy(arm, qpos, qvel, torque):
     """Of the boundary layer, J, at coordinates motor 0, spring 0, motor 1, spring 1, shape (4,); from matrices."""
     q, q_dot = qpos[::2] + qpos[1::2], qvel[::2] + qvel[1::2]
-    m = inertia_of(arm, q)
-    z0 = manifold(torque - arm.motor_damping * qvel[::2], arm.rotor_inertia, m, bias_of(arm, q, q_dot))
+    m, j, driving = inertia_of(arm, q), arm.rotor_inertia, torque - arm.motor_damping * qvel[::2]
+    # What the gears of a rigid arm carry, N m: its rotors keep J q'' of the torque to themselves.
+    z0 = driving - j * np.linalg.solve(m + np.diag(j), driving - bias_of(arm, q, q_dot))
     away, rate = -qpos[1::2] - z0 / arm.stiffness, -qvel[1::2]
-    mobility = np.diag(1.0 / arm.rotor_inertia) + np.linalg.inv(m)
+    mobility = np.diag(1.0 / j) + np.linalg.inv(m)
     return 0.5 * (arm.stiffness @ away**2 + rate @ np.linalg.solve(mobility, rate))

@@ -81,8 +81,7 @@ class Grid(gym.Env):
 
     frame_skip = 1
 
-    def __init__(self, render_mode=None):
-        self.render_mode = render_mode
+    def __init__(self):
         self.action_space = gym.spaces.Discrete(4)
         self.observation_space = gym.spaces.Box(0.0, 3.0, (2,), np.float64)
 

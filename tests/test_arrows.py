@@ -58,10 +58,6 @@ def place(name):
     return first if first in PLACES else "__init__"
 
 
-def test_every_folder_and_module_of_the_library_is_on_one_floor():
-    assert sorted(one for floor in FLOORS for one in floor) == sorted(PLACES)
-
-
 @pytest.mark.parametrize("module", PATHS)
 def test_no_arrow_points_back_up_and_heavy_libraries_stay_in_their_layers(module):
     own = module.partition(".")[0]

@@ -133,10 +133,6 @@ def wrong_plant(env, mass, damping, **options):
     return filtered
 
 
-def another_clip(env):
-    return sw.CBFActionFilter(env, [sw.constraints.WallClearance(velocity_clip=2.0)])
-
-
 def on_ice(env):
     """The car takes longer to stop than a filter believes that goes on with the dry model."""
     plant = sw.MujocoPlant(model=copy.copy(env.unwrapped.model))
@@ -148,7 +144,8 @@ def on_ice(env):
 @pytest.mark.parametrize(("name", "driver", "protect"), [
     ("SafePointGoal2-v0", "lateral-drift", lambda env: wrong_plant(env, 0.5, 1.5)),
     ("SafeCarGoal2-v0", "full throttle", on_ice),
-    ("PointMaze_UMaze-v3", "bang-bang", another_clip),
+    ("PointMaze_UMaze-v3", "bang-bang",
+     lambda env: sw.CBFActionFilter(env, [sw.constraints.WallClearance(velocity_clip=2.0)])),
 ])  # fmt: skip
 def test_a_filter_of_another_machine_is_found_out(name, driver, protect):
     case = with_filter(name, protect)

@@ -17,7 +17,6 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 HOME = PROJECT["urls"]["Repository"]
-SITE = sysconfig.get_paths()["purelib"]
 
 BLOCK = '''
 import sys
@@ -62,7 +61,7 @@ def python(wheel, tmp_path_factory):
         archive.extractall(site)
     # The dependencies are linked one by one: without .pth files, so no editable install of ours comes along.
     hidden = ("safe_wrappers", "__editable__", "torch", "stable_baselines3", "tensorboard")
-    for entry in Path(SITE).iterdir():
+    for entry in Path(sysconfig.get_paths()["purelib"]).iterdir():
         if not entry.name.startswith(hidden) and entry.suffix != ".pth" and not (site / entry.name).exists():
             (site / entry.name).symlink_to(entry)
     (site / "sitecustomize.py").unlink(missing_ok=True)

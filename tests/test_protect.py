@@ -63,13 +63,6 @@ def test_runners_keep_the_limit_that_their_task_publishes(robot):
     assert limit.body == (None if robot == "Humanoid" else "torso")
 
 
-def test_what_a_fetch_arm_keeps_can_be_chosen():
-    ball = sw.constraints.Sphere([1.4, 0.8, 0.6], 0.05)
-    box, clear = sw.protect(make("FetchReach-v4"), keep_out=[ball]).constraints
-    assert box.sites == ["robot0:grip"] and not box.keep_out
-    assert len(clear.keep_out) == 2 and clear.keep_out[1] == ball
-
-
 def test_an_ant_keeps_out_of_its_mazes_blocks_and_of_nothing_else():
     env = sw.protect(make("AntMaze_UMaze-v5"))
     model, points = env.unwrapped.model, np.random.default_rng(0).uniform(-14.0, 14.0, (2000, 1, 2))

@@ -57,23 +57,7 @@ def below_speed(dofs, limit):
     return lambda model, data: limit - np.abs(data.qvel[dofs])
 
 
-def in_range(dofs, low, high):
-    return lambda model, data: np.minimum(data.qpos[dofs] - low, high - data.qpos[dofs])
-
-
-def in_box(body, low, high):
-    def room(model, data):
-        p = data.body(body).xpos[: len(low)]
-        return np.concatenate([p - low, high - p])
-
-    return room
-
-
 ARM_JOINTS = "r_shoulder_pan_joint", "r_shoulder_lift_joint", "r_upper_arm_roll_joint", "r_elbow_flex_joint"
-
-
-def pusher_manipulability(model, data):
-    return manipulability(model, data, "body", "tips_arm", ARM_JOINTS) / 0.05 - 1.0
 
 
 def impact(mass, stiffness, horizon, steps):
@@ -98,14 +82,14 @@ LOOPS = {
     "joint position of Reacher": Loop(
         task("Reacher-v5"),
         [of.JointPositionLimit(-1.5, 1.5, ["joint0", "joint1"], horizon=10)],
-        in_range([0, 1], -1.5, 1.5),
+        lambda model, data: 1.5 - np.abs(data.qpos[:2]),
         most_flagged=0.4,
         deepest=1e-3,
     ),
     "a box on Reacher": Loop(
         task("Reacher-v5"),
         [of.Workspace([*FINGER_LOW, None], [*FINGER_HIGH, None], bodies=["fingertip"], horizon=10)],
-        in_box("fingertip", FINGER_LOW, FINGER_HIGH),
+        lambda model, data: FINGER_HIGH - np.abs(data.body("fingertip").xpos[:2]),
         most_flagged=0.1,
         deepest=5e-3,
     ),
@@ -113,7 +97,7 @@ LOOPS = {
     "singularity of Pusher": Loop(
         task("Pusher-v5"),
         [of.SingularityMargin(0.05, body="tips_arm", horizon=8)],
-        pusher_manipulability,
+        lambda model, data: manipulability(model, data, "body", "tips_arm", ARM_JOINTS) / 0.05 - 1.0,
         steps=45,
         most_flagged=0.1,
         deepest=1.0,

@@ -18,12 +18,6 @@ def limit(against="wall", **options):
     return sw.constraints.ImpactSpeedLimit(["cart"], [against], LIMIT, K, **options)
 
 
-def cart_at(speed, gap):
-    env = cart_before_a_wall(MASS, K, gap=gap)
-    env.data.qvel[0] = speed
-    return env
-
-
 STRUCK = np.sqrt(K * MASS)  # N per m/s
 
 
@@ -39,7 +33,9 @@ STRUCK = np.sqrt(K * MASS)  # N per m/s
     ],
 )
 def test_the_value_is_the_limit_less_the_peak_at_the_present_speed(speed, gap, left):
-    assert asked(cart_at(speed, gap), limit(margin=5.0)).value() == pytest.approx(left, abs=1e-2)
+    env = cart_before_a_wall(MASS, K, gap=gap)
+    env.data.qvel[0] = speed
+    assert asked(env, limit(margin=5.0)).value() == pytest.approx(left, abs=1e-2)
 
 
 ARM = """<mujoco><option timestep="0.001"/><worldbody>

@@ -9,7 +9,7 @@ from asking import Asked
 from hypothesis import given
 from hypothesis import strategies as st
 from judged_loops import Judge, drive, flagged, signs
-from simulated_worlds import DT, TOP, WALL, Cart, Grid, WaitingCart
+from simulated_worlds import DT, TOP, WALL, Cart, Grid
 
 import safe_wrappers as sw
 from safe_wrappers.constraints import PredictiveShield
@@ -254,8 +254,6 @@ def test_envs_and_plants_without_copies_or_a_zero_are_refused():
         sw.ActionShield(Grid(), [PredictiveShield("cost", 2)])
     with pytest.raises(UnsupportedEnvError, match=r"take plant=SimulatorPlant\(\)"):
         sw.CBFActionFilter(gym.make("Reacher-v5"), [shield()], plant=sw.MujocoPlant())
-    with pytest.raises(UnsupportedEnvError, match="cannot be copied"):
-        sw.CBFActionFilter(WaitingCart(), [shield()])
 
 
 # On MuJoCo envs, against every physics substep that MuJoCo itself makes of what was executed -------------------

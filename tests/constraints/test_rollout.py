@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from asking import Asked, bound
+from asking import asked
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from judged_loops import slider
@@ -31,14 +31,6 @@ def slider_path(x, v, u, horizon, strength):
     return np.array(path)
 
 
-def looking(scene, limit, qpos, qvel):
-    """The limit, bound to a plant that has seen this state."""
-    plant = bound(scene)
-    scene.data.qpos[:], scene.data.qvel[:] = qpos, qvel
-    plant.observe()
-    return Asked(limit, plant)
-
-
 # What is asked ------------------------------------------------------------------------------------------------
 
 
@@ -50,8 +42,9 @@ def looking(scene, limit, qpos, qvel):
     margin=st.sampled_from([0.0, 0.2]),
 )
 def test_a_control_is_admitted_by_where_it_leads(x, v, u, horizon, margin):
-    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=horizon, margin=margin)
-    limit = looking(slider(30.0), limit, [x], [v])
+    scene = slider(30.0)
+    scene.data.qpos[:], scene.data.qvel[:] = x, v
+    limit = asked(scene, sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=horizon, margin=margin))
     beyond = np.abs(slider_path(x, v, u, horizon, 30.0)) - (1.0 - margin)
     start = abs(x) - (1.0 - margin)
     if start <= 0.0:
@@ -103,8 +96,7 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
 def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monkeypatch):
     # MuJoCo resets it, and from the reset on all looks well.
     monkeypatch.chdir(tmp_path)  # it writes a log
-    scene = slider(1e9, gear=1000.0)
-    limit = looking(scene, sw.constraints.JointPositionLimit(-1e6, 1e6), [0.0], [0.0])
+    limit = asked(slider(1e9, gear=1000.0), sw.constraints.JointPositionLimit(-1e6, 1e6))
     assert limit.admits(np.array([1.0]))
     assert not limit.admits(np.array([1e9]))
     assert limit.admits(np.array([2.0]))  # and the next one is a forecast again

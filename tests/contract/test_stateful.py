@@ -6,6 +6,7 @@ space, reaches the task; and the counts are those of a count beside it.
 """
 
 import copy
+import functools
 import math
 import pickle
 import warnings
@@ -243,32 +244,25 @@ class Calls(RuleBasedStateMachine):
             assert not bottom.wrong
 
 
-def bare_reacher():
-    return made("Reacher-v5")
-
-
-def bare_point_goal():
-    return made("SafePointGoal1-v0")
-
-
 def filtered_reacher():
-    return sw.CBFActionFilter(bare_reacher(), [sw.constraints.JointSpeedLimit(2.0)])
+    return sw.CBFActionFilter(made("Reacher-v5"), [sw.constraints.JointSpeedLimit(2.0)])
 
 
 def filtered_point_goal():
-    return sw.protect(bare_point_goal())
+    return sw.protect(made("SafePointGoal1-v0"))
 
 
 class VectorCalls(RuleBasedStateMachine):
     """Any calls on the filter of a vector env, and those that it did not refuse on a vector env of filters."""
 
-    bare, single = staticmethod(bare_point_goal), staticmethod(filtered_point_goal)
+    task, single = "SafePointGoal1-v0", staticmethod(filtered_point_goal)
 
     @initialize()
     def begin(self):
         self.twin = SyncVectorEnv([self.single] * 2)
         constraints = self.twin.envs[0].constraints
-        self.stack = sw.VectorCBFActionFilter(SyncVectorEnv([self.bare] * 2), constraints)
+        bare = SyncVectorEnv([functools.partial(made, self.task)] * 2)
+        self.stack = sw.VectorCBFActionFilter(bare, constraints)
         self.running = False
 
     @rule(seed=SEEDS)
@@ -309,7 +303,7 @@ class VectorCalls(RuleBasedStateMachine):
 
 
 class ReacherVectorCalls(VectorCalls):
-    bare, single = staticmethod(bare_reacher), staticmethod(filtered_reacher)
+    task, single = "Reacher-v5", staticmethod(filtered_reacher)
 
 
 def run(machine, examples, steps):

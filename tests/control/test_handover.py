@@ -107,12 +107,6 @@ def test_a_curve_is_scipys_and_its_peaks_are_those_of_dense_samples(scenario):
     np.testing.assert_allclose(curve(HOLD * np.arange(n + 2)), [sent[-1], *plan[: n + 1]], atol=1e-10)
 
 
-@pytest.mark.parametrize(("order", "peak"), [(1, 1.875), (2, 10 / np.sqrt(3)), (3, 60.0)])
-def test_between_held_commands_the_peaks_are_the_closed_forms(order, peak):
-    found = peaks(bridge(np.zeros((3, 1)), np.full((9, 1), 2.0), 4, HOLD), order)
-    assert found == pytest.approx(2.0 * peak / 0.5**order)
-
-
 def test_torque_steps_at_knots_are_those_of_scipys_spline():
     rng = np.random.default_rng(0)
     knots, roots = rng.normal(size=(6, 2)), rng.normal(size=(4, 2, 2))

@@ -211,12 +211,6 @@ def test_the_first_stage_that_finds_an_admitted_control_answers(first):
     assert (decision.refused is None) if first == 0 else decision.refused.tolist() == [True]
 
 
-def test_an_admitted_proposal_is_executed_bit_for_bit():
-    decision = decide((-0.1, -0.2), Predicting(lambda u: 1.0), LEFT, Rows(((1.0, 1.0), 1.0)))
-    np.testing.assert_array_equal(decision.control, [-0.1, -0.2])
-    assert decision.stage is Stage.PROPOSAL and not decision.changed and decision.refused is None
-
-
 def test_changes_are_counted_in_shares_of_what_acts():
     # The first control saturates at 0.5: in shares of what acts it costs twice as much to change.
     decision = decide((1.0, 1.0), Rows(((1.0, 1.0), 0.5)), acting=((-0.5, -1.0), (0.5, 1.0)))

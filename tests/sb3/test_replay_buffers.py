@@ -332,11 +332,7 @@ def info(proposed, executed):
 def test_an_action_that_is_not_finite_is_never_stored():
     # The first two are not; for the second one the filter chose just what stands for it in the infos.
     chosen = [[np.nan, 0.0], [0.0, np.inf], [0.0, 0.0]]
-    infos = [
-        info([0.0, 5.0], [1.0, 2.5]),
-        info([0.5, 0.0], [0.5, 0.0]),
-        info([0.5, 5.0], [0.5, 5.0]),
-    ]
+    infos = [info([0.0, 5.0], [1.0, 2.5]), info([0.5, 0.0], [0.5, 0.0]), info([0.5, 5.0], [0.5, 5.0])]
     buffer = ExecutedActionReplayBuffer(8, Box(-1.0, 1.0, (1,)), SPACE, device="cpu", n_envs=3)
     one = np.ones((3, 1))
     buffer.add(0.0 * one, one, np.array(chosen, np.float32), np.array([4.0, 5.0, 6.0]), np.zeros(3), infos)

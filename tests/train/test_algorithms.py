@@ -31,11 +31,7 @@ SETTINGS = {
 SETTINGS |= {f"sbx.{name}": SETTINGS[name] for name in ("PPO", "SAC", "TD3", "TQC", "CrossQ")}
 PENALTY = 1000.0
 """An episode of the fake task returns less than 5, so that one penalty in a return would show."""
-KINDS = {
-    "naive": "naive",
-    "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}}}",
-    "safe_action": "safe_action",
-}
+PENALISED = f"{{kind: adaption_penalty, penalty: {PENALTY}}}"
 
 
 class BehindTheWall(sw.Constraint):
@@ -162,13 +158,13 @@ class Watch(BaseCallback):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "kind"),
-    [("SAC", "naive"), ("SAC", "safe_action"), ("SAC", "adaption_penalty"), ("PPO", "adaption_penalty")],
+    ("algorithm", "learner"),
+    [("SAC", "naive"), ("SAC", "safe_action"), ("SAC", PENALISED), ("PPO", PENALISED)],
 )
 def test_training_has_what_the_kind_says_and_what_is_reported_is_the_tasks(
-    fake_experiment, monkeypatch, algorithm, kind
+    fake_experiment, monkeypatch, algorithm, learner
 ):
-    experiment = one_arm(fake_experiment, algorithm, KINDS[kind], "n_envs=2", "total_steps=192")
+    experiment = one_arm(fake_experiment, algorithm, learner, "n_envs=2", "total_steps=192")
     (arm,), watch = experiment.arms, Watch()
     monkeypatch.setattr(run_module, "InterventionCallback", lambda: watch)
     folder = trained(experiment, 0)

@@ -146,22 +146,6 @@ def rewrite(path, name, change):
             archive.writestr(part, content)
 
 
-def poison(checkpoint, name, payload):
-    """The payload inside of a checkpoint's file."""
-    path = checkpoint / name
-    if name == "model.zip":
-        pickled = base64.b64encode(pickle.dumps(payload)).decode()
-
-        def poisoned(content):
-            data = json.loads(content)
-            data["lr_schedule"][":serialized:"] = pickled
-            return json.dumps(data)
-
-        rewrite(path, "data", poisoned)
-    else:
-        path.write_bytes(pickle.dumps(payload))
-
-
 @pytest.mark.parametrize("name", ["model.zip", "vecnormalize.pkl", "replay_buffer.pkl"])
 def test_a_checkpoint_that_would_run_something_is_refused(finished, fake_experiment, tmp_path, name):
     experiment, longer = finished(), finished("total_steps=640")  # the run would go on
@@ -173,12 +157,22 @@ def test_a_checkpoint_that_would_run_something_is_refused(finished, fake_experim
         folder = trained(sac)
         uses = [lambda: resumed(sac.arms[1], folder)]
     (checkpoint,) = (folder / "checkpoints").iterdir()
-    poison(checkpoint, name, Touch(tmp_path / "made"))
+    poison = pickle.dumps(Touch(tmp_path / "made"))
+
+    def poisoned(content):
+        data = json.loads(content)
+        data["lr_schedule"][":serialized:"] = base64.b64encode(poison).decode()
+        return json.dumps(data)
+
+    if name == "model.zip":
+        rewrite(checkpoint / name, "data", poisoned)
+    else:
+        (checkpoint / name).write_bytes(poison)
     for use in uses:
         with pytest.raises(RunStateError, match=rf"{name}' is refused: its pickle names pathlib\.Path"):
             use()
     assert not (tmp_path / "made").exists()
-    pickle.loads(pickle.dumps(Touch(tmp_path / "made")))
+    pickle.loads(poison)
     assert (tmp_path / "made").exists()  # it would have been
 
 

@@ -30,11 +30,6 @@ FAKE = Path(__file__).parent / "fake.yaml"
 FILTERED = "arms={filtered: {filter: {factory: 'fake_task:shield'}}}"
 
 
-def heed_interrupts():
-    """Tests that are started in a shell's background ignore SIGINT, and so would their children."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 @pytest.fixture
 def start():
     """Starts the command; what a failing test leaves running is killed."""
@@ -46,7 +41,8 @@ def start():
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            preexec_fn=heed_interrupts,
+            # In a shell's background tests ignore SIGINT, and so would their children.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         started.append(process)
         return process

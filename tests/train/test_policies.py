@@ -60,9 +60,7 @@ def policy(reacher, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [None, SAC, DQN, pytest.param(SBX, marks=pytest.mark.slow)],
-    ids=["PPO", "SAC", "DQN", "sbx"],
+    "settings", [None, SAC, DQN, pytest.param(SBX, marks=pytest.mark.slow)], ids=["PPO", "SAC", "DQN", "sbx"]
 )
 def test_its_folder_acts_as_the_run_does(settings, reacher, tmp_path):
     if settings is SBX:

@@ -237,14 +237,6 @@ def test_the_verdict_names_what_either_policy_returns_and_how_surely(fake_experi
 # Pictures: their sentences against planted numbers, and what they are drawn from -----------------------------------
 
 
-def texts(picture):
-    """What is written in a drawing."""
-    kind, data = picture.image.split(",")
-    assert kind == "data:image/svg+xml;base64"
-    root = ElementTree.fromstring(base64.b64decode(data))
-    return {"".join(node.itertext()) for node in root.iter() if node.tag.endswith("text")}
-
-
 def test_a_curve_says_where_it_begins_and_ends():
     seeds = np.array([np.linspace(0, 10, 20), np.linspace(0, 30, 20)])
     curve = Curve(np.arange(20.0), seeds.mean(axis=0), *seeds, seeds)
@@ -263,7 +255,11 @@ def test_where_in_state_space():
     share = f"{100 * log.intervened.mean():.2g} % of 4,000 steps were changed"
     assert picture.reading == f"{share}; in the middle of them ({x:.2g}, {speed:.2g})."
     assert hurt.title == "Where violations were: bare, filter off" and "were in violation" in hurt.reading
-    assert {"x (m)", "speed (m/s)", "share of steps changed"} <= texts(picture)
+    kind, data = picture.image.split(",")
+    drawn = ElementTree.fromstring(base64.b64decode(data)).iter()
+    written = {"".join(node.itertext()) for node in drawn if node.tag.endswith("text")}
+    assert kind == "data:image/svg+xml;base64"
+    assert {"x (m)", "speed (m/s)", "share of steps changed"} <= written
     flat = {"coordinates": np.zeros((200, 2)), "coordinate_names": np.array(["x", "y"])}
     narrow = {"coordinates": np.zeros((200, 1)), "coordinate_names": np.array(["x"])}
     for log, reading in (

@@ -176,13 +176,10 @@ def test_a_sac_run_keeps_its_replay_buffer_until_it_is_finished(fake_experiment,
     assert 370 < trained_at[0] <= 384 and finish(folder)["timesteps"] == 400
 
 
-LIMIT = "arms.unfiltered.learner={cost_limit: 0, multiplier_rate: 0.01}"
-
-
 def test_the_price_on_cost_rises_where_there_is_a_limit_and_goes_on_from_a_checkpoint(fake_experiment):
-    prices = []
+    limit, prices = "arms.unfiltered.learner={cost_limit: 0, multiplier_rate: 0.01}", []
     for steps in (384, 512):
-        folder = trained(fake_experiment(LIMIT, f"total_steps={steps}"), 0)
+        folder = trained(fake_experiment(limit, f"total_steps={steps}"), 0)
         told = scalars(folder)["interventions/lagrangian_multiplier"]
         prices.append([value for at, value in told if at > 384 or steps == 384])
     # Each is what stood after a rollout; costs are never below the limit.
@@ -272,9 +269,7 @@ def test_a_start_that_fails_leaves_the_folder_to_the_corrected_command(fake_expe
     assert [model.clip_range(left) for left in (1.0, 0.25, 0.0, -0.1)] == pytest.approx([0.2, 0.05, 0.0, 0.0])
 
 
-def test_a_checkpoint_that_cannot_be_read_is_named_and_without_it_the_one_before_counts(
-    fake_experiment,
-):
+def test_a_checkpoint_that_cannot_be_read_is_named_and_without_it_the_one_before_counts(fake_experiment):
     experiment = fake_experiment("total_steps=640")
     folder = killed_after(experiment, 3)
     older, newer = sorted((folder / "checkpoints").glob("step_*"))

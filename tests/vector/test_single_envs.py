@@ -193,16 +193,11 @@ def test_the_filters_attributes_are_read_across_processes():
         assert envs.get_attr("filter_calls") == (11, 21)
 
 
-def wrong_fallback(plant):
-    return [0.0, 0.0]
-
-
-def with_wrong_fallback(index):
-    return cart_filter(index, fallback=wrong_fallback if index == 1 else "brake")
-
-
 def test_a_refusal_in_a_process_arrives_as_ours_with_its_words():
-    envs = FORKED(sub_envs(with_wrong_fallback))
+    def make(index):
+        return cart_filter(index, fallback=(lambda plant: [0.0, 0.0]) if index == 1 else "brake")
+
+    envs = FORKED(sub_envs(make))
     try:
         envs.reset(seed=0, options={"start": [-1.0, 0.0]})
         with pytest.raises(ConfigurationError, match=r"must return a control of shape \(1,\), got \(2,\)"):

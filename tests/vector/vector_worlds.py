@@ -79,9 +79,6 @@ def cart_plant(delay_s=0.0):
 BEFORE_THE_WALL = sw.constraints.Clearance(
     [sw.constraints.Plane([WALL], [-1.0])], braking=1.0, position=[0], velocity=[1]
 )
-HAZARDS = sw.constraints.HeadingDriveClearance(
-    [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004, detour=True
-)
 """One for all envs: the filter's business is to take copies."""
 
 

@@ -14,7 +14,7 @@ import pytest
 from asking import Below
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds import Cart, Raw, filtered_cart, full_throttle, wall
+from worlds import Cart, Raw, filtered_cart
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -285,9 +285,13 @@ def test_an_env_may_reset_its_filter_within_a_step():
 @pytest.mark.parametrize("late", [0, 3])
 def test_a_plant_with_inertia_stops_in_front_of_the_wall_whatever_is_in_flight(dt, late):
     # Bugs 6 and 7: one step of look-ahead on the position would drive through at any of these.
+    planes = [sw.constraints.Plane([3.0], [-1.0])]
+    wall = sw.constraints.Clearance(planes, braking=1.0, position=[0], velocity=[1])
+
     def driven(delay_s):
-        filtered = filtered_cart([wall(3.0)], env=Cart(dt, late), dt=dt, delay_s=delay_s)
-        return filtered, full_throttle(filtered, int(12 / dt))
+        filtered = filtered_cart([wall], env=Cart(dt, late), dt=dt, delay_s=delay_s)
+        filtered.reset(seed=0)
+        return filtered, [filtered.step(np.ones(1, np.float32))[4] for _ in range(int(12 / dt))]
 
     filtered, infos = driven(late * dt)
     assert 3.0 - 1e-2 < filtered.unwrapped.farthest <= 3.0 + 1e-6

@@ -9,7 +9,6 @@ from worlds import Cart, filtered_cart
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError
 
 PUSH = np.array([1.0, 0.0], dtype=np.float32)
 BEFORE_A_HAZARD = {"layout": {"agent": [0, 0, 0], "hazards": [[0.5, 0.0]], "goal": [1.3, 0.0]}}
@@ -164,11 +163,6 @@ def test_dicts_get_a_key_and_images_become_dicts(space, key):
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     assert set(observation) == {key, "filter"} and observation["filter"].dtype == np.float32
-
-
-def test_a_plant_beside_a_filter_is_refused():
-    with pytest.raises(ConfigurationError, match="without one give it"):
-        sw.FilterObservation(sw.protect(gym.make("Reacher-v5")), plant=sw.MujocoPlant())
 
 
 class Broken(gym.Wrapper):

@@ -190,18 +190,17 @@ def test_the_cost_is_judged_on_the_true_state_after_the_step_and_counted_as_the_
     assert summary["cost"] == pytest.approx(sum(costs))
 
 
-@pytest.mark.parametrize("answer", [None, "1", [1.0, 2.0], float("nan"), float("inf"), 1j])
+@pytest.mark.parametrize("answer", [None, "1", [1.0], np.zeros(2), np.nan, np.inf, 1j])
 def test_a_cost_that_is_no_finite_number_is_an_error(answer):
     env = sw.CostFunction(gym.make("Pendulum-v1"), lambda env: answer)
-    with pytest.raises(sw.SafeWrappersError, match="must return one finite number"):
+    with pytest.raises(sw.errors.ConfigurationError, match="must return one finite number"):
         env.reset(seed=0)
 
 
 def test_a_task_s_own_cost_is_not_hidden():
     env = sw.CostFunction(gym.make("SafePointGoal1-v0"), lambda env: 0.0)
-    with pytest.raises(sw.SafeWrappersError, match="reports a cost of its own"):
+    with pytest.raises(sw.errors.ConfigurationError, match="reports a cost of its own"):
         env.reset(seed=0)
-        env.step(env.action_space.high)
 
 
 class SameInfo(Scripted):

@@ -80,17 +80,12 @@ NO_CONTACTS = "no body of this model can touch"
 ORDER = "d <= s <= H - d must hold"
 REFUSED = [
     bad("ActionRepeat", "repeat .* got 0", repeat=0),
-    bad("ActionRepeat", "repeat .* got 2.5", repeat=2.5),
-    bad("ActionRepeat", "repeat .* got '4'", repeat="4"),
     bad("ActionShield", "a discrete action has no zero", fallback="zero"),
     bad("ActionShield", "use CBFActionFilter for a Box", on=bare("Reacher-v5")),
     bad("ActionShield", "1,024; got Discrete", on=acting(gym.spaces.Discrete(1025))),
     bad("AdaptionPenalty", "needs a CBFActionFilter inside", on=bare("Reacher-v5")),
     bad("AdaptionPenalty", "penalty must be a finite number > 0", penalty=0.0),
-    bad("AdaptionPenalty", "penalty must be a finite number", penalty=math.nan),
-    bad("AdaptionPenalty", "penalty must be a number in the task's reward", penalty="much"),
     bad("BalanceMonitor", "bodies is a list of names of bodies, or None", bodies="torso"),
-    bad("BalanceMonitor", "bodies is a list", bodies=[]),
     bad("BalanceMonitor", "no body 'tail'; give another", UnknownNameError, bodies=["torso", "tail"]),
     bad("BalanceMonitor", "of this model can touch", UnsupportedEnvError, on=bare("Reacher-v5")),
     bad("CBFActionFilter", "constraints is a list with at least one, got", constraints=[]),
@@ -101,14 +96,12 @@ REFUSED = [
     bad("CBFActionFilter", CHANGES, on=reacher(lambda env: gym.wrappers.MaxAndSkipObservation(env, skip=4))),
     bad("CBFActionFilter", CHANGES, on=reacher(lambda env: gym.wrappers.RescaleAction(env, -2.0, 2.0))),
     bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Dict(a=gym.spaces.Box(-1.0, 1.0, (2,))))),
-    bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Tuple([gym.spaces.Box(-1.0, 1.0, (2,))]))),
     bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Discrete(3))),
     bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Box(-1.0, 1.0, (1, 2)))),
     bad("CBFActionFilter", NO_VECTOR, on=acting(gym.spaces.Box(-1, 1, (2,), np.int64))),
     bad("ChunkHandover", f"{ORDER}.*H = 8 control steps", execution_horizon=9),
     bad("ChunkHandover", ORDER, inference_delay=5),
     bad("ChunkHandover", ORDER, inference_delay=[0, 5], execution_horizon=8),
-    bad("ChunkHandover", ORDER, inference_delay=3, execution_horizon=2),
     bad("ChunkHandover", "inference_delay .* at least 0; got -1", inference_delay=-1),
     bad("ChunkHandover", "at least 0; got -1", inference_delay=[-1, 2]),
     bad("ChunkHandover", r"\[least, most\]", inference_delay=[2, 1]),
@@ -135,7 +128,6 @@ REFUSED = [
     bad("ChunkHandover", '"moving" or "rest"', limits={"arrival": "soon", "acceleration": 2.0}),
     bad("ChunkHandover", "beside an acceleration", limits={"arrival": "rest", "velocity": 1.0}),
     bad("ChunkHandover", "steps_per_entry", steps_per_entry=0),
-    bad("ChunkHandover", "steps_per_entry", steps_per_entry=1.5),
     bad("ChunkHandover", "at least 2", chunk_size=1, execution_horizon=1, inference_delay=0, steps_per_entry=2),
     bad("ChunkHandover", "H = 29 control steps", execution_horizon=30, steps_per_entry=4),
     bad("ContactMonitor", "no body 'tail'", UnknownNameError, bodies=["tail"]),
@@ -148,9 +140,11 @@ REFUSED = [
     bad("CostFunction", "cannot be imported", fn="a b:c"),
     bad("FilterObservation", "without one give it constraints", constraints=None),
     bad("FilterObservation", "shows what the filter inside", on=reacher(lambda e: sw.CBFActionFilter(e, [SPEED]))),
+    bad("FilterObservation", "without one give it", on=reacher(sw.protect), constraints=None, plant=sw.MujocoPlant()),
     bad("FilterObservation", "neighbours", neighbours=-1),
     bad("LeaseExpiry", "min_lease_s.*CBFActionFilter", min_lease_s=0.1),
     bad("LeaseExpiry", "min_lease_s", min_lease_s=-0.1),
+    bad("LeaseExpiry", "than min_lease_s = 2", min_lease_s=2.0),
     bad("LeaseExpiry", CHANGES, on=rescaled("InvertedPendulum-v5")),
     bad("LeaseExpiry", "Raw has no value", budget={"clearance": Raw([[1.0]], [1.0]), "closing_speed": 1.0}),
     bad("OcclusionPenalty", "tolerance.*> 0 in m, got 0", tolerance=0.0),
@@ -193,13 +187,10 @@ REFUSED = [
     bad("TeleopChannel", "Box action space", on=bare("CartPole-v1")),
     bad("TeleopChannel", "MuJoCo", UnsupportedEnvError, on=bare("Pendulum-v1"),
         budget={"clearance": RAIL, "acceleration": 1.0}),
-    bad("WholeBodyFilter", "friction_share", friction_share=0.0),
     bad("WholeBodyFilter", "friction_share", friction_share=1.1),
-    bad("WholeBodyFilter", "tolerance", tolerance=-1.0),
     bad("WholeBodyFilter", "joint_tolerance", joint_tolerance=-0.1),
     bad("WholeBodyFilter", "inset", zmp_inset=0.0),
     bad("WholeBodyFilter", NO_CONTACTS, UnsupportedEnvError, on=bare("InvertedPendulum-v5")),
-    bad("WholeBodyFilter", NO_CONTACTS, UnsupportedEnvError, on=bare("Swimmer-v5")),
     bad("WholeBodyFilter", "MuJoCo", UnsupportedEnvError, on=bare("Pendulum-v1")),
     bad("WholeBodyFilter", "joint_tolerance=None", UnsupportedEnvError, on=bare("SafePointGoal1-v0")),
 ]  # fmt: skip
@@ -235,18 +226,11 @@ def test_a_wrapper_refuses_what_it_cannot_work_with(name, words, error, on, argu
         (sw.occlusion.Track, {"acceleration_noise": 0.1}, "follows bodies by name or pattern, or published"),
         (sw.occlusion.Track, {"bodies": "a", "acceleration_noise": 0.1, "reversion_s": 0.0}, "reversion_s"),
         (sw.teleop.Link, {"delay_s": -0.1}, "delay_s"),
-        (sw.teleop.Link, {"delay_s": math.nan}, "delay_s"),
-        (sw.teleop.Link, {"delay_s": "soon"}, "delay_s"),
         (sw.teleop.Link, {"jitter_s": -1.0}, "jitter_s"),
-        (sw.teleop.Link, {"loss": 1.1}, "loss"),
         (sw.teleop.Link, {"loss": -0.1}, "loss"),
-        (RepeatedCommands, {"env": BrakedCart(), "share": -0.1}, "share"),
         (RepeatedCommands, {"env": BrakedCart(), "share": 1.1}, "share"),
-        (RepeatedCommands, {"env": BrakedCart(), "share": None}, "share"),
         (Outages, {"env": BrakedCart(), "mean_between_s": 0.0, "mean_length_s": 1.0}, "mean_between_s"),
         (Outages, {"env": BrakedCart(), "mean_between_s": 1.0, "mean_length_s": -1.0}, "mean_length_s"),
-        (Outages, {"env": BrakedCart(), "mean_between_s": 1.0, "mean_length_s": math.inf}, "mean_length_s"),
-        (Outages, {"env": BrakedCart(), "mean_between_s": "never", "mean_length_s": 1.0}, "mean_between_s"),
     ],
 )  # fmt: skip
 def test_settings_and_faults_refuse_what_makes_no_sense(setting, arguments, words):
@@ -264,21 +248,6 @@ def test_one_plant_for_two_envs():
         sw.CBFActionFilter(gym.make("Reacher-v5"), [SPEED], plant=plant)
 
 
-def test_another_control_interval_than_the_env_s():
-    plant = sw.AnalyticPlant(
-        f=lambda x: np.zeros(2), g=lambda x: np.ones((2, 1)), state=lambda env: env.state, control_dt=0.3
-    )
-    slow = sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2)
-    with pytest.raises(ConfigurationError, match=r"control_dt = 0\.3 s, but one step of this env lasts"):
-        sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant)
-
-
-def test_a_lease_is_never_less_than_max_lease_s():
-    filtered = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [RAIL])
-    with pytest.raises(ConfigurationError, match="min_lease_s"):
-        sw.LeaseExpiry(filtered, sw.StoppingBudget(RAIL, acceleration=1.0), min_lease_s=2.0)
-
-
 @pytest.mark.parametrize("kind", FAULTS)
 def test_an_env_that_does_not_say_how_long_a_step_lasts_is_told_what_to_give(kind):
     env = gym.make("MountainCarContinuous-v0")
@@ -287,19 +256,6 @@ def test_an_env_that_does_not_say_how_long_a_step_lasts_is_told_what_to_give(kin
         FAULTS[kind](env, *arguments)
     env.unwrapped.dt = 0.05
     assert FAULTS[kind](env, *arguments).control_dt == 0.05
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, None, "1", [1.0], np.zeros(2), 1j])
-def test_a_cost_that_is_no_finite_number(bad):
-    env = sw.CostFunction(gym.make("Pendulum-v1"), lambda env: bad)
-    with pytest.raises(ConfigurationError, match="must return one finite number, got"):
-        env.reset(seed=0)
-
-
-def test_a_task_s_own_cost_is_not_hidden():
-    env = sw.CostFunction(gym.make("SafePointGoal1-v0"), lambda env: 0.0)
-    with pytest.raises(ConfigurationError, match="reports a cost of its own"):
-        env.reset(seed=0)
 
 
 @pytest.mark.parametrize("name", ["CBFActionFilter", "LeaseExpiry", "TeleopChannel", "ChunkHandover"])

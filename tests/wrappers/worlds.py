@@ -34,34 +34,18 @@ class Cart(gym.Env):
         return self.state.copy(), 0.0, False, False, {}
 
 
-def read(env):
-    return env.state
-
-
 def cart_plant(dt=0.1, delay_s=0.0):
     return sw.AnalyticPlant(
         f=lambda x: np.array([x[1], 0.0]),
         g=lambda x: np.array([[0.0], [1.0]]),
-        state=read,
+        state=lambda env: env.state,
         control_dt=dt,
         delay_s=delay_s,
     )
 
 
-def wall(at, **more):
-    """Stay left of a wall, on the cart's line."""
-    planes = [sw.constraints.Plane([at], [-1.0])]
-    return sw.constraints.Clearance(planes, braking=1.0, position=[0], velocity=[1], **more)
-
-
 def filtered_cart(constraints, *, dt=0.1, env=None, delay_s=0.0, **options):
     return sw.CBFActionFilter(env or Cart(dt), constraints, plant=cart_plant(dt, delay_s), **options)
-
-
-def full_throttle(filtered, steps, state=(0.0, 0.0)):
-    """Always the largest action; returns the infos."""
-    filtered.reset(seed=0, options={"state": list(state)})
-    return [filtered.step(np.array([1.0], np.float32))[4] for _ in range(steps)]
 
 
 class Raw(sw.Constraint):
