@@ -77,12 +77,12 @@ MOVES = ((0, -1), (1, 0), (0, 1), (-1, 0))
 
 
 class Grid(gym.Env):
-    """A grid with pits ("#"), which cost 1 per step in them; four moves; the observation is (column, row)."""
+    """A grid with pits ("#"), which cost 1 per step; moves are numbered from `start`; observes (column, row)."""
 
     frame_skip = 1
 
-    def __init__(self):
-        self.action_space = gym.spaces.Discrete(4)
+    def __init__(self, start=0):
+        self.action_space = gym.spaces.Discrete(4, start=start)
         self.observation_space = gym.spaces.Box(0.0, 3.0, (2,), np.float64)
 
     def reset(self, *, seed=None, options=None):
@@ -91,7 +91,7 @@ class Grid(gym.Env):
         return np.array(self.at, dtype=np.float64), {"cost": 0.0}
 
     def step(self, action):
-        (x, y), (dx, dy) = self.at, MOVES[int(action)]
+        (x, y), (dx, dy) = self.at, MOVES[int(action - self.action_space.start)]
         self.at = (min(max(x + dx, 0), 3), min(max(y + dy, 0), 3))
         kind = GRID[self.at[1]][self.at[0]]
         return (

@@ -8,8 +8,8 @@ from simulated_worlds import GRID, MOVES, Grid
 import safe_wrappers as sw
 
 
-def shielded(env=None, cost="cost", **options):
-    shield = sw.constraints.PredictiveShield(cost, 2, backup=[0, 1, 2, 3], **options)
+def shielded(env=None, cost="cost", start=0, **options):
+    shield = sw.constraints.PredictiveShield(cost, 2, backup=[start + k for k in range(4)], **options)
     env = sw.ActionShield(env or Grid(), [shield])
     env.reset(seed=0)
     return env
@@ -22,49 +22,28 @@ def pits(at):
     return np.array([GRID[y][x] == "#" for x, y in led])
 
 
-@pytest.mark.parametrize("prefers", ["the nearest", "the farthest"])
-def test_a_move_into_a_pit_is_masked_and_replaced_by_the_preferred_one(prefers):
+@pytest.mark.parametrize(
+    "prefers, start", [("the nearest", 0), ("the farthest", 0), ("the nearest", 5)], ids=str
+)
+def test_a_move_into_a_pit_is_masked_and_replaced_by_the_preferred_one(prefers, start):
     favourite = {"value": lambda o, a: np.abs(a[:, 0] - 3.0)} if prefers == "the farthest" else {}
-    env, rng, refused = shielded(**favourite), np.random.default_rng(0), 0
+    env = shielded(Grid(start), start=start, **favourite)
+    rng, refused = np.random.default_rng(0), 0
     for _ in range(300):
-        masks, action = env.action_masks(), int(rng.integers(4))
+        masks, move = env.action_masks(), int(rng.integers(4))
         np.testing.assert_array_equal(masks, ~pits(env.unwrapped.at))
-        _, _, terminated, _, info = env.step(action)
-        executed = int(info["executed_action"][0])
-        assert info["cbf/intervened"] == (not masks[action]) and info["cost"] == 0.0
-        assert info["proposed_action"] == [action] and masks[executed]
+        _, _, terminated, _, info = env.step(start + move)
+        executed = int(info["executed_action"][0]) - start
+        assert info["cbf/intervened"] == (not masks[move]) and info["cost"] == 0.0
+        assert info["proposed_action"] == [start + move] and masks[executed]
         if info["cbf/intervened"]:
             admitted = np.flatnonzero(masks)
-            away = 3 - admitted if favourite else -abs(admitted - action)
+            away = 3 - admitted if favourite else -abs(admitted - move)
             assert away[admitted == executed] == away.max()
             refused += 1
         if terminated:
             env.reset()
     assert refused > 20
-
-
-class FromFive(Grid):
-    """The same moves, numbered from 5."""
-
-    def __init__(self):
-        super().__init__()
-        self.action_space = gym.spaces.Discrete(4, start=5)
-
-    def step(self, action):
-        return super().step(action - 5)
-
-
-def test_numbers_of_actions_begin_where_the_space_s_do():
-    env = sw.ActionShield(FromFive(), [sw.constraints.PredictiveShield("cost", 2, backup=[5, 6, 7, 8])])
-    env.reset(seed=0)
-    for action in np.random.default_rng(0).integers(5, 9, 60).tolist():
-        masks = env.action_masks()
-        np.testing.assert_array_equal(masks, ~pits(env.unwrapped.at))
-        _, _, terminated, _, info = env.step(action)
-        assert env.action_space.contains(int(info["executed_action"][0]))
-        assert info["cbf/intervened"] == (not masks[action - 5])
-        if terminated:
-            env.reset()
 
 
 @pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
