@@ -4,7 +4,6 @@ A robot's first two coordinates are the world x and y of its centre, m.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Final
 
 import mujoco
@@ -24,17 +23,14 @@ _HEIGHT: Final = 0.1  # m: of the car's centre where its wheels touch the floor
 _QUARTER_TURN: Final = math.pi / 2.0
 
 
-@dataclass(frozen=True)
-class _Robot:
-    """A robot whose root body is called "agent"; every geom in its subtree counts as the robot."""
+class PlanarRobot:
+    """A sphere that pushes along its heading and turns, with a box for a nose; its joints are world x, y and heading.
 
-    name: str  # prefix of its assets: <name>_goal<level>.xml
-    n_sensors: int  # how many readings open the observation
-    hull_corners: tuple[tuple[float, float], ...] = ()  # of a car's outline, in its frame seen from above, m
+    The root body of a robot is called "agent"; every geom in its subtree counts as the robot.
+    """
 
-
-class PlanarRobot(_Robot):
-    """A robot whose first three joints are world x, world y and heading."""
+    name: Final = "point"  # prefix of its assets: <name>_goal<level>.xml
+    n_sensors: Final = 12  # that open the observation: accelerometer, velocimeter, gyro, magnetometer
 
     def place(self, qpos: Array, pose: Array) -> None:
         """Stand at a pose: x, y, heading, shape (3,), m and rad."""
@@ -57,19 +53,17 @@ class PlanarRobot(_Robot):
         return turned
 
 
-POINT: Final = PlanarRobot(
-    name="point",
-    n_sensors=12,  # accelerometer, velocimeter, gyro, magnetometer
-)
-"""A sphere that pushes along its heading and turns, with a box for a nose."""
-
-
-class WheeledCar(_Robot):
-    """A car on a free joint, which opens the configuration: x, y, z, quaternion.
+class WheeledCar:
+    """Safety-Gymnasium's car, on a free joint, which opens the configuration: x, y, z, quaternion.
 
     Its wheels' axle is the x axis of its body, and positive controls drive it along -y: `heading` is that
     direction. Its lidar counts from the x axis, as the original's does: bin 0 looks to the heading's left.
     """
+
+    name: Final = "car"
+    n_sensors: Final = 24  # as the point's 12, then the caster's turning and its 3 x 3 orientation
+    hull_corners: Final = ((0.1, -0.1), (0.1, 0.16), (0.05, -0.175), (0.155, 0.15), (0.155, 0.05))
+    """Outline in its frame seen from above, m: the chassis, the bumpers, back and front, the wheels' outer rims."""
 
     def place(self, qpos: Array, pose: Array) -> None:
         x, y, heading = pose.tolist()
@@ -101,14 +95,8 @@ def _rotation(quaternion: Array) -> Array:
     return matrix.reshape(3, 3)
 
 
-CAR: Final = WheeledCar(
-    name="car",
-    n_sensors=24,  # accelerometer, velocimeter, gyro, magnetometer, caster's turning, its 3 x 3 orientation
-    # The chassis, the back bumper, the front bumper, the wheels' outer rims.
-    hull_corners=((0.1, -0.1), (0.1, 0.16), (0.05, -0.175), (0.155, 0.15), (0.155, 0.05)),
-)
-"""Safety-Gymnasium's car."""
-
+POINT: Final = PlanarRobot()
+CAR: Final = WheeledCar()
 Robot = PlanarRobot | WheeledCar
 
 

@@ -86,44 +86,8 @@ SLOWEST: Final = 0.5
 """Speed below which slip counts against this speed, m/s: at rest there is no ratio."""
 
 
-def tyre_force(
-    rim: float, forward: float, sideways: float, load: float, curve: MagicFormula
-) -> tuple[float, float, float]:
-    """Force of the ground on a wheel: against the sliding of the contact point, as much as the curve gives.
-
-    Both slips count against one speed, `max(|forward|, |rim|, SLOWEST)`, and share one curve (a friction circle):
-    who spins or locks a wheel loses its grip across, too. As the force opposes the sliding, a tyre only ever takes
-    energy away.
-
-    Plain numbers, as this runs for every wheel at every physics substep.
-
-    Args:
-        rim: Circumferential speed r w, m/s.
-        forward: Speed of the wheel over ground along its heading, m/s.
-        sideways: The same to its left, m/s.
-        load: F_z, N; a wheel without load gets no force.
-        curve: The ground's.
-
-    Returns:
-        Force along the heading and to the left, N, and the longitudinal slip.
-    """
-    over = 1.0 / max(abs(forward), abs(rim), SLOWEST)
-    along, across = (rim - forward) * over, -sideways * over
-    slip = math.hypot(along, across)
-    if load <= 0.0 or slip == 0.0:
-        return 0.0, 0.0, along
-    share = curve.at(slip) * load / slip
-    return share * along, share * across, along
-
-
 UPRIGHT: Final = 0.5
 """Cosine of the tilt from which on the chassis has rolled over, and a wheel does not roll."""
-
-
-def rolled_over(quaternion: NDArray[np.float64]) -> bool:
-    """Whether a chassis with this orientation, shape (4,), lies on its side or its back."""
-    _, x, y, _ = quaternion.tolist()
-    return bool(1.0 - 2.0 * (x * x + y * y) < UPRIGHT)
 
 
 class Tyres:
@@ -148,6 +112,10 @@ class Tyres:
         Needs the kinematics of the present state (`mj_step1`). With z upwards, the contact point lies `r z` under the
         wheel's centre; its speed against the ground is the centre's plus that of the whole rotation of the wheel, the
         chassis's share included.
+
+        Slip along and across counts against one speed, the largest of the ground's, the rim's and `SLOWEST`. Both
+        share one curve (a friction circle): a wheel that spins or locks loses its grip across, too. The force opposes
+        the sliding, so that a tyre only ever takes energy away.
         """
         r = self._radius
         com_x, com_y, com_z = data.subtree_com[1].tolist()
@@ -169,7 +137,11 @@ class Tyres:
             rim = r * (wx * left_x + wy * left_y)
             forward = vx * left_y - vy * left_x
             sideways = vx * left_x + vy * left_y + r * (wx * left_y - wy * left_x)
-            along, across, slips[i] = tyre_force(rim, forward, sideways, loads[i], curve_at(x, y))
+            over = 1.0 / max(abs(forward), abs(rim), SLOWEST)
+            along, across = (rim - forward) * over, -sideways * over
+            slips[i], slip = along, math.hypot(along, across)
+            share = curve_at(x, y).at(slip) * loads[i] / slip if loads[i] > 0.0 and slip else 0.0
+            along, across = share * along, share * across
             fx = along * left_y + across * left_x
             fy = across * left_y - along * left_x
             forces[body] = [fx, fy, 0.0, r * fy, -r * fx, 0.0]

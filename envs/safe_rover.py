@@ -14,7 +14,7 @@ from safe_wrappers.info import COST, COST_SUBSTEP, SPIN_OUT
 
 from .field import FieldEnv
 from .goal_robots import LIDAR_BINS, pseudo_lidar
-from .ground import GROUNDS, Ground, Patch, Tyres, rolled_over
+from .ground import GROUNDS, UPRIGHT, Ground, Patch, Tyres
 from .layout import PLACE, POSE, Form, Given, layout_option, numbers, place_goal_beside, place_objects, places
 
 WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
@@ -200,7 +200,8 @@ class SafeRoverEnv(FieldEnv):
         return bool(np.isfinite(observation).all())
 
     def _is_over(self) -> bool:
-        return rolled_over(self.data.qpos[3:7])
+        _, x, y, _ = self.data.qpos[3:7].tolist()
+        return bool(1.0 - 2.0 * (x * x + y * y) < UPRIGHT)
 
     def observe(self) -> Array:
         data = self.data

@@ -108,6 +108,16 @@ def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
     return kind(**given)
 
 
+def of_kind(kinds: Mapping[str, type[T]], data: Any, what: str) -> T:
+    """A dataclass rebuilt from the dict of its fields, with its class under "kind"; `what` is expected."""
+    if not isinstance(data, Mapping):
+        raise ConfigurationError(f"expected {what} or the dict of one; got {data!r}")
+    kind = data.get("kind", "")
+    if not isinstance(kind, str) or kind not in kinds:
+        raise UnknownNameError(f"unknown kind {kind!r}; expected {what}: the kinds are {', '.join(kinds)}")
+    return settings_from(kinds[kind], {k: v for k, v in data.items() if k != "kind"}, kind)
+
+
 def check_fields(settings: Any, check: Callable[..., float], names: Sequence[str], unit: str) -> None:
     """Check fields of a frozen dataclass by `positive` or `non_negative`; None stays where it is the default."""
     defaults = {field.name: field.default for field in fields(settings)}
@@ -182,13 +192,3 @@ def one_number(name: str, value: Any) -> float:
     if array.size != 1:
         raise ConfigurationError(f"{name} must return one number, got an array of shape {array.shape}")
     return float(array.reshape(()))
-
-
-def finite_arrays(**values: ArrayLike) -> list[Array]:
-    """The values as finite float64, broadcast together, in the given order."""
-    arrays = [finite_array(name, value) for name, value in values.items()]
-    try:
-        return list(np.broadcast_arrays(*arrays))
-    except ValueError:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(values, arrays, strict=True))
-        raise ConfigurationError(f"expected shapes that broadcast together, got {shapes}") from None

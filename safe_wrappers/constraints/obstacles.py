@@ -14,8 +14,8 @@ from safe_wrappers.errors import (
     ConfigurationError,
     finite_array,
     non_negative,
+    of_kind,
     positive,
-    settings_from,
 )
 from safe_wrappers.plants.plant import Plant
 
@@ -282,29 +282,25 @@ class TrackedDiscs:
 KINDS: dict[str, type[Any]] = {k.__name__: k for k in (Disc, Sphere, Plane, Box, Discs, TrackedDiscs)}
 
 
-def obstacle_from(data: Any) -> Obstacle:
-    """An obstacle itself, or rebuilt from the plain dict that a recorded wrapper holds."""
-    if not isinstance(data, dict):
-        if hasattr(data, "nearest"):
-            return data  # type: ignore[no-any-return]
-        raise ConfigurationError(f"expected an obstacle ({', '.join(KINDS)}) or its dict, got {data!r}")
-    name = data.get("kind")
-    if name not in KINDS:
-        raise ConfigurationError(f"unknown obstacle kind {name!r}; the kinds are {', '.join(KINDS)}")
-    obstacle: Obstacle = settings_from(KINDS[name], {k: v for k, v in data.items() if k != "kind"}, name)
-    return obstacle
-
-
 def obstacles_from(
-    given: Any, name: str = "obstacles", kinds: tuple[type[Any], ...] = (), optional: bool = False
+    given: Any,
+    name: str = "obstacles",
+    kinds: tuple[type[Any], ...] = (),
+    optional: bool = False,
+    still: bool = False,
 ) -> list[Any]:
-    """A list of obstacles, each itself or as its dict, of these kinds (none: all); it may be empty if `optional`."""
+    """A list of obstacles, each itself or as its dict, of these kinds (none: all); it may be empty if `optional`.
+
+    With `still` those that publish a velocity are refused.
+    """
     fitting = " and ".join(kind.__name__ for kind in kinds) or "obstacles"
     if isinstance(given, dict | str) or not isinstance(given, Sequence) or not (given or optional):
         wanted = f"list of {fitting}" if optional else "list with at least one obstacle"
         raise ConfigurationError(f"{name} is a {wanted}, got {given!r}")
-    found = [obstacle_from(o) for o in given]
+    found = [o if hasattr(o, "nearest") else of_kind(KINDS, o, "an obstacle") for o in given]
     for obstacle in found:
         if kinds and not isinstance(obstacle, kinds):
             raise ConfigurationError(f"{name} holds {fitting}, got {type(obstacle).__name__}")
+        if still and getattr(obstacle, "velocity_attribute", None) is not None:
+            raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
     return found

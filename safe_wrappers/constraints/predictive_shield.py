@@ -5,7 +5,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -127,7 +126,13 @@ class PredictiveShield(Constraint, Model):
             raise ConfigurationError(
                 "a discrete action has no zero: give as backup the action that is safe, or hold, or a function"
             )
-        self._backups = [self._function(one) for one in self.backup]
+        nothing = np.zeros(self.plant.lower.shape)
+        self._backups: list[Any] = [
+            one
+            if callable(one) or one == "hold"
+            else self.plant.control(nothing if one == "zero" else one, "the backup")
+            for one in self.backup
+        ]
         self._points = np.random.default_rng(0).random((self.candidates, self.plant.lower.size))
 
     def observe(self, memory: Memory) -> None:
@@ -146,7 +151,7 @@ class PredictiveShield(Constraint, Model):
             self.promise = "best effort"
         if begins and np.isfinite(self.plant.state).all():
             for backup in self._backups:
-                self._first(backup)  # refuses at a reset what no action is
+                self._control(backup, view)  # refuses at a reset what no action is
 
     def rollout(self, control: Array | None, horizon: int = 1) -> Plan | None:
         """What a control leads to; nothing of None: the present state is known."""
@@ -165,29 +170,21 @@ class PredictiveShield(Constraint, Model):
             return -float(view.info[self.h])
         return one_number("h", self.h(_seen(self.sees, view)))
 
-    def _function(self, backup: Any) -> Callable[[View], Array] | None:
-        """What a backup does in a state, a control of shape (m,); None: the action goes on."""
-        plant, named = self.plant, isinstance(backup, str)
-        if named and backup == "hold":
-            return None
+    def _control(self, backup: Any, view: View) -> Array:
+        """What a backup does in a state, shape (m,); the action goes on under "hold"."""
+        if isinstance(backup, str):
+            return np.asarray(self._last)
         if not callable(backup):
-            return partial(
-                _constant, plant.control(np.zeros(plant.lower.shape) if named else backup, "the backup")
-            )
-        return partial(
-            _asked, plant, backup, "observation" if isinstance(backup, _PolicyBackup) else self.sees
-        )
-
-    def _first(self, backup: Callable[[View], Array] | None) -> Array:
-        """What a backup would do now, shape (m,)."""
-        return self._last if backup is None else backup(self.plant.view)
+            return np.asarray(backup)
+        sees = "observation" if isinstance(backup, _PolicyBackup) else self.sees
+        return np.asarray(self.plant.control(backup(_seen(sees, view)), "the backup"))
 
     def _firsts(self) -> list[Array]:
         """What the backups would do now that have an answer."""
         found = []
         for backup in self._backups:
             with contextlib.suppress(NotFiniteError):
-                found.append(self._first(backup))
+                found.append(self._control(backup, self.plant.view))
         return found
 
     def plan(self, control: Array) -> Plan:
@@ -205,10 +202,10 @@ class PredictiveShield(Constraint, Model):
             self._known[key] = best
         return self._known[key]
 
-    def _after(self, control: Array, backup: Callable[[View], Array] | None) -> float:
+    def _after(self, control: Array, backup: Any) -> float:
         """The slack of a control with a backup after it; NaN where an h is."""
         plant, terminal = self.plant, self.terminal
-        policy = None if backup is None else lambda view: plant.action(backup(view))
+        policy = None if isinstance(backup, str) else lambda view: plant.action(self._control(backup, view))
         until = None if terminal is None else lambda view: bool(terminal(_seen(self.sees, view)))
         try:
             rollout = plant.rollout(
@@ -241,14 +238,6 @@ class PredictiveShield(Constraint, Model):
 
 def _seen(sees: str, view: View) -> Any:
     return view if sees == "view" else getattr(view, sees)
-
-
-def _constant(control: Array, view: View) -> Array:
-    return np.asarray(control)
-
-
-def _asked(plant: Any, backup: Any, sees: str, view: View) -> Array:
-    return np.asarray(plant.control(backup(_seen(sees, view)), "the backup"))
 
 
 def _checked(backup: Any) -> Any:

@@ -140,7 +140,7 @@ class Traction(Constraint):
             seen.faster = np.maximum(error, _SPEED_ERROR_FADE * seen.faster)
             seen.slower = np.maximum(-error, _SPEED_ERROR_FADE * seen.slower)
             seen.ahead = ground - seen.ground
-            torque = self._wheels.torque(published)
+            torque = published.qfrc_actuator[self._wheels.dofs]
             seen.traction = self.constants.traction(self._response, seen.rate, rate, torque)
             # Below the regularisation the number is no slip ratio, and says nothing about the curve.
             self._learn(ground, slip, across, load, rolls=faster > self.regularization)
@@ -212,19 +212,17 @@ class Traction(Constraint):
 
     def proposals(self, control: Array | None) -> Iterable[Array]:
         """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
-        if control is None:
-            yield self._braking()
-
-    def _braking(self) -> Array:
+        if control is not None:
+            return ()
         if self.seen.rate is None:
-            return np.zeros_like(self.plant.lower)
+            return (np.zeros_like(self.plant.lower),)
         speed = self.seen.ground + self.seen.ahead
         low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
         wanted = np.where(speed > 0.0, low, high)
         # No farther than to a standstill: past it the wheel would drive the other way.
         wanted = np.where(speed > 0.0, np.maximum(wanted, 0.0), np.minimum(wanted, 0.0))
         torque = self._torques(wanted, self.seen.present)
-        return np.asarray(np.linalg.lstsq(self._wheels.effect, torque, rcond=None)[0])
+        return (np.linalg.lstsq(self._wheels.effect, torque, rcond=None)[0],)
 
 
 def _kept_free(error: Array, room: Array) -> Array:

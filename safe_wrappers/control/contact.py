@@ -102,23 +102,13 @@ def peak_force(
     return np.asarray(push + np.hypot(pressed, struck))
 
 
-def speed_limit(force: Numbers, mass: Numbers, stiffness: Numbers) -> Array:
-    """The approach speed whose `peak_force` is F, `F / sqrt(k m)`, shape (...), m/s, of F (N), m (kg) and k (N/m)."""
-    return np.asarray(force / np.sqrt(stiffness * mass))
-
-
-def time_to_peak(mass: Numbers, stiffness: Numbers) -> Array:
-    """From the first touch to the peak without braking, a quarter of a period, shape (...), s, of m (kg), k (N/m)."""
-    return np.asarray(np.pi / 2.0 * np.sqrt(mass / stiffness))
-
-
 def braked_deflection(
     speed: Numbers, mass: Numbers, stiffness: Numbers, braking: Numbers, latency: Numbers = 0.0
 ) -> Array:
     """The first peak of the deflection when a brake works against it, shape (...), m.
 
     With b = m a / k and the unbraked peak `p = v sqrt(m / k)` it is `sqrt(b^2 + p^2 + 2 b p sin(latency sqrt(k / m)))
-    - b`. From the unbraked peak on, at the `time_to_peak`, a brake changes nothing.
+    - b`. From the unbraked peak on, `pi / 2 sqrt(m / k)` after the touch, a brake changes nothing.
 
     Args:
         speed: v at the first touch, m/s.

@@ -99,13 +99,3 @@ class DeadReckoning:
 def lever_arm_velocity(velocity: Array, angular_velocity: Array, arm: Array) -> Array:
     """Velocity of P, m/s, from that of O, and the arm P - O, m, all of shape (..., 3) in the same axes."""
     return np.asarray(velocity + np.cross(angular_velocity, arm))
-
-
-def to_sensor(points: Array, rotation: Array, position: Array) -> Array:
-    """World points (..., 3), m, in the frame of a sensor with a rotation (3, 3) and position (3,) in the world."""
-    return np.asarray((points - position) @ rotation)
-
-
-def from_sensor(points: Array, rotation: Array, position: Array) -> Array:
-    """World points from a sensor's frame, shape (..., 3), m: the inverse of `to_sensor`."""
-    return np.asarray(points @ rotation.T + position)

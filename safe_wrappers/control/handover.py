@@ -112,22 +112,6 @@ def _way(sent: Array, plan: Array, steps: int) -> Array:
     return np.diff(np.concatenate([sent[-1:], plan[: steps + 1]]), axis=0)
 
 
-def _backward_differences(sent: Array) -> list[Array]:
-    """The last command with its first and second backward differences, shape (m,) each; 0 if too little was sent."""
-    return [
-        np.diff(sent[-k - 1 :], n=k, axis=0)[0] if len(sent) > k else np.zeros_like(sent[-1])
-        for k in range(LOOK_BACK)
-    ]
-
-
-def _stream_derivatives(new: Array) -> list[Array]:
-    """A stream, shape (n, m), with its first and second central differences, per control step."""
-    second = np.zeros_like(new)
-    if len(new) > 2:
-        second[1:-1] = np.diff(new, n=2, axis=0)
-    return [new, np.gradient(new, axis=0) if len(new) > 1 else np.zeros_like(new), second]
-
-
 def bridge(sent: Array, new: Array, steps: int, control_dt: float) -> PPoly:
     """The quintic that bridges `steps` commands: of the time since the last command, s, values (m,).
 
@@ -135,10 +119,13 @@ def bridge(sent: Array, new: Array, steps: int, control_dt: float) -> PPoly:
     """
     from scipy.interpolate import BPoly, PPoly
 
-    per_step = control_dt ** -np.arange(3.0)[:, None]
-    before = np.stack(_backward_differences(sent)) * per_step
-    after = np.stack([d[steps] for d in _stream_derivatives(new)]) * per_step
-    bernstein = BPoly.from_derivatives([0.0, (steps + 1) * control_dt], [before, after])
+    per_step, none = control_dt ** -np.arange(3.0)[:, None], np.zeros_like(sent[-1])
+    # Backward differences of what was sent, 0 where too little was; central ones of the stream.
+    before = [np.diff(sent[-k - 1 :], n=k, axis=0)[0] if len(sent) > k else none for k in range(LOOK_BACK)]
+    slope = np.gradient(new, axis=0)[steps] if len(new) > 1 else none
+    bend = np.diff(new[steps - 1 : steps + 2], n=2, axis=0)[0] if 0 < steps < len(new) - 1 else none
+    ends = [np.stack(before) * per_step, np.stack([new[steps], slope, bend]) * per_step]
+    bernstein = BPoly.from_derivatives([0.0, (steps + 1) * control_dt], ends)
     return PPoly.from_bernstein_basis(bernstein)
 
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.errors import Array, ConfigurationError, finite_arrays, float_array, positive
+from safe_wrappers.errors import Array, ConfigurationError, finite_array, float_array, positive
 
 
 def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> tuple[Array, Array]:
@@ -26,7 +26,7 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> tuple[Arra
         flow: v, m/s, of the same shape, positive together with F into the component that u goes into.
         impedance: b > 0, N s/m.
     """
-    f, v = finite_arrays(effort=effort, flow=flow)
+    f, v = finite_array("effort", effort), finite_array("flow", flow)
     b = positive("impedance", impedance, "N s/m")
     root = math.sqrt(2.0 * b)
     return (f + b * v) / root, (f - b * v) / root
@@ -37,7 +37,7 @@ def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) 
 
     All are of one shape (..., m), or numbers; the impedance b is in N s/m, > 0.
     """
-    v, w = finite_arrays(flow=flow, incoming=incoming)
+    v, w = finite_array("flow", flow), finite_array("incoming", incoming)
     b = positive("impedance", impedance, "N s/m")
     root = math.sqrt(2.0 * b)
     return b * v + root * w, root * v + w

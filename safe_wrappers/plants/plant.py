@@ -99,9 +99,6 @@ class Plant(Model):
         """Step the env with what may be executed; what `env.step` returns."""
         return env.step(action)
 
-    def follow(self) -> None:
-        """Read the env's model anew if it has changed; `model_version` counts how often."""
-
     def deviation(self) -> str:
         """How the env's last step was not what was decided, in words; "" if it was, or nothing can be compared.
 
@@ -121,10 +118,6 @@ class Plant(Model):
     def acting_range(self) -> tuple[Array, Array] | None:
         """The controls between which the force still changes, shapes (m,); None: all between the bounds."""
         return None
-
-    def info(self) -> dict[str, Any]:
-        """The info keys of its own, always the same, after what was received last."""
-        return {}
 
     def drift(self, x: Array) -> Array:
         """The drift at any state, shape (n,); by default that of the present one."""

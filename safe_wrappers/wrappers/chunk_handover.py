@@ -255,7 +255,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         if self._apart > 1:
             if self._check is not None and not self._check.bears_knots(chunk, self._apart * self.control_dt):
                 return False
-            chunk = np.clip(upsampled(chunk, self._apart), self._low, self._high)
+            spline = hermite_spline(chunk, float(self._apart))(np.arange(float(self._size)))
+            spline[:: self._apart] = chunk  # bit for bit; between its entries it may overshoot their range
+            chunk = np.clip(spline, self._low, self._high)
         self._coming.append(Chunk(chunk, observed, self._steps_done + delay))
         return True
 
@@ -387,13 +389,3 @@ class Admission:
         if self._rest:
             return transit_time(*motion, *limits) <= duration_s
         return bool(admits(*motion, duration_s, *limits).all())
-
-
-def upsampled(chunk: Array, steps: int) -> Array:
-    """Commands on a cubic Hermite spline through entries (H, m) that lie so many control steps apart.
-
-    Shape ((H - 1) steps + 1, m); at the entries these bit for bit. Between them it may overshoot their range.
-    """
-    commands = hermite_spline(chunk, float(steps))(np.arange((len(chunk) - 1) * steps + 1.0))
-    commands[::steps] = chunk
-    return np.asarray(commands)

@@ -36,6 +36,7 @@ class StepMonitor(LayerWrapper, ABC):
     """Its info key for steps that could not be replayed."""
     nothing: ClassVar[dict[str, Any]]
     """The other info keys, where there was no contact and no motion."""
+    _contacts: ContactReader
 
     def __init__(self, env: Env) -> None:
         LayerWrapper.__init__(self, env)
@@ -53,7 +54,7 @@ class StepMonitor(LayerWrapper, ABC):
         answer = self._pass_on(action)
         raw = self._raw
         self._forget()
-        whole = self._replay.after(lambda data, _: self._visit(data))
+        whole = self._replay.after(lambda data, _: self._contacts.read(data))
         if not whole:
             message = (
                 f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs, state or model "
@@ -62,17 +63,13 @@ class StepMonitor(LayerWrapper, ABC):
             )
             self._warn_once("partial", message)
             self._forget()
-            self._visit(raw.data)
+            self._contacts.read(raw.data)
         answer[4].update(self._figures(raw.data) | {self.partial: not whole})
         return answer
 
     @abstractmethod
     def _forget(self) -> None:
         """Forget what was visited; the env may have made itself another model."""
-
-    @abstractmethod
-    def _visit(self, data: mujoco.MjData) -> None:
-        """Look at one evaluation of the physics."""
 
     @abstractmethod
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
@@ -135,9 +132,6 @@ class ContactMonitor(StepMonitor):
             self._contacts = ContactReader(self._model, between(self._model, self.bodies, self.against))
         self._contacts.clear()
         self.peak_bodies = None
-
-    def _visit(self, data: mujoco.MjData) -> None:
-        self._contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
         found = self._contacts.found()
@@ -231,9 +225,6 @@ class BalanceMonitor(StepMonitor):
         if self._model is not self._raw.model:
             self._take(self.bodies)
         self._contacts.clear()
-
-    def _visit(self, data: mujoco.MjData) -> None:
-        self._contacts.read(data)
 
     def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
         figures: dict[str, Any] = copy.deepcopy(self.nothing)

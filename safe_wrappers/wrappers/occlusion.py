@@ -11,13 +11,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.control.dead_reckoning import (
-    DeadReckoning,
-    from_sensor,
-    lever_arm_velocity,
-    rigid_transform,
-    to_sensor,
-)
+from safe_wrappers.control.dead_reckoning import DeadReckoning, lever_arm_velocity, rigid_transform
 from safe_wrappers.control.estimation import Motion, Tracks, largest_deviation, unobservable_states
 from safe_wrappers.errors import (
     Array,
@@ -187,7 +181,8 @@ class Sensor:
             believed = ego.position + turned @ (eye - body)
         parts = []
         if self.position_std is not None:
-            parts.append(from_sensor(to_sensor(truth, axes, eye), turned @ axes, believed)[:, :d])
+            seen = (truth - eye) @ axes  # in the sensor's frame
+            parts.append((seen @ (turned @ axes).T + believed)[:, :d])
         if velocities is not None:
             linear, angular = sight.velocity(sight.body)
             apparent = velocities - lever_arm_velocity(linear, angular, eye - body)[:d]

@@ -5,7 +5,7 @@ from typing import Any
 
 from safe_wrappers import constraints
 from safe_wrappers.constraints.obstacles import KINDS as OBSTACLES
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, settings_from
+from safe_wrappers.errors import of_kind
 from safe_wrappers.filter.constraint import Constraint
 
 _EXPORTED = [getattr(constraints, name) for name in constraints.__all__ if name != "Constraint"]
@@ -18,14 +18,7 @@ def constraint_from(data: Any) -> Constraint:
     """A constraint itself, or rebuilt from its `plain_data`."""
     if isinstance(data, Constraint):
         return data
-    if not isinstance(data, dict):
-        raise ConfigurationError(
-            f"expected a constraint (an instance of a subclass of sw.Constraint) or the dict of one; got {data!r}"
-        )
-    kind = data.get("kind", "")
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise UnknownNameError(f"unknown constraint kind {kind!r}; the kinds are {', '.join(KINDS)}")
-    return settings_from(KINDS[kind], {k: v for k, v in data.items() if k != "kind"}, kind)
+    return of_kind(KINDS, data, "a constraint (an instance of a subclass of sw.Constraint)")
 
 
 def plain_data(value: Any) -> Any:

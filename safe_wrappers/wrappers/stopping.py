@@ -31,15 +31,6 @@ _ROW_TOLERANCE = 1e-9
 """Control units times normals: a row that is violated by less is kept."""
 
 
-_CHECKS: Final = (
-    (["delays_s"], non_negative, "s"),
-    (["acceleration"], non_negative, "m/s^2"),
-    (["braking"], positive, "m/s^2"),
-    (["top_speed"], positive, "m/s"),
-    (["closing_speed"], positive, "the constraint's unit per second"),
-)
-
-
 @dataclass(frozen=True)
 class StoppingBudget:
     """Clearance, bounds on the motion and delays from which a stop is worked out; shared by lease and ceiling.
@@ -77,8 +68,11 @@ class StoppingBudget:
                 "clearance is a constraint, or a function of the env that returns clearances in m and approach "
                 f"speeds in m/s; got {given!r}"
             )
-        for names, check, unit in _CHECKS:
-            check_fields(self, check, names, unit)
+        check_fields(self, non_negative, ["delays_s"], "s")
+        check_fields(self, non_negative, ["acceleration"], "m/s^2")
+        check_fields(self, positive, ["braking"], "m/s^2")
+        check_fields(self, positive, ["top_speed"], "m/s")
+        check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
         takes, more = {"closing_speed"}, set()
         if self.measures_approach:
             takes, more = {"acceleration"}, {"top_speed"}

@@ -92,6 +92,7 @@ MADE = [
     (of.CoastingClearance, {"keep_out": []}, "keep_out .* or untouched"),
     (of.CoastingClearance, {"keep_out": [of.Plane([0.0], [1.0])]}, "holds Disc and Discs, got Plane"),
     (of.CoastingClearance, {"keep_out": [of.Discs("a", 1.0, "v")]}, "past discs that stand still"),
+    (of.HeadingDriveClearance, {"obstacles": [of.Discs("a", 1.0, "v")]}, "past discs that stand still"),
     (of.CoastingClearance, {"untouched": [DISC]}, "untouched needs the machine's outline"),
     (of.CoastingClearance, {"outline": SQUARE}, "keep_out is for the body's origin alone"),
     (of.CoastingClearance, {"untouched": [DISC], "outline": SQUARE[:2]}, "not on one line"),

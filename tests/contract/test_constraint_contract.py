@@ -10,7 +10,7 @@ from gymnasium.envs.registration import EnvSpec
 
 import safe_wrappers as sw
 from safe_wrappers import constraints as of
-from safe_wrappers.constraints.obstacles import obstacle_from
+from safe_wrappers.constraints.obstacles import obstacles_from
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.wrappers.serialize import constraint_from, plain_data
 
@@ -78,7 +78,7 @@ def test_every_argument_is_given_another_value_than_its_own_somewhere():
 
 @given
 def test_it_survives_json(given):
-    again = constraint_from if isinstance(given, sw.Constraint) else obstacle_from
+    again = constraint_from if isinstance(given, sw.Constraint) else lambda data: obstacles_from([data])[0]
     rebuilt = again(json.loads(json.dumps(plain_data(given))))
     assert rebuilt == given and type(rebuilt) is type(given)
     with pytest.raises(UnknownNameError, match="no_such"):

@@ -3,7 +3,6 @@
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -11,10 +10,8 @@ from scipy.spatial.transform import Rotation
 from safe_wrappers.control.dead_reckoning import (
     DeadReckoning,
     centre_acceleration,
-    from_sensor,
     lever_arm_velocity,
     rigid_transform,
-    to_sensor,
 )
 
 THROWN = """
@@ -53,18 +50,6 @@ def test_lever_arms_are_those_of_mujocos_sensors(seed):
     found = centre_acceleration(force + model.opt.gravity, rate, speeding, arm)
     np.testing.assert_allclose(found, data.qacc[:3], atol=1e-10)
     assert np.linalg.norm(velocity - data.qvel[:3]) > 0.1 and np.linalg.norm(force - found) > 0.5
-
-
-@given(arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), VECTORS, VECTORS, VECTORS)
-def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
-    body = rigid_transform(Rotation.from_rotvec(rotvec).as_matrix(), position)
-    mount = rigid_transform(Rotation.from_rotvec(mounted).as_matrix(), 0.1 * mounted)
-    pose = body * mount
-    rotation, origin = pose.rotation.as_matrix(), pose.translation
-    seen = to_sensor(points, rotation, origin)
-    np.testing.assert_allclose(seen, pose.inv().apply(points), atol=1e-12)
-    np.testing.assert_allclose(from_sensor(seen, rotation, origin), points, atol=1e-12)
-    np.testing.assert_allclose(to_sensor(points[2], rotation, origin), seen[2], atol=1e-14)
 
 
 def test_mujocos_readings_lead_to_mujocos_motion():

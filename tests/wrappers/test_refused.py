@@ -90,7 +90,7 @@ REFUSED = [
     bad("BalanceMonitor", "of this model can touch", UnsupportedEnvError, on=bare("Reacher-v5")),
     bad("CBFActionFilter", "constraints is a list with at least one, got", constraints=[]),
     bad("CBFActionFilter", "expected a constraint .* got 3", constraints=[3]),
-    bad("CBFActionFilter", "unknown constraint kind 'Wall'", UnknownNameError, constraints=[{"kind": "Wall"}]),
+    bad("CBFActionFilter", "unknown kind 'Wall'", UnknownNameError, constraints=[{"kind": "Wall"}]),
     bad("CBFActionFilter", "margin", margin=-0.1),
     bad("CBFActionFilter", CHANGES, on=reacher(lambda env: gym.wrappers.StickyAction(env, 0.5))),
     bad("CBFActionFilter", CHANGES, on=reacher(lambda env: gym.wrappers.MaxAndSkipObservation(env, skip=4))),

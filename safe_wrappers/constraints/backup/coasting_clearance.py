@@ -81,10 +81,11 @@ class CoastingClearance(Detour, Model):
 
     def __post_init__(self) -> None:
         for name in ("keep_out", "untouched"):
-            found = obstacles_from(getattr(self, name), name, kinds=(Disc, Discs), optional=True)
-            if any(getattr(obstacle, "velocity_attribute", None) is not None for obstacle in found):
-                raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
-            setattr(self, name, found)
+            setattr(
+                self,
+                name,
+                obstacles_from(getattr(self, name), name, (Disc, Discs), optional=True, still=True),
+            )
         self.detour = true_or_false("detour", self.detour)
         if not (self.keep_out or self.untouched):
             raise ConfigurationError("give obstacles in keep_out (for the origin) or untouched (the outline)")

@@ -65,7 +65,11 @@ class HeadingDriveClearance(Detour, Model):
 
     def __post_init__(self) -> None:
         for name in ("obstacles", "untouched"):
-            setattr(self, name, obstacles_from(getattr(self, name), name, (Disc, Discs), optional=True))
+            setattr(
+                self,
+                name,
+                obstacles_from(getattr(self, name), name, (Disc, Discs), optional=True, still=True),
+            )
         if not (self.obstacles or self.untouched):
             raise ConfigurationError("give obstacles (for the axis) or untouched (for the robot's parts)")
         parts = finite_array("parts", self.parts)

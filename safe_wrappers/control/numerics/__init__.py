@@ -1,1 +1,1 @@
-"""Series, polynomials, matrix exponentials, rotations, geometry, cone programs."""
+"""Shapes in the plane."""

@@ -96,10 +96,6 @@ class DrivenWheels:
                 loads[wheel] += self._force[0] * abs(float(data.contact.frame[contact, 2]))
         return loads
 
-    def torque(self, data: mujoco.MjData) -> Array:
-        """Torque of the drives, shape (n,), N m, in an env's last physics substep."""
-        return np.asarray(data.qfrc_actuator[self.dofs])
-
 
 def _round_geom(plant: MujocoPlant, joint: int) -> int:
     m = plant.model

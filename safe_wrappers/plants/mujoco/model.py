@@ -2,7 +2,6 @@
 
 import operator
 from collections.abc import Sequence
-from fnmatch import fnmatchcase
 from typing import Any, Final, Self
 
 import mujoco
@@ -52,11 +51,11 @@ def named(model: mujoco.MjModel, kind: str, name: str, argument: str = "") -> in
     return int(found)
 
 
-def names(model: mujoco.MjModel, kind: str, pattern: str = "*") -> list[str]:
-    """All names of a kind that match a shell pattern."""
+def names(model: mujoco.MjModel, kind: str) -> list[str]:
+    """All names of a kind."""
     count = {"body": "nbody", "joint": "njnt", "actuator": "nu", "camera": "ncam"}.get(kind, f"n{kind}")
     every = (getattr(model, kind)(i).name for i in range(getattr(model, count)))
-    return [n for n in every if n and fnmatchcase(n, pattern)]
+    return [n for n in every if n]
 
 
 def frame(

@@ -275,9 +275,9 @@ class MujocoPlant(Plant):
         """
         return of_model.named(self.model, kind, name, argument)
 
-    def names(self, kind: str, pattern: str = "*") -> list[str]:
-        """All names of a kind that match a shell pattern."""
-        return of_model.names(self.model, kind, pattern)
+    def names(self, kind: str) -> list[str]:
+        """All names of a kind."""
+        return of_model.names(self.model, kind)
 
     def forward(self) -> mujoco.MjData:
         """The plant's data with every derived quantity up to date at the present state.
