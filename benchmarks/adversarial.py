@@ -14,23 +14,18 @@ import itertools
 import multiprocessing
 import warnings
 from collections import Counter
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks import car_drivers, drivers
+from benchmarks.cases import CASES, driven
 from benchmarks.judges import counted
-from benchmarks.tables import keep, markdown, options, total
+from benchmarks.tables import keep, made, markdown, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
-DRIVERS = {"point": drivers.DRIVERS, "car": car_drivers.DRIVERS}
 
-
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One driver on one level for so many steps."""
 
     level: int
@@ -46,37 +41,34 @@ class Job:
 def run(job: Job) -> dict[str, Any]:
     """Drive, count, and say what it cost."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted below
-    env: Any = gym.make(f"Safe{job.robot.capitalize()}Goal{job.level}-v0")
+    case = CASES[f"Safe{job.robot.capitalize()}Goal{job.level}-v0"]
+    env: Any = case.make()
     if job.filtered:
         plant = sw.MujocoPlant()
         plant.perturb(mass=job.mass, damping=job.damping)
         # True is the plant's times 1 / factor: 0.8 needs 25 % of uncertainty, 1.2 needs 17 %.
         wrong = {} if job.mass == job.damping == 1.0 else {"uncertainty": 0.25}
         env = sw.protect(env, plant=plant, **wrong)
-    raw = env.unwrapped
-    driver = DRIVERS[job.robot][job.driver](raw, np.random.default_rng(job.seed))
     count = Counter[str]()
     returns: list[float] = []
-    total, lowest, episode = 0.0, np.inf, job.seed * 100_000
-    env.reset(seed=episode)
-    for _ in range(job.steps):
-        _, reward, _, truncated, info = env.step(driver())
-        total += float(reward)
-        count.update(counted(info, info["cost_substep"] > 0.0))
+    total, lowest = 0.0, np.inf
+    steps = driven(case, env, job.driver, job.steps, job.seed, job.seed * 100_000)
+    for _, reward, info, violated, over in steps:
+        total += reward
+        count.update(counted(info, violated))
         if job.filtered:
             lowest = min(lowest, info["cbf/margin"])
-        if truncated:
+        if over:
             returns.append(total)
-            total, episode = 0.0, episode + 1
-            env.reset(seed=episode)
+            total = 0.0
     mean = {"return_mean": float(np.mean(returns)) if returns else None}
-    return {**asdict(job), **count, **mean, "margin_min_m": float(lowest) if job.filtered else None}
+    return {**job._asdict(), **count, **mean, "margin_min_m": float(lowest) if job.filtered else None}
 
 
 def jobs(arguments: argparse.Namespace) -> list[Job]:
     """What to run."""
     robot = arguments.robot
-    levels, names = (1, 2), list(DRIVERS[robot])
+    levels, names = (1, 2), list(CASES[f"Safe{robot.capitalize()}Goal1-v0"].drivers)
     steps = arguments.steps // len(names)
     if arguments.mismatch:
         wrong = list(itertools.product((0.8, 1.2), repeat=2))
@@ -119,8 +111,7 @@ def main() -> None:
     )
     if given.mismatch and given.robot != "point":
         raise SystemExit("--mismatch is for the point: the car's filter declares no uncertainty")
-    with multiprocessing.get_context("spawn").Pool(given.workers) as pool:
-        rows = pool.map(run, jobs(given), chunksize=1)
+    rows = list(made(run, jobs(given), given.workers))
     name = "mismatch" if given.mismatch else "off" if given.off else "filtered"
     keep(
         f"adversarial_{name}" if given.robot == "point" else f"adversarial_{given.robot}_{name}", table(rows)

@@ -20,7 +20,7 @@ from safe_wrappers.train.files import read_json
 from safe_wrappers.train.policies import CARD, load_policy, write_card
 from safe_wrappers.train.run.folder import POLICY
 from safe_wrappers.train.run.model import new_model
-from safe_wrappers.train.run.policy import CONFIG, SpacesEnv, write_policy
+from safe_wrappers.train.run.policy import CONFIG, write_policy
 
 
 def main() -> None:
@@ -28,10 +28,10 @@ def main() -> None:
     arguments = options(__doc__, run=Path, to=Path)
     run, to = arguments.run, arguments.to
     trained = load_policy(run / POLICY, other_filter=True)
-    arm, spaces = trained.arm, SpacesEnv(trained.model.observation_space, trained.model.action_space)
+    arm, space = trained.arm, trained.model.observation_space
     sb3 = replace(arm, algorithm="SAC")
     config = read_json(run / POLICY / CONFIG)
-    model: Any = new_model(sb3, config["seed"], DummyVecEnv([lambda: spaces]))
+    model: Any = new_model(sb3, config["seed"], DummyVecEnv([trained.make_env]))
     model.num_timesteps = config["timesteps"]
     layers = trained.model.policy.actor_state.params["params"]
     hidden = [layer for layer in model.actor.latent_pi if isinstance(layer, torch.nn.Linear)]
@@ -42,8 +42,8 @@ def main() -> None:
             )
             layer.weight.copy_(kernel.T)
             layer.bias.copy_(bias)
-    spaces.observation_space.seed(0)
-    seen = np.stack([spaces.observation_space.sample() for _ in range(1000)])
+    space.seed(0)
+    seen = np.stack([space.sample() for _ in range(1000)])
     here, there = (policy.predict(seen, deterministic=True)[0] for policy in (model, trained.model))
     print(f"over 1,000 observations an action component differs by {np.abs(here - there).max():.1g} at most")
     with TemporaryDirectory() as made:

@@ -1,6 +1,6 @@
 """The filter, the judge and the drivers of each row in docs/results/standard-envs.md."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from benchmarks import mujoco_drivers as drivers
 from benchmarks.car_drivers import DRIVERS as CAR_GOAL
 from benchmarks.drivers import CROSSING, PATROLLED, Maker
 from benchmarks.drivers import DRIVERS as POINT_GOAL
-from benchmarks.judges import Judge, Replay, Reported, Worst
+from benchmarks.judges import Judge, Replay, Reported
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
 from safe_wrappers.wrappers.recipes import SHADOW_HAND_TIED
 
@@ -55,6 +55,27 @@ class Case:
 
             gym.register_envs(gymnasium_robotics)
         return gym.make(self.env_id, max_episode_steps=self.max_episode_steps, render_mode=render_mode)
+
+
+def driven(
+    case: Case, env: gym.Env[Any, Any], driver: str, steps: int, seed: int, episode: int
+) -> Iterator[tuple[Any, float, dict[str, Any], bool, bool]]:
+    """Drives a case's env, filtered or not, and judges: action, reward, info, violation and end of each step.
+
+    Resets have the seeds from `episode` on; one that is in violation itself is left out.
+    """
+    judge, over = case.judge(env.unwrapped), True
+    act = case.drivers[driver](env.unwrapped, np.random.default_rng(seed))
+    for _ in range(steps):
+        while over:
+            env.reset(seed=episode)
+            over, episode = not judge.start() <= 0.0, episode + 1
+        action = np.asarray(act(), dtype=env.action_space.dtype)
+        judge.before()
+        _, reward, terminated, truncated, info = env.step(action)
+        missed = judge.after(info.get("executed_action", action), info)
+        over = bool(truncated or (terminated and not case.past_termination))
+        yield action, float(reward), info, not missed <= 0.0, over  # what is not a number is a violation
 
 
 def crossing(env: gym.Env[Any, Any], tolerance: float = 0.5) -> sw.OcclusionPenalty:
@@ -152,12 +173,13 @@ def _goal_task(robot: str, level: int, known: dict[str, Maker]) -> Case:
     )
 
 
-def _point_maze(maze: str) -> Case:
-    def judge(env: Any) -> Judge:
-        touch = judges.touches_wall(env.model, "particle_geom")
-        return Replay(env, touch, prepare=judges.clip_speed(5.0))
+def _touches_no_wall(env: Any, **more: Any) -> Judge:
+    truth = judges.touches_wall(env.model, "particle_geom")
+    return Replay(env, truth, prepare=judges.clip_speed(5.0), **more)
 
-    return Case(f"PointMaze_{maze}-v3", judge=judge, drivers=_BLIND | {"wall-seeking": drivers.wall_seeking})
+
+def _point_maze(maze: str) -> Case:
+    return Case(f"PointMaze_{maze}-v3", _touches_no_wall, _BLIND | {"wall-seeking": drivers.wall_seeking})
 
 
 def _fallen(env_id: str) -> Case:
@@ -223,7 +245,7 @@ PROTECTED: dict[str, Case] = _by_name(
     _point_maze("UMaze"),
     Case(
         "PatrolledPointMaze-v0",
-        judge=lambda env: Worst(_point_maze("UMaze").judge(env), Reported(judges.costs)),
+        judge=lambda env: _touches_no_wall(env, reported=judges.costs),
         drivers=_BLIND | PATROLLED,
         protect=lambda env: sw.protect(patrolled(env)),
     ),
@@ -237,7 +259,7 @@ PROTECTED: dict[str, Case] = _by_name(
         },
     ),
     *(
-        Case(f"Fetch{task}-v4", fetch.FetchJudge, fetch.drivers(ball=False))
+        Case(f"Fetch{task}-v4", fetch.FetchJudge, fetch.DRIVERS)
         for task in ("Reach", "Push", "Slide", "PickAndPlace")
     ),
     _hand("HandReach-v3", 3.0, also=tuple(SHADOW_HAND_TIED)),

@@ -19,10 +19,10 @@ import os
 import platform
 import warnings
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
@@ -55,8 +55,7 @@ TOGETHER = 16
 _VERSIONS = ("safe-wrappers", "mujoco", "gymnasium", "gymnasium-robotics", "numpy", "numba", "torch")
 
 
-@dataclass(frozen=True)
-class Chunk:
+class Chunk(NamedTuple):
     """One driver on one env for about so many steps."""
 
     env: str
@@ -110,7 +109,7 @@ def run(chunk: Chunk) -> dict[str, Any]:
     process = f"{os.getpid()} of {Path('/proc/self/stat').read_text().split()[21]}"
     known = [f"{name} {importlib.metadata.version(name)}" for name in _VERSIONS]
     versions = ", ".join([f"Python {platform.python_version()}", *known])
-    return asdict(chunk) | row | {"mb": used_mb(), "process": process, "versions": versions}
+    return chunk._asdict() | row | {"mb": used_mb(), "process": process, "versions": versions}
 
 
 def attack(chunk: Chunk) -> dict[str, Any]:

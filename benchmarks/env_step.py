@@ -30,13 +30,7 @@ def gentle(env: Any, rng: np.random.Generator) -> Driver:
 
 def slower(limit: float) -> Filter:
     """`protect`'s constraint with a lower speed limit, m/s."""
-
-    def protect(env: gym.Env[Any, Any]) -> sw.CBFActionFilter:
-        (speed,) = sw.protect(env).constraints
-        assert isinstance(speed, sw.constraints.SpeedLimit)
-        return sw.CBFActionFilter(env, [replace(speed, limit=limit)])
-
-    return protect
+    return lambda env: sw.CBFActionFilter(env, [replace(sw.protect(env).constraints[0], limit=limit)])
 
 
 SEEKING = DRIVERS["hazard-seeking"]

@@ -186,49 +186,40 @@ def _in_the_table(env: Any, rng: np.random.Generator) -> Action:
     return np.asarray(point)
 
 
-def _in_the_ball(env: Any, rng: np.random.Generator) -> Action:
+def in_the_ball(env: Any, rng: np.random.Generator) -> Action:
     """Near the ball's centre; now and then away, to come back from elsewhere."""
     low, high = box_of(env)
     centre, _ = ball_of(env)
     return np.asarray(centre + rng.uniform(-0.03, 0.03, 3) if rng.random() < 0.7 else rng.uniform(low, high))
 
 
-def margin_reading(ball: bool) -> Maker:
+@stepwise
+def margin_reading(env: Any, rng: np.random.Generator) -> Iterator[Action]:
     """Knows the filter: of random actions, the one that it would still admit, and hardly.
 
     So it rides along the edges of what is admitted, as fast as that goes, to where the next step is left least.
-
-    Args:
-        ball: Whether the filter keeps the fingers out of the ball, too.
     """
+    plant = sw.plants.DisplacementPlant()
+    plant.bind(env)
+    bound = [Bound(constraint, plant) for constraint in RECIPES[env.spec.id.rpartition("-v")[0]](env)]
+    way = rng.normal(size=3)
 
-    @stepwise
-    def read(env: Any, rng: np.random.Generator) -> Iterator[Action]:
-        recipe = RECIPES[env.spec.id.rpartition("-v")[0]]
-        constraints: list[Any] = recipe(env, keep_out=obstacles(env) if ball else [])
-        plant = sw.plants.DisplacementPlant()
-        plant.bind(env)
-        bound = [Bound(constraint, plant) for constraint in constraints]
-        way = rng.normal(size=3)
+    def left(action: Action) -> float:
+        return float(min(c.slacks(action).min() for c in bound))
 
-        def left(action: Action) -> float:
-            return float(min(c.slacks(action).min() for c in bound))
-
-        while True:
-            plant.observe()
-            for c in bound:
-                c.observe({})  # nobody says when an episode begins
-            if rng.random() < 0.04:
-                way = rng.normal(size=3)
-            fingers = rng.choice([-1.0, 1.0])
-            noisy = 3.0 * (way + 0.7 * rng.normal(size=3))
-            tries = [np.append(np.clip(noisy, -1.0, 1.0), fingers)]
-            tries += [np.where(rng.random(4) < 0.5, -1.0, 1.0) for _ in range(2)]
-            found = [(left(action), k) for k, action in enumerate(tries)]
-            admitted = [pair for pair in found if pair[0] >= 0.0]
-            yield tries[min(admitted)[1] if admitted else max(found)[1]]
-
-    return read
+    while True:
+        plant.observe()
+        for c in bound:
+            c.observe({})  # nobody says when an episode begins
+        if rng.random() < 0.04:
+            way = rng.normal(size=3)
+        fingers = rng.choice([-1.0, 1.0])
+        noisy = 3.0 * (way + 0.7 * rng.normal(size=3))
+        tries = [np.append(np.clip(noisy, -1.0, 1.0), fingers)]
+        tries += [np.where(rng.random(4) < 0.5, -1.0, 1.0) for _ in range(2)]
+        found = [(left(action), k) for k, action in enumerate(tries)]
+        admitted = [pair for pair in found if pair[0] >= 0.0]
+        yield tries[min(admitted)[1] if admitted else max(found)[1]]
 
 
 def obstacles(env: Any) -> list[sw.constraints.Sphere]:
@@ -237,15 +228,12 @@ def obstacles(env: Any) -> list[sw.constraints.Sphere]:
     return [sw.constraints.Sphere(centre.tolist(), radius)]
 
 
-def drivers(ball: bool) -> dict[str, Maker]:
-    """By name."""
-    known: dict[str, Maker] = {
-        "random": mujoco_drivers.random,
-        "bang-bang": mujoco_drivers.bang_bang,
-        "pulse": mujoco_drivers.pulse,
-        "corner-seeking": seeking(_beyond_a_corner, 30),
-        "side-seeking": seeking(_beyond_a_side, 20),
-        "table-seeking": seeking(_in_the_table, 12),
-        "margin-reading": margin_reading(ball),
-    }
-    return known | ({"ball-seeking": seeking(_in_the_ball, 12)} if ball else {})
+DRIVERS: dict[str, Maker] = {
+    "random": mujoco_drivers.random,
+    "bang-bang": mujoco_drivers.bang_bang,
+    "pulse": mujoco_drivers.pulse,
+    "corner-seeking": seeking(_beyond_a_corner, 30),
+    "side-seeking": seeking(_beyond_a_side, 20),
+    "table-seeking": seeking(_in_the_table, 12),
+    "margin-reading": margin_reading,
+}

@@ -1,10 +1,10 @@
 """Golden traces: what every protected env did, step by step, before a change, compared with today.
 
-    python -m benchmarks.golden_traces                    # bit for bit: all runs of tests/data/golden_traces.json
-    python -m benchmarks.golden_traces --behaviour        # what the filter did in each run, within a tolerance
-    python -m benchmarks.golden_traces --envs Reacher     # of the envs whose name has one of these words
-    python -m benchmarks.golden_traces --short            # three envs, one seed: the default tests
-    python -m benchmarks.golden_traces --write            # records what is compared from now on
+    python -m benchmarks golden_traces                    # bit for bit: all runs of tests/data/golden_traces.json
+    python -m benchmarks golden_traces --behaviour        # what the filter did in each run, within a tolerance
+    python -m benchmarks golden_traces --envs Reacher     # of the envs whose name has one of these words
+    python -m benchmarks golden_traces --short            # three envs, one seed: the default tests
+    python -m benchmarks golden_traces --write            # records what is compared from now on
 
 Each env runs under a random and an attacking driver, two seeds, 500 control steps each. Recorded are observation,
 reward, end of episode, executed action and every number in `info`: not themselves but chained digests of 50 steps
@@ -20,12 +20,10 @@ before where each of them is within `TOLERANCES` (relative, absolute) plus the d
 of the same driver with other seeds, which is what chance alone changes. What is beyond is listed.
 """
 
-import argparse
 import hashlib
 import importlib.metadata
 import json
 import math
-import multiprocessing
 import os
 import subprocess
 import sys
@@ -41,6 +39,7 @@ import safe_wrappers as sw
 from benchmarks import mujoco_drivers as drivers
 from benchmarks.cases import CASES, PROTECTED, Case
 from benchmarks.mujoco_drivers import Maker
+from benchmarks.tables import made, options
 from safe_wrappers.envs.teleop_contact import (
     CLAMP_Y,
     TELEOP_ACCELERATION,
@@ -227,14 +226,6 @@ def _job(job: tuple[str, str, int]) -> tuple[str, dict[str, Any]]:
     return f"{name}; {driver}; seed {seed}", trace(make, by_name[driver], seed, case)
 
 
-def _made(jobs: list[tuple[str, str, int]], workers: int) -> Iterator[tuple[str, dict[str, Any]]]:
-    if workers == 1:  # here: another process would only import everything once more
-        yield from map(_job, jobs)
-        return
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        yield from pool.imap(_job, jobs)
-
-
 def arithmetic() -> dict[str, str]:
     """What decides about the last bits: the libraries' versions, and a probe of what they compute."""
     libraries = (
@@ -302,54 +293,40 @@ def misbehaviour(recorded: Mapping[str, Any], today: Mapping[str, Any]) -> list[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="golden_traces", description=__doc__.splitlines()[0])
-    parser.add_argument("--write", action="store_true", help="record instead of comparing")
-    parser.add_argument("--behaviour", action="store_true", help="compare what the filter did, not bits")
-    parser.add_argument("--short", action="store_true", help=f"only {', '.join(SHORT)}, one seed")
-    parser.add_argument(
-        "--envs", nargs="+", metavar="WORD", help="only envs whose name has one of these words"
-    )
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--recorded", type=Path, default=RECORDED, help="the file (default: %(default)s)")
-    arguments = parser.parse_args()
+    given = options(__doc__, write=False, behaviour=False, short=False, envs=[], workers=os.cpu_count() or 1)
     if any(os.environ.get(name) != value for name, value in SAME_BITS.items()):
-        words = [sys.executable, "-W", "ignore", "-m", "benchmarks.golden_traces", *sys.argv[1:]]
+        words = [sys.executable, "-W", "ignore", "-m", "benchmarks", "golden_traces", *sys.argv[1:]]
         sys.exit(subprocess.run(words, env=os.environ | SAME_BITS).returncode)
     chosen = [
         name
         for name in runs()
-        if (not arguments.short or name in SHORT)
-        and (not arguments.envs or any(word in name for word in arguments.envs))
+        if (not given.short or name in SHORT) and (not given.envs or any(word in name for word in given.envs))
     ]
     if not chosen:
-        parser.error(f"no env has one of these words; there are: {'; '.join(runs())}")
-    kept = json.loads(arguments.recorded.read_text()) if arguments.recorded.exists() else {}
+        raise SystemExit(f"no env has one of these words; there are: {'; '.join(runs())}")
+    kept = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}
     here = arithmetic()
-    if not (arguments.write or arguments.behaviour) and kept.get("arithmetic") != here:
+    if not (given.write or given.behaviour) and kept.get("arithmetic") != here:
         print(f"not comparable: recorded with {kept.get('arithmetic')}, this is {here}")
         sys.exit(NOT_COMPARABLE)
-    seeds = SEEDS[: 1 if arguments.short else None]
+    seeds = SEEDS[: 1 if given.short else None]
     jobs = [(name, driver, seed) for name in chosen for driver in runs()[name][1] for seed in seeds]
     today: dict[str, Any] = {}
-    for run, found in _made(jobs, arguments.workers):
+    for run, found in made(_job, jobs, given.workers):
         today[run] = found
         if sys.stderr.isatty():
             print(f"{len(today)} of {len(jobs)}: {run}", file=sys.stderr)
-    if arguments.write:
+    if given.write:
         same = kept.get("arithmetic") == here
         whole = len(chosen) == len(runs())
         runs_kept = (kept.get("runs", {}) if same and not whole else {}) | today
         text = json.dumps({"arithmetic": here, "runs": dict(sorted(runs_kept.items()))}, indent=1)
-        arguments.recorded.write_text(text + "\n")
-        print(f"{len(today)} runs of {STEPS} steps recorded in {arguments.recorded}")
+        RECORDED.write_text(text + "\n")
+        print(f"{len(today)} runs of {STEPS} steps recorded in {RECORDED}")
         return
-    if arguments.behaviour:
+    if given.behaviour:
         found, equal = misbehaviour(kept["runs"], today), "behave as recorded, within the tolerance"
     else:
         found, equal = differences(kept["runs"], today), "are equal bit for bit"
     print("\n".join(found) if found else f"{len(today)} runs of {STEPS} steps {equal}")
     sys.exit(1 if found else 0)
-
-
-if __name__ == "__main__":
-    main()

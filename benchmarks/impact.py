@@ -11,9 +11,8 @@ normal force of any physics substep. The filter keeps 2 % of the limit as its ma
 import itertools
 import multiprocessing
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import mujoco
@@ -159,8 +158,7 @@ def actions(name: str, raw: ArmAndWall, rng: np.random.Generator) -> Iterator[np
                 yield direction * effect / max(float(np.abs(effect).max()), 1e-9)
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A block of approaches."""
 
     limited: bool
@@ -194,7 +192,7 @@ def run(job: Job) -> dict[str, Any]:
             counts["touched"] += peak > 0.0
             counts["exceeded"] += peak > limit
             shares.append(peak / limit)
-    return asdict(job) | counts | {"approaches": BLOCK, "share_sum": sum(shares), "share_max": max(shares)}
+    return job._asdict() | counts | {"approaches": BLOCK, "share_sum": sum(shares), "share_max": max(shares)}
 
 
 def table(rows: list[dict[str, Any]]) -> str:

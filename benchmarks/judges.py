@@ -74,6 +74,7 @@ class Replay(Judge):
         truth: Evaluated on the states.
         prepare: What the env does to its data at the start of a step, before it sets the control.
         control: The control that the env makes of an action; None: the action itself.
+        reported: By how much the info of a step says that the env misses something else, whose sign counts.
 
     Raises:
         RuntimeError: The replay does not end in the env's own state, bit for bit.
@@ -85,8 +86,10 @@ class Replay(Judge):
         truth: Truth,
         prepare: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None,
         control: Callable[[np.ndarray], np.ndarray] | None = None,
+        reported: Callable[[dict[str, Any]], float] = lambda info: -np.inf,
     ) -> None:
         self._env, self._truth, self._prepare, self._control = env, truth, prepare, control
+        self._reported = reported
         self._model: mujoco.MjModel = env.model
         self._data = mujoco.MjData(self._model)
         self._state = np.zeros(mujoco.mj_stateSize(self._model, _STATE))
@@ -108,7 +111,7 @@ class Replay(Judge):
             self._prepare(model, data)
         there = self._env.data
         data.ctrl[:] = executed if self._control is None else self._control(executed)
-        missed = []
+        missed = [self._reported(info)]
         for _ in range(round((there.time - data.time) / model.opt.timestep)):
             mujoco.mj_step(model, data)
             missed.append(self._present())
@@ -221,28 +224,6 @@ def near_wall(model: mujoco.MjModel, body: str, distance: float) -> Truth:
 def wall_geoms(model: mujoco.MjModel) -> np.ndarray:
     """Indices of the boxes that stand in the world."""
     return np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX)))
-
-
-class Worst(Judge):
-    """Several judges at once: the one that is most displeased.
-
-    Args:
-        judges: At least one, in the same unit or at least with the same sign.
-    """
-
-    def __init__(self, *judges: Judge) -> None:
-        self._judges = judges
-
-    def start(self) -> float:
-        return float(np.max([judge.start() for judge in self._judges]))
-
-    def before(self) -> None:
-        for judge in self._judges:
-            judge.before()
-
-    def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
-        """The largest; not a number if one of them is not."""
-        return float(np.max([judge.after(executed, info) for judge in self._judges]))
 
 
 def faster_than(limit: float, plane: bool) -> Callable[[dict[str, Any]], float]:

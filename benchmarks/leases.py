@@ -18,8 +18,8 @@ under one that is 5 % longer. Clearances are drawn so that a lease is a whole nu
 import math
 import multiprocessing
 from collections import deque
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 from unittest import mock
 
 import gymnasium as gym
@@ -266,8 +266,7 @@ def worst_case(longer: float, seed: tuple[int, ...]) -> dict[str, Any]:
     return found | {"seconds": steps * HOLD_S, "braked": 0, "steps": steps}
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A block of episodes."""
 
     mode: str
@@ -286,7 +285,7 @@ def run(job: Job) -> dict[str, Any]:
     sums = {"contacts": total(rows, "contact"), "arrived": total(rows, "arrived")}
     sums |= {"steps": total(rows, "steps"), "braked": total(rows, "braked")}
     sums["arrived_s"] = sum(row["seconds"] for row in rows if row["arrived"])
-    return asdict(job) | sums | {"episodes": BLOCK, "lowest_m": min(least), "highest_m": max(least)}
+    return job._asdict() | sums | {"episodes": BLOCK, "lowest_m": min(least), "highest_m": max(least)}
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -176,18 +176,18 @@ def _running_to(env: Any, spot: Callable[[], Action]) -> Iterator[Action]:
         yield np.asarray(offset / max(float(np.abs(offset).max()), 1e-9))
 
 
-def planning(gain: Callable[[Any], Callable[[np.ndarray], float]]) -> Maker:
+def planning(gain: Callable[[Any, np.ndarray], float]) -> Maker:
     """Rolls random changes of its plan out on the env's model, and goes on with the best (predictive sampling).
 
     Args:
-        gain: Of the env: how good a path of the root is, shape (steps + 1, 2), m; larger is better.
+        gain: How good a path of the env's root is, shape (steps + 1, 2), m; larger is better.
     """
     steps, tries, keep = 12, 8, 2
 
     @stepwise
     def run(env: Any, rng: np.random.Generator) -> Iterator[Action]:
         model: mujoco.MjModel = env.model
-        data, substeps, value = mujoco.MjData(model), stepped(env).frame_skip, gain(env)
+        data, substeps = mujoco.MjData(model), stepped(env).frame_skip
         low, high = _box(env)
         snapshot = np.zeros(mujoco.mj_stateSize(model, _STATE))
         best = np.zeros((steps, low.size))
@@ -199,7 +199,7 @@ def planning(gain: Callable[[Any], Callable[[np.ndarray], float]]) -> Maker:
                 data.ctrl[:] = control
                 mujoco.mj_step(model, data, substeps)
                 path.append(data.qpos[:2].copy())
-            return value(np.array(path))
+            return gain(env, np.array(path))
 
         while True:
             mujoco.mj_getState(model, env.data, snapshot, _STATE)
@@ -216,28 +216,20 @@ def planning(gain: Callable[[Any], Callable[[np.ndarray], float]]) -> Maker:
     return run
 
 
-def _fastest(plane: bool) -> Callable[[Any], Callable[[np.ndarray], float]]:
-    def of(env: Any) -> Callable[[np.ndarray], float]:
-        def value(path: np.ndarray) -> float:
-            moved = np.diff(path, axis=0)
-            speeds = np.linalg.norm(moved, axis=1) if plane else moved[:, 0]
-            # Sooner or later the fastest step counts, but a robot that runs gets there more often.
-            return float(speeds.max() + 2.0 * speeds.mean())
-
-        return value
-
-    return of
-
-
-def _closest(env: Any) -> Callable[[np.ndarray], float]:
-    geoms = wall_geoms(env.model)
-    middle, half = env.model.geom_pos[geoms, :2], env.model.geom_size[geoms, :2]
-
-    def value(path: np.ndarray) -> float:
-        beyond = np.maximum(np.abs(path[-1] - middle) - half, 0.0)
-        return -float(np.linalg.norm(beyond, axis=1).min())
+def _fastest(plane: bool) -> Callable[[Any, np.ndarray], float]:
+    def value(env: Any, path: np.ndarray) -> float:
+        moved = np.diff(path, axis=0)
+        speeds = np.linalg.norm(moved, axis=1) if plane else moved[:, 0]
+        # Sooner or later the fastest step counts, but a robot that runs gets there more often.
+        return float(speeds.max() + 2.0 * speeds.mean())
 
     return value
+
+
+def _closest(env: Any, path: np.ndarray) -> float:
+    geoms = wall_geoms(env.model)
+    beyond = np.abs(path[-1] - env.model.geom_pos[geoms, :2]) - env.model.geom_size[geoms, :2]
+    return -float(np.linalg.norm(np.maximum(beyond, 0.0), axis=1).min())
 
 
 sprinting_along_x = planning(_fastest(plane=False))

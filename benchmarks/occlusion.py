@@ -8,14 +8,10 @@ the env's: the states of its cars, and its own judge of collisions at every phys
 
 import itertools
 import warnings
-from dataclasses import asdict, dataclass
-from typing import Any
-
-import gymnasium as gym
-import numpy as np
+from typing import Any, NamedTuple
 
 import safe_wrappers as sw
-from benchmarks.cases import crossing
+from benchmarks.cases import CASES, crossing, driven
 from benchmarks.drivers import CROSSING
 from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
@@ -30,8 +26,7 @@ PART = 5_000
 """Steps of a job."""
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One driver under one filter for so many steps."""
 
     driver: str
@@ -43,26 +38,19 @@ class Job:
 def run(job: Job) -> dict[str, Any]:
     """Drive, count."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted below
-    env: Any = crossing(gym.make("OccludedCrossing-v0"))
-    act = CROSSING[job.driver](env.unwrapped, np.random.default_rng(job.seed))
-    on = ARMS[job.arm] is not None
-    if on:
-        env = sw.protect(env, **(ARMS[job.arm] or {}))
+    case, settings = CASES["OccludedCrossing-v0"], ARMS[job.arm]
+    env: Any = crossing(case.make())
+    if settings is not None:
+        env = sw.protect(env, **settings)
     count = dict.fromkeys(("collisions", "unflagged", "goals", "intervened", "flagged"), 0)
-    done, number = True, 0
-    for _ in range(job.steps):
-        if done:
-            env.reset(seed=100_000 * job.seed + number)
-            number += 1
-        _, _, terminated, truncated, info = env.step(np.asarray(act(), dtype=env.action_space.dtype))
-        done = terminated or truncated
-        flagged = on and bool(info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"])
+    for _, _, info, _, _ in driven(case, env, job.driver, job.steps, job.seed, 100_000 * job.seed):
+        flagged = any(info.get(f"cbf/{name}", False) for name in ("infeasible", "fallback", "unsafe"))
         count["collisions"] += int(info["collisions"])
         count["unflagged"] += int(info["collisions"]) * (not flagged)
         count["goals"] += int(info["goal_met"])
         count["flagged"] += flagged
-        count["intervened"] += on and bool(info["cbf/intervened"])
-    return asdict(job) | count
+        count["intervened"] += bool(info.get("cbf/intervened", False))
+    return job._asdict() | count
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -5,34 +5,26 @@
 
 A violation is a control step in which the env's own truth (`benchmarks/judges.py`) was broken at any physics
 substep; for a published speed, over the step as a whole. Unflagged is one in a step that the filter reported
-neither as infeasible or fallback nor as one that started unsafe. The overhead is the median over steps of how much
-longer the env's step takes with the filter, against a second env that makes the same step without, split by whether
-the filter changed the action.
+neither as infeasible or fallback nor as one that started unsafe.
 """
 
 import itertools
 import multiprocessing
-import time
 import warnings
 from collections import Counter
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import fields
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from benchmarks.cases import PROTECTED, Case
+from benchmarks.cases import PROTECTED, Case, driven
 from benchmarks.judges import counted
 from benchmarks.tables import RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 CHUNK = 10_000
 """Steps of one job: what is lost when a run is killed."""
-TIMED = 1_000
-"""Of those, steps that are timed beside an env without the filter."""
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One driver on one env for so many steps."""
 
     case: str
@@ -46,42 +38,11 @@ def run(job: Job) -> dict[str, Any]:
     """Drive, judge and count."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted below
     case = PROTECTED[job.case]
-    bare = case.make()
-    env = case.protect(bare) if job.filtered else bare
-    twin = case.make() if job.filtered else None
-    judge = case.judge(env.unwrapped)
-    rng = np.random.default_rng(job.seed)
-    driver = case.drivers[job.driver](env.unwrapped, rng)
-    kind = env.action_space.dtype
+    env = case.protect(case.make()) if job.filtered else case.make()
     count = Counter[str]()
-    ratios: dict[str, list[float]] = {"inactive": [], "active": []}
-    episode, over = job.seed * 100_000, True
-    for step in range(job.steps):
-        while over:
-            env.reset(seed=episode)
-            if twin is not None:
-                twin.reset(seed=episode)
-            over = not judge.start() <= 0.0
-            episode += 1
-        action = np.asarray(driver(), dtype=kind)
-        judge.before()
-        begin = time.perf_counter()
-        _, _, terminated, truncated, info = env.step(action)
-        spent = time.perf_counter() - begin
-        executed = info["executed_action"] if job.filtered else action
-        missed = judge.after(executed, info)
-        count.update(counted(info, not missed <= 0.0))  # so that what is not a number counts
-        if twin is not None and step < TIMED:
-            begin = time.perf_counter()
-            twin.step(np.asarray(executed, dtype=kind))
-            ratios["active" if info["cbf/intervened"] else "inactive"].append(
-                spent / (time.perf_counter() - begin)
-            )
-        over = bool(truncated or (terminated and not case.past_termination))
-    row = {**asdict(job), **count}
-    for name, timed in ratios.items():
-        row |= {f"{name}_timed": len(timed), f"{name}_ratio": float(np.median(timed)) if timed else None}
-    return row
+    for _, _, info, violated, _ in driven(case, env, job.driver, job.steps, job.seed, job.seed * 100_000):
+        count.update(counted(info, violated))
+    return {**job._asdict(), **count}
 
 
 def jobs(cases: dict[str, Case], steps: int) -> list[Job]:
@@ -95,13 +56,6 @@ def jobs(cases: dict[str, Case], steps: int) -> list[Job]:
     return found
 
 
-def _overhead(rows: list[dict[str, Any]], which: str) -> str:
-    """Medians of the parts, weighted by their steps; a few steps say nothing."""
-    timed = [(row[f"{which}_ratio"], row[f"{which}_timed"]) for row in rows if row[f"{which}_timed"]]
-    steps = sum(n for _, n in timed)
-    return f"{sum(r * n for r, n in timed) / steps:.1f}" if steps >= 20 else "-"
-
-
 def table(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
     """Markdown: one line per env, drivers pooled."""
     lines = []
@@ -112,16 +66,15 @@ def table(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
         env = cases[name].protect(cases[name].make())
         kinds = map(spelled, env.constraints)
         proved = all(getattr(c, "promise", "best effort") == "proved" for c in env.constraints)
-        times = f"{_overhead(on, 'inactive')} / {_overhead(on, 'active')}"
         cells = [
             ", ".join((name, *cases[name].also)),
             "; ".join(kinds),
             "proved" if proved else "best effort",
         ]
-        cells += [times, _violations(on), f"{total(off, 'violations'):,}", f"{total(on, 'steps'):,}"]
+        cells += [_violations(on), f"{total(off, 'violations'):,}", f"{total(on, 'steps'):,}"]
         cells.append(f"{total(on, 'intervened') / total(on, 'steps'):.1%}")
         lines.append([*cells, *(f"{total(on, flag):,}" for flag in ("infeasible", "fallback"))])
-    head = "env | constraints | class | step time, inactive / active | violations on | off"
+    head = "env | constraints | class | violations on | off"
     return markdown(f"{head} | steps each | changed | infeasible | fallback", lines)
 
 

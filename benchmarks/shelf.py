@@ -14,8 +14,7 @@ import importlib.util
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -29,8 +28,7 @@ DRIVERS = ("random", "greedy", "attacking")
 _TRIED, _HELD = 8, 5
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """An env, how far it is from a violation, how many steps are made, and what it needs."""
 
     env_id: str
@@ -134,8 +132,7 @@ def run(case: Case, driver: str, on: bool, steps: int) -> dict[str, float]:
     return found
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A row of the table."""
 
     env: str
@@ -147,7 +144,7 @@ def row(job: Job) -> dict[str, Any]:
     """Its figures, per step where they are not counts."""
     case = next(case for case in CASES if case.env_id == job.env)
     off, on = (run(case, job.driver, filtered, job.steps) for filtered in (False, True))
-    found = asdict(job) | {"violations_off": off["violations"], "violations_on": on["violations"]}
+    found = job._asdict() | {"violations_off": off["violations"], "violations_on": on["violations"]}
     found |= {"unflagged": on["unflagged"]} | {key: on[key] / job.steps for key in ("changed", "infeasible")}
     for name, side in (("off", off), ("on", on)):
         found |= {f"{key}_{name}": side[key] / job.steps for key in ("return", "seconds")}

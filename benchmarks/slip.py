@@ -12,14 +12,13 @@ import itertools
 import math
 import multiprocessing
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, markdown, options, total
+from benchmarks.tables import keep, made, markdown, options, total
 
 SLIPPING, YAW_EXCURSION = 0.2, 0.5
 EPISODE_STEPS = 300
@@ -31,8 +30,7 @@ STANDSTILL = 0.05
 PARTS = 4
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One driver for so many steps."""
 
     driver: str
@@ -87,7 +85,7 @@ def run(job: Job) -> dict[str, Any]:
             count["infeasible"] += info["cbf/infeasible"]
         spun, worst = spins, max(worst, info["slip_max"])
         distance += abs(raw.forward_speed) * raw.dt
-    return asdict(job) | count | {"worst_slip": worst, "mean_speed": distance / (job.steps * raw.dt)}
+    return job._asdict() | count | {"worst_slip": worst, "mean_speed": distance / (job.steps * raw.dt)}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -112,5 +110,4 @@ def main() -> None:
     given = options(__doc__, steps=200_000, workers=multiprocessing.cpu_count())
     kinds = itertools.product(DRIVERS, (False, True), range(PARTS))
     jobs = [Job(driver, limited, given.steps // PARTS, part) for driver, limited, part in kinds]
-    with multiprocessing.get_context("spawn").Pool(given.workers) as pool:
-        keep("slip", table(pool.map(run, jobs, chunksize=1)))
+    keep("slip", table(list(made(run, jobs, given.workers))))

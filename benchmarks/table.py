@@ -23,7 +23,8 @@ from rich.console import Console
 
 from benchmarks.tables import RESULTS as FOLDER
 from benchmarks.tables import options
-from safe_wrappers.train.config import ExperimentConfig, parse_experiment, read_config
+from safe_wrappers.train.config import parse_experiment, read_config
+from safe_wrappers.train.config.models import ExperimentConfig
 from safe_wrappers.train.evaluation.summary import estimate, number, summarize
 from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
 from safe_wrappers.train.files import read_json, read_rows, write_rows

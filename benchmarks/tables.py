@@ -5,14 +5,14 @@ import json
 import multiprocessing
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 RESULTS: Final = Path(__file__).parent / "results"
 RUNS: Final = Path("runs")
 Job = TypeVar("Job")
+Result = TypeVar("Result")
 Row = dict[str, Any]
 
 
@@ -60,11 +60,13 @@ def total(rows: Iterable[Row], key: str) -> int:
     return sum(int(row[key]) for row in rows)
 
 
-def known(path: Path, kind: type[Job]) -> dict[Job, Row]:
-    """The rows of a file, one JSON object a line, by their jobs: dataclasses whose fields are in each row."""
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    found = [json.loads(line) for line in lines if line.endswith("\n")]  # a killed run's last one may be cut
-    return {kind(**{key: row[key] for key in kind.__dataclass_fields__}): row for row in found}  # type: ignore[attr-defined]
+def made(run: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
+    """What the jobs come to, in their order, by so many processes; 1: by this one."""
+    if workers == 1:
+        yield from map(run, jobs)
+        return
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap(run, jobs)
 
 
 def measured(path: Path, wanted: Sequence[Job], run: Callable[[Job], Row], workers: int) -> list[Row]:
@@ -72,20 +74,21 @@ def measured(path: Path, wanted: Sequence[Job], run: Callable[[Job], Row], worke
 
     Args:
         path: Of a file that grows by one line per job, and whose jobs are not run again.
-        wanted: Dataclasses.
+        wanted: Named tuples.
         run: Makes a job's row, with the job's fields in it.
         workers: Processes; 1: this one.
     """
-    rows = known(path, type(wanted[0])) if wanted else {}
+    if not wanted:
+        return []
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    found = [json.loads(line) for line in lines if line.endswith("\n")]  # a killed run's last one may be cut
+    kind: Any = type(wanted[0])
+    rows = {kind(**{key: row[key] for key in kind._fields}): row for row in found}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
     left = [job for job in wanted if job not in rows]
-    with ExitStack() as stack:
-        file = stack.enter_context(path.open("a"))
-        done: Iterable[Row] = map(run, left)
-        if workers > 1:
-            done = stack.enter_context(multiprocessing.get_context("spawn").Pool(workers)).imap(run, left)
-        for job, row in zip(left, done, strict=True):
+    with path.open("a") as file:
+        for job, row in zip(left, made(run, left, workers), strict=True):
             rows[job] = row
             file.write(json.dumps(row) + "\n")
             file.flush()

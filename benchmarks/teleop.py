@@ -15,8 +15,7 @@ acted on the tool by the env's own account; clearance is the env's, at every phy
 import itertools
 import math
 import multiprocessing
-from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -40,8 +39,7 @@ NETWORKS = ("steady", "rough", "outages")
 OPERATORS = ("careful", "looks away")
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One combination, and one seed of env, network and operator."""
 
     coding: str
@@ -98,7 +96,7 @@ def run(job: Job) -> dict[str, Any]:
         breached += int(info["cost"] > 0.0)
         revoked += int(info["teleop/revoked"])
     found = {"made_j": max(-lowest, 0.0), "peak_n": peak, "swept_m": float(info["swept"])}
-    return asdict(job) | found | {"breached": breached > 0, "least_m": least, "revoked_steps": revoked}
+    return job._asdict() | found | {"breached": breached > 0, "least_m": least, "revoked_steps": revoked}
 
 
 def _some(rows: list[dict[str, Any]], **wanted: Any) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ began unsafe.
 import warnings
 from dataclasses import asdict, dataclass
 from functools import reduce
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -43,8 +43,7 @@ _FIRST_SEED: Final = 1_000_000
 """Of the evaluation: no training episode has it."""
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One env's training."""
 
     env: str
@@ -123,7 +122,7 @@ def run(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
     model = PPO(policy, envs, seed=job.seed, device="cpu", **settings)
     model.learn(job.steps)
     training = reduce(Tally.plus, (env.tally for env in made))
-    row: dict[str, Any] = asdict(job) | {"training": asdict(training)}
+    row: dict[str, Any] = job._asdict() | {"training": asdict(training)}
     for name, deterministic, filtered in (
         ("deterministic", True, True),
         ("stochastic", False, True),

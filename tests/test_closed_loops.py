@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from benchmarks import fetch
-from benchmarks.cases import CASES, crossing
-from benchmarks.protected import Case
+from benchmarks.cases import CASES, Case, crossing, driven
+from benchmarks.judges import counted
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning"),
@@ -53,27 +53,14 @@ def made(case: Case, filtered=True):
 def attack(case: Case, env, driver, steps, seed=0, enough=math.inf):
     """What happened in so many steps, or until there were enough violations: violations, those that nothing flagged,
     what the filter reported, the reward."""
-    judge, rng = case.judge(env.unwrapped), np.random.default_rng(seed)
-    act, filtered = case.drivers[driver](env.unwrapped, rng), env.has_wrapper_attr("filter")
-    told, over, episode = Counter(), True, 1000 * seed
-    for _ in range(steps):
-        while over:
-            env.reset(seed=episode)
-            over, episode = not judge.start() <= 0.0, episode + 1
-        action = np.asarray(act(), env.action_space.dtype)
-        judge.before()
-        _, reward, terminated, truncated, info = env.step(action)
-        executed = info["executed_action"] if filtered else action
-        violated = not judge.after(executed, info) <= 0.0  # what is not a number counts
-        flags = {name: info.get(f"cbf/{name}", False) for name in ("infeasible", "fallback", "unsafe")}
-        told.update(flags, violations=violated, unflagged=violated and not any(flags.values()), reward=reward)
-        told["intervened"] += info.get("cbf/intervened", False)
+    told, filtered = Counter(), env.has_wrapper_attr("filter")
+    for action, reward, info, violated, _ in driven(case, env, driver, steps, seed, 1000 * seed):
+        told.update(counted(info, violated), reward=reward)
         if filtered and not info["cbf/intervened"]:
             within = np.clip(action, env.action_space.low, env.action_space.high)
-            assert executed.astype(action.dtype).tobytes() == within.tobytes()
+            assert info["executed_action"].astype(action.dtype).tobytes() == within.tobytes()
         if told["violations"] > enough:
             break
-        over = bool(truncated or (terminated and not case.past_termination))
     return told
 
 
@@ -194,7 +181,7 @@ def test_no_finger_gets_into_a_ball_that_is_kept_out(task):
     case = replace(
         CASES[f"Fetch{task}-v4"],
         judge=lambda env: fetch.FetchJudge(env, True),
-        drivers=fetch.drivers(ball=True),
+        drivers={"ball-seeking": fetch.seeking(fetch.in_the_ball, 12)},
         protect=lambda env: sw.protect(env, keep_out=fetch.obstacles(env.unwrapped)),
     )
     kept, free = (attack(case, made(case, filtered), "ball-seeking", 100) for filtered in (True, False))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from .config import ArmConfig, ExperimentConfig
+from .config.models import ArmConfig, ExperimentConfig
 from .evaluation.evaluate import evaluate_run
 from .evaluation.summary import Summary, summarize, write_summary
 from .policies import write_card

@@ -13,7 +13,7 @@ import gymnasium as gym
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
-from .config import ArmConfig, stored_arm
+from .config.models import ArmConfig, stored_arm
 from .evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
 from .evaluation.summary import CONDITIONS, episode_file, number, seed_row
 from .files import read_json, read_rows, write_text

@@ -20,7 +20,8 @@ from rich.console import Console
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
-from .config import ExperimentConfig, SweepConfig, parse_experiment, set_value
+from .config.load import parse_experiment, set_value
+from .config.models import ExperimentConfig, SweepConfig
 from .config.types import check_name
 from .evaluation.evaluate import conditions, evaluate_run
 from .evaluation.summary import number

@@ -26,7 +26,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.safety_overlay import SafetyOverlay, find_renderer, set_size
 
-from .config import ArmConfig, ExperimentConfig, FilterConfig
+from .config.models import ArmConfig, ExperimentConfig, FilterConfig
 from .evaluation.evaluate import ShownEpisode, conditions, shown_episode
 from .evaluation.step_log import is_violation
 from .files import read_json, say, write_bytes, write_json

@@ -12,7 +12,7 @@ from benchmarks.golden_traces import NOT_COMPARABLE, RECORDED, SAME_BITS, SHORT,
 
 def compare(*words):
     """In the environment that it would make for itself, and in one process: others run tests beside it."""
-    line = [sys.executable, "-m", "benchmarks.golden_traces", "--workers", "1", *words]
+    line = [sys.executable, "-m", "benchmarks", "golden_traces", "--workers", "1", *words]
     done = subprocess.run(line, capture_output=True, text=True, env=os.environ | SAME_BITS)
     if done.returncode == NOT_COMPARABLE:
         pytest.skip(done.stdout.strip())

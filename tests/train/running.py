@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from safe_wrappers.train.evaluation.evaluate import EVALUATION_COLUMNS, evaluate_run, evaluation_folder
+from safe_wrappers.train.evaluation.evaluate import EVALUATION_COLUMNS, evaluate_run
 from safe_wrappers.train.evaluation.step_log import StepLog, save_steps
 from safe_wrappers.train.files import read_rows, write_rows
 from safe_wrappers.train.run import Progress, train_run
@@ -38,7 +38,7 @@ def evaluated(experiment, arm=1, seed=0, progress=SILENT):
     config = experiment.arms[arm]
     folder = experiment.run_folder(config, seed)
     evaluate_run(config, seed, folder, experiment.evaluation, experiment.evaluation_filter, progress)
-    return evaluation_folder(folder)
+    return folder / "evaluation"
 
 
 def killed_after(experiment, checkpoints, arm=1):
@@ -108,7 +108,7 @@ def write_training(experiment, arm, seed, rows):
 
 
 def write_evaluation(experiment, arm, seed, condition, rows, steps=None):
-    folder = evaluation_folder(experiment.run_folder(experiment.arms[arm], seed))
+    folder = experiment.run_folder(experiment.arms[arm], seed) / "evaluation"
     rows = [{"episode_seed": 100 + at, **row} for at, row in enumerate(rows)]
     write_rows(folder / f"{condition}.csv", EVALUATION_COLUMNS, rows)
     if steps is not None:

@@ -20,16 +20,9 @@ from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train import cli
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.config import (
-    EnvConfig,
-    FilterConfig,
-    LearnerConfig,
-    models,
-    parse_experiment,
-    read_config,
-    stored_arm,
-)
+from safe_wrappers.train.config import models, parse_experiment, read_config
 from safe_wrappers.train.config.algorithms import algorithm_class
+from safe_wrappers.train.config.models import EnvConfig, FilterConfig, LearnerConfig, stored_arm
 from safe_wrappers.train.experiment import check_training
 from safe_wrappers.train.processes.on_ray import check_place
 from safe_wrappers.train.run.stack import make_stack

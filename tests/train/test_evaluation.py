@@ -19,9 +19,9 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.config import EnvConfig, FilterConfig
+from safe_wrappers.train.config.models import EnvConfig, FilterConfig
 from safe_wrappers.train.evaluation import step_log
-from safe_wrappers.train.evaluation.evaluate import compared_pairs, evaluated_steps, shown_episode
+from safe_wrappers.train.evaluation.evaluate import compared_pairs, shown_episode
 from safe_wrappers.train.evaluation.step_log import StepRecorder, coordinates_of, load_steps, pool, save_steps
 from safe_wrappers.train.evaluation.summary import (
     Estimate,
@@ -43,7 +43,7 @@ def test_every_arm_sees_the_same_episodes_and_the_steps_agree_with_the_table(kep
         folder = kept.run_folder(arm, 0)
         for condition in ("filter_off", "filter_on"):
             rows = read_rows(folder / "evaluation" / f"{condition}.csv")
-            log = evaluated_steps(folder, condition)
+            log = load_steps(folder / "evaluation" / f"{condition}_steps.npz")
             assert [row["episode_seed"] for row in rows] == [100, 101, 102]
             assert len(log) == sum(row["length"] for row in rows)
             assert all(("intervention_rate" in row) == (condition == "filter_on") for row in rows)

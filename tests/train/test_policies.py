@@ -16,8 +16,10 @@ import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, RunStateError
 from safe_wrappers.train import policies
 from safe_wrappers.train.cli import main
-from safe_wrappers.train.config import EvaluationConfig, parse_experiment
-from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
+from safe_wrappers.train.config import parse_experiment
+from safe_wrappers.train.config.models import EvaluationConfig
+from safe_wrappers.train.evaluation.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.step_log import load_steps
 from safe_wrappers.train.files import read_rows, write_rows
 from safe_wrappers.train.policies import load_policy, write_card
 from safe_wrappers.train.run.data_pickles import read_pickle
@@ -103,7 +105,7 @@ def test_it_acts_in_evaluation_as_it_was_trained(tmp_path):
     evaluate_run(arm, 0, run, EvaluationConfig(episodes=2, seed=7), arm.filter, SILENT)
     env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=50)))
     env = sw.ActionRepeat(sw.RecordInterventions(env), 4)
-    for seed, row in zip((7, 8), read_rows(evaluation_folder(run) / "filter_on.csv"), strict=True):
+    for seed, row in zip((7, 8), read_rows(run / "evaluation" / "filter_on.csv"), strict=True):
         observation, _ = env.reset(seed=seed)
         truncated = False
         while not truncated:
@@ -111,7 +113,7 @@ def test_it_acts_in_evaluation_as_it_was_trained(tmp_path):
             observation, _, _, truncated, info = env.step(action)
         assert row["return"] == pytest.approx(info["interventions"]["return"], abs=1e-12)
         assert row["length"] == 50
-    held = evaluated_steps(run, "filter_on").proposed[:48].reshape(12, 4, 2)
+    held = load_steps(run / "evaluation" / "filter_on_steps.npz").proposed[:48].reshape(12, 4, 2)
     assert (held == held[:, :1]).all()
     policy.deterministic = False
     policy.reset()
@@ -127,10 +129,10 @@ def test_fetch_reach_is_trained_and_evaluated_by_its_plain_id(tmp_path):
     policy = load_policy(run)
     assert type(policy.model.policy).__name__ == "MultiInputActorCriticPolicy"  # its observations are dicts
     evaluate_run(policy.arm, 0, run, EvaluationConfig(episodes=1), policy.arm.filter, SILENT)
-    (row,) = read_rows(evaluation_folder(run) / "filter_on.csv")
+    (row,) = read_rows(run / "evaluation" / "filter_on.csv")
     assert row["length"] == 50
     code = (  # a new process registers the id when it is asked for
-        "import gymnasium as gym; from safe_wrappers.train.config import check_env_id;"
+        "import gymnasium as gym; from safe_wrappers.train.config.models import check_env_id;"
         "assert 'FetchReach-v4' not in gym.registry; check_env_id('FetchReach-v4');"
         "assert 'FetchReach-v4' in gym.registry"
     )

@@ -144,8 +144,6 @@ def renamed(fake_experiment, word):
         coordinate_names=np.array([f"{axis}{word} (m)" for axis in "xyz"]),
     )
     fill(experiment, {"violations": 5, "cost": 50, "return": 20}, {"return": 10}, log, log)
-    start = json.dumps({"from": word, "timesteps": 10})
-    (experiment.run_folder(experiment.arms[1], 0) / "start.json").write_text(start)
     return experiment
 
 

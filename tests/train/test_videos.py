@@ -17,7 +17,8 @@ import safe_wrappers  # noqa: F401  (registers its envs)
 from safe_wrappers import info as keys
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train import videos
-from safe_wrappers.train.evaluation.evaluate import evaluated_steps, evaluation_folder, shown_episode
+from safe_wrappers.train.evaluation.evaluate import shown_episode
+from safe_wrappers.train.evaluation.step_log import load_steps
 from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.videos import HEIGHT, STRIP, WIDTH, film_episode, for_film, load_video, video_path
@@ -79,8 +80,8 @@ def test_every_arm_is_filmed_in_the_very_episode_that_was_evaluated(finished, in
         folder, lower = experiment.run_folder(arm, 0), []
         for condition in ("filter_off", "filter_on"):
             animation, told = load_video(video_path(experiment, arm, condition))
-            rows = read_rows(evaluation_folder(folder) / f"{condition}.csv")
-            log = evaluated_steps(folder, condition)
+            rows = read_rows(folder / "evaluation" / f"{condition}.csv")
+            log = load_steps(folder / "evaluation" / f"{condition}_steps.npz")
             (row,) = [row for row in rows if row["episode_seed"] == seed]
             count = round(row.get("intervention_rate", 0) * row["length"])
             of_steps = f"of {row['length']:.0f} steps {row['violations']:.0f} in violation, {count} changed."

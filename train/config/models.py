@@ -38,19 +38,11 @@ def check_env_id(env_id: str) -> str:
     Imports gymnasium-robotics if it may be one of its ids. An id of the form `module:Id-v0` is left to
     `gymnasium.make`, which imports the module.
     """
-    if ":" in env_id or _registered(env_id):
+    if ":" in env_id or env_id in gym.registry:
         return env_id
     if importlib.util.find_spec("gymnasium_robotics") is not None:
         gym.register_envs(importlib.import_module("gymnasium_robotics"))  # its import registers them
-    return env_id if _registered(env_id) else check_name(env_id, gym.registry)
-
-
-def _registered(env_id: str) -> bool:
-    try:
-        gym.spec(env_id)
-    except gym.error.Error:
-        return False
-    return True
+    return check_name(env_id, gym.registry)
 
 
 def _check_algorithm(name: str) -> str:

@@ -13,7 +13,7 @@ import gymnasium as gym
 from safe_wrappers import info as keys
 from safe_wrappers.wrappers.recording import COLUMNS
 
-from ..config import ArmConfig, EvaluationConfig, ExperimentConfig, FilterConfig
+from ..config.models import ArmConfig, EvaluationConfig, ExperimentConfig, FilterConfig
 from ..files import only_writer, read_json, read_rows, write_json, write_rows
 from ..processes import Progress, RunStoppedError
 from ..run.folder import EVALUATION, check_finished
@@ -21,24 +21,10 @@ from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger
 from ..run.training import finished_checkpoint
-from .step_log import StepLog, StepRecorder, load_steps, save_steps
+from .step_log import StepRecorder, save_steps
 
 EVALUATION_COLUMNS: Final = ("episode_seed", *COLUMNS)
 STATE_FILE: Final = "evaluation.json"
-
-
-def evaluation_folder(run_folder: Path) -> Path:
-    """Where a run's evaluation lies.
-
-    Per condition (`filter_off`, `filter_on`) a table of episodes `.csv`, and the steps `_steps.npz`
-    (`safe_wrappers.train.evaluation.step_log`).
-    """
-    return run_folder / EVALUATION
-
-
-def evaluated_steps(run_folder: Path, condition: str) -> StepLog | None:
-    """The steps of a run's evaluation; None if it was not evaluated."""
-    return load_steps(evaluation_folder(run_folder) / f"{condition}_steps.npz")
 
 
 def conditions(arm: ArmConfig, default_filter: FilterConfig) -> dict[str, FilterConfig]:
@@ -59,7 +45,8 @@ def evaluate_run(
 
     Episode i starts from env seed `settings.seed + i`, whatever the arm, the training seed and the filter:
     the rows of two conditions can be compared one by one. Does nothing if this has been done already. An arm without
-    a filter of its own is given `default_filter`.
+    a filter of its own is given `default_filter`. Writes, per condition (`filter_off`, `filter_on`), a table of
+    episodes `.csv`, and the steps `_steps.npz`.
 
     Raises:
         RunStateError: The run is not finished, its folder or policy cannot be used, or another process is at work in
@@ -69,7 +56,7 @@ def evaluate_run(
     filters = conditions(arm, default_filter)
     with only_writer(folder):
         checkpoint = finished_checkpoint(arm, seed, folder)
-        out = evaluation_folder(folder)
+        out = folder / EVALUATION
         state = {
             "settings": {"episodes": settings.episodes, "seed": settings.seed},
             "filter": filters.get("filter_on", FilterConfig()).plain(),
@@ -159,7 +146,7 @@ def shown_episode(experiment: ExperimentConfig) -> ShownEpisode | None:
     pair = next(iter(compared_pairs(experiment)), None)
     arm, condition = (experiment.arms[0], "filter_off") if pair is None else (pair.filtered, "filter_on")
     seed = experiment.seeds[0]
-    rows = read_rows(evaluation_folder(experiment.run_folder(arm, seed)) / f"{condition}.csv")
+    rows = read_rows(experiment.run_folder(arm, seed) / EVALUATION / f"{condition}.csv")
     if not rows:
         return None
     typical = typical_seed({int(row["episode_seed"]): row["return"] for row in rows})

@@ -13,9 +13,10 @@ from scipy import stats
 
 from safe_wrappers.errors import Array
 
-from ..config import ArmConfig, ExperimentConfig, FilterConfig
+from ..config.models import ArmConfig, ExperimentConfig, FilterConfig
 from ..files import read_rows, write_json, write_rows
-from .evaluate import conditions, evaluation_folder
+from ..run.folder import EVALUATION
+from .evaluate import conditions
 from .metrics import METRICS, OF_THE_FILTER, OF_THE_LEASE, RATES, TOTALS
 
 CONDITIONS: Final = {
@@ -183,7 +184,7 @@ def episode_file(run_folder: Path, condition: str) -> Path:
     """The table of a run's episodes under a condition."""
     if condition == "training":
         return run_folder / "episodes.csv"
-    return evaluation_folder(run_folder) / f"{condition}.csv"
+    return run_folder / EVALUATION / f"{condition}.csv"
 
 
 def seed_row(episodes: Sequence[Mapping[str, float]], metrics: Sequence[str]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from typing import Any, Final
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
+from ..files import say
 from . import ONE_THREAD, STOPPED, Interrupted, Job, Message, RunsFailedError, environment, work
 
 _POLL_S: Final = 0.2
@@ -42,7 +43,7 @@ def run_jobs(
         Interrupted: A signal stopped the jobs; none of their processes is left.
     """
     waiting = list(jobs)
-    running: set[str] = set()
+    running: dict[str, TaskID] = {}
     failures: dict[str, str] = {}
     wait_until = float("inf")
     with ExitStack() as stack:
@@ -54,34 +55,36 @@ def run_jobs(
 
             place = RayWorkers(on, workers)
         stack.callback(place.kill)
-        shown = _Shown(console)
-        stack.enter_context(shown.bars)
+        # A bar for each running job on a terminal; lines at its begin and end in a file or a pipe.
+        bars = Progress(console=console, transient=True, disable=not console.is_terminal)
+        stack.enter_context(bars)
         while running or (waiting and not signals):
             while waiting and len(running) < place.at_once and not signals:
                 job = waiting.pop(0)
                 place.start(job)
-                running.add(job.name)
-                shown.start(job)
+                running[job.name] = bars.add_task(job.name, total=job.total)
+                if not console.is_terminal:
+                    say(console, f"{job.name}: started ({job.total:,} {job.unit})")
             for name, (kind, told) in place.messages(_POLL_S):
                 if kind == "end":
-                    running.remove(name)
+                    bars.remove_task(running.pop(name))
                     if told not in ("", STOPPED):
                         failures[name] = told
-                    shown.end(name, "failed" if name in failures else told or "done")
+                    say(console, f"{name}: {'failed' if name in failures else told or 'done'}")
                 elif kind == "say":
-                    shown.say(f"{name}: {told}")
+                    say(console, f"{name}: {told}")
                 else:
-                    shown.steps(name, told)
+                    bars.update(running[name], completed=told)
             if signals and wait_until == float("inf"):
                 wait_until = time.monotonic() + _SAVE_S
-                shown.say(f"Stopping, for at most {_SAVE_S:.0f} s; another signal stops at once.")
+                say(console, f"Stopping, for at most {_SAVE_S:.0f} s; another signal stops at once.")
                 for name in running:
                     place.stop(name)
             if len(signals) > 1 or time.monotonic() > wait_until:
                 break
     texts = "\n".join(f"{name}: {text}" for name, text in failures.items())
     if signals:
-        console.print(texts, highlight=False, markup=False, soft_wrap=True)
+        say(console, texts)
         raise Interrupted(signals[0])
     if failures:
         raise RunsFailedError(f"{title}: {len(failures)} of {len(jobs)} failed.\n{texts}", failures)
@@ -109,29 +112,6 @@ def _noted_signals() -> Iterator[list[int]]:
     finally:
         for which, handler in before.items():
             signal.signal(which, signal.SIG_DFL if handler is None else handler)
-
-
-class _Shown:
-    """A bar for each running job on a terminal; lines at its begin and end in a file or a pipe."""
-
-    def __init__(self, console: Console) -> None:
-        self.bars = Progress(console=console, transient=True, disable=not console.is_terminal)
-        self._tasks: dict[str, TaskID] = {}
-
-    def start(self, job: Job) -> None:
-        self._tasks[job.name] = self.bars.add_task(job.name, total=job.total)
-        if not self.bars.console.is_terminal:
-            self.say(f"{job.name}: started ({job.total:,} {job.unit})")
-
-    def steps(self, name: str, done: int) -> None:
-        self.bars.update(self._tasks[name], completed=done)
-
-    def end(self, name: str, how: str) -> None:
-        self.bars.remove_task(self._tasks.pop(name))
-        self.say(f"{name}: {how}")
-
-    def say(self, text: str) -> None:
-        self.bars.console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 _here: dict[str, Any] = {}

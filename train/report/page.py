@@ -12,10 +12,10 @@ import yaml
 
 from safe_wrappers.errors import RunStateError
 
-from ..config import ExperimentConfig
-from ..evaluation.evaluate import compared_pairs, evaluated_steps, shown_episode
+from ..config.models import ExperimentConfig
+from ..evaluation.evaluate import compared_pairs, shown_episode
 from ..evaluation.metrics import OF_THE_FILTER, REGISTRY
-from ..evaluation.step_log import MOST_STEPS, StepLog, pool
+from ..evaluation.step_log import MOST_STEPS, StepLog, load_steps, pool
 from ..evaluation.summary import (
     SEEDS_FOR_AN_INTERVAL,
     Curve,
@@ -25,7 +25,7 @@ from ..evaluation.summary import (
     over_seeds,
 )
 from ..files import read_json, write_text
-from ..run.folder import FINISHED_FILE
+from ..run.folder import EVALUATION, FINISHED_FILE
 from ..videos import load_video, video_path
 from .figures import CONDITIONS, Picture, curve_picture, data_uri, place_pictures, refusals
 from .tables import SHORT, every_metric, short_rows, verdict
@@ -112,7 +112,8 @@ def _curves(experiment: ExperimentConfig, summary: Summary) -> dict[str, dict[st
 
 def _logs(experiment: ExperimentConfig, condition: str) -> Iterator[tuple[str, StepLog]]:
     for arm in experiment.arms:
-        found = [evaluated_steps(experiment.run_folder(arm, seed), condition) for seed in experiment.seeds]
+        folders = [experiment.run_folder(arm, seed) / EVALUATION for seed in experiment.seeds]
+        found = [load_steps(folder / f"{condition}_steps.npz") for folder in folders]
         log = pool([steps for steps in found if steps is not None])
         if log is not None and len(log):
             yield arm.name, log

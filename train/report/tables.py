@@ -9,7 +9,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from ..config import ArmConfig, ExperimentConfig
+from ..config.models import ArmConfig, ExperimentConfig
 from ..evaluation.evaluate import Pair, compared_pairs
 from ..evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
 from ..evaluation.summary import (

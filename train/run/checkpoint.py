@@ -51,22 +51,15 @@ def load_model(folder: Path, algorithm: str, device: str) -> BaseAlgorithm:
     return _load(folder, algorithm, device, None, _NO_BUFFER)
 
 
-def load_normalize(folder: Path, env: VecEnv) -> VecEnv:
-    """Puts the saved running statistics around the env; returns the env itself if there are none."""
-    path = folder / NORMALIZE
-    if not path.exists():
-        return env
-    scaled: VecNormalize = read_pickle(path)
-    scaled.set_venv(env)
-    return scaled
-
-
 def resume(folder: Path, algorithm: str, env: VecEnv, device: str, buffer_size: int) -> BaseAlgorithm:
     """The model of a checkpoint with its replay buffer, in an env; and the random states of that time.
 
     A finished run's checkpoint has no replay buffer: there is an empty one of `buffer_size` transitions then.
     """
-    env = load_normalize(folder, env)
+    if (folder / NORMALIZE).exists():
+        scaled: VecNormalize = read_pickle(folder / NORMALIZE)
+        scaled.set_venv(env)
+        env = scaled
     replay = folder / _REPLAY
     model = _load(folder, algorithm, device, env, {"buffer_size": 1 if replay.exists() else buffer_size})
     if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None and replay.exists():

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
-from ..config import ArmConfig, stored_arm
+from ..config.models import ArmConfig, stored_arm
 from ..files import read_json, write_json
 
 RUN_FILE: Final = "run.json"

@@ -1,4 +1,4 @@
-"""From an arm's settings to its model, and the callbacks that its learner needs."""
+"""From an arm's settings to its model."""
 
 from __future__ import annotations
 
@@ -9,19 +9,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.sb3 import (
-    ExecutedActionDictReplayBuffer,
-    ExecutedActionReplayBuffer,
-    LagrangianMultiplier,
-)
+from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer, ExecutedActionReplayBuffer
 
-from ..config import ArmConfig
 from ..config.algorithms import (
     DISCRETE,
     LINEAR,
@@ -32,6 +26,7 @@ from ..config.algorithms import (
     algorithm_class,
     default_of,
 )
+from ..config.models import ArmConfig
 
 _NOISE: Final = {"normal": NormalActionNoise, "ornstein_uhlenbeck": OrnsteinUhlenbeckActionNoise}
 
@@ -92,14 +87,6 @@ def whole_rollouts(arm: ArmConfig) -> int:
     count, unit = (given, "step") if isinstance(given, int) else given
     rollout = arm.n_envs * (count if unit == "step" else 1)  # how long episodes are is not known beforehand
     return int(-(-arm.total_steps // rollout) * rollout)
-
-
-def learner_callbacks(arm: ArmConfig) -> list[BaseCallback]:
-    """What the arm's learner needs beside its algorithm: a price on cost."""
-    learner = arm.learner
-    if learner.cost_limit is None:
-        return []
-    return [LagrangianMultiplier(learner.cost_limit, learner.multiplier_rate)]
 
 
 def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:

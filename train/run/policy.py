@@ -10,29 +10,22 @@ from typing import Any, Final, Literal
 
 import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
-from ..config import ArmConfig, FilterConfig
 from ..config.algorithms import SBX
+from ..config.models import ArmConfig, FilterConfig
 from ..files import write_json
-from .checkpoint import load_model, load_normalize, save_policy
+from .checkpoint import NORMALIZE, load_model, save_policy
+from .data_pickles import read_pickle
 from .folder import POLICY
 from .stack import make_stack
 
 CONFIG: Final = "config.json"
 _PACKAGES: Final = ("safe-wrappers", "stable-baselines3", "gymnasium", "mujoco")
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
-
-
-class SpacesEnv(gym.Env[Any, Any]):
-    """An env that has spaces and nothing else: what SB3 wants to be told of them by."""
-
-    def __init__(self, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
-        self.observation_space = observation_space
-        self.action_space = action_space
 
 
 class TrainedPolicy:
@@ -49,9 +42,8 @@ class TrainedPolicy:
     def __init__(self, arm: ArmConfig, folder: Path) -> None:
         self.arm = arm
         self.model = load_model(folder, arm.algorithm, arm.device)
-        spaces = SpacesEnv(self.model.observation_space, self.model.action_space)
-        scaled = load_normalize(folder, DummyVecEnv([lambda: spaces]))
-        self._normalize = scaled if isinstance(scaled, VecNormalize) else None
+        scaling = folder / NORMALIZE
+        self._normalize: VecNormalize | None = read_pickle(scaling) if scaling.exists() else None
         self.reset()
 
     def make_env(

@@ -26,7 +26,7 @@ from safe_wrappers.wrappers.occlusion import OcclusionPenalty
 from safe_wrappers.wrappers.protect import protect
 from safe_wrappers.wrappers.recording import CostFunction, RecordInterventions, refuse_own_cost
 
-from ..config import NAIVE, ArmConfig, EnvConfig, FilterConfig, LearnerConfig, check_env_id
+from ..config.models import NAIVE, ArmConfig, EnvConfig, FilterConfig, LearnerConfig, check_env_id
 from ..config.types import check_name
 
 _TOLERANCE: Final = 1e-6

@@ -20,7 +20,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 
 from safe_wrappers.errors import ConfigurationError
 
-from ..config import ArmConfig
+from ..config.models import ArmConfig
 from .folder import TENSORBOARD
 
 Log = Callable[[dict[str, float], int], object]

@@ -17,10 +17,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.sb3 import InterventionCallback
+from safe_wrappers.sb3 import InterventionCallback, LagrangianMultiplier
 from safe_wrappers.wrappers.recording import COLUMNS
 
-from ..config import ArmConfig
+from ..config.models import ArmConfig
 from ..files import append_row, only_writer, read_rows, write_json, write_rows
 from ..processes import Progress, RunStoppedError
 from .checkpoint import Checkpoint, latest_checkpoint, resume, save_checkpoint
@@ -35,7 +35,7 @@ from .folder import (
     claim_folder,
     is_finished,
 )
-from .model import buffer_size, learner_callbacks, learning_starts, new_model, whole_rollouts
+from .model import buffer_size, learning_starts, new_model, whole_rollouts
 from .policy import write_policy
 from .stack import make_vec_env
 from .trackers import run_logger
@@ -69,30 +69,19 @@ def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> No
             claim_folder(arm, seed, folder)  # the last rollout may have gone beyond totals that were raised
             progress.steps(whole_rollouts(arm))
             return
-        checkpoint = latest_checkpoint(folder / CHECKPOINTS)
+        last = latest_checkpoint(folder / CHECKPOINTS)
         with contextlib.closing(make_vec_env(arm)) as envs:
-            _train(arm, seed, folder, envs, checkpoint, progress)
-
-
-def _train(
-    arm: ArmConfig,
-    seed: int,
-    folder: Path,
-    envs: VecEnv,
-    checkpoint: Checkpoint | None,
-    progress: Progress,
-) -> None:
-    model = new_model(arm, seed, envs) if checkpoint is None else _continued(arm, envs, checkpoint, progress)
-    claim_folder(arm, seed, folder)
-    for outdated in (EVALUATION, POLICY):
-        shutil.rmtree(folder / outdated, ignore_errors=True)
-    (folder / FINISHED_FILE).unlink(missing_ok=True)
-    if checkpoint is None or model.num_timesteps < arm.total_steps:
-        facts = _learn(arm, seed, folder, envs, model, checkpoint, progress)
-    else:  # it was killed with its last checkpoint there; not even an env is reset: the scaling would move
-        facts = dict(checkpoint.facts)
-    write_policy(arm, seed, folder, model)
-    write_json(folder / FINISHED_FILE, facts)
+            model = new_model(arm, seed, envs) if last is None else _continued(arm, envs, last, progress)
+            claim_folder(arm, seed, folder)
+            for outdated in (EVALUATION, POLICY):
+                shutil.rmtree(folder / outdated, ignore_errors=True)
+            (folder / FINISHED_FILE).unlink(missing_ok=True)
+            if last is None or model.num_timesteps < arm.total_steps:
+                facts = _learn(arm, seed, folder, envs, model, last, progress)
+            else:  # it was killed with its last checkpoint there; not even an env is reset: the scaling would move
+                facts = dict(last.facts)
+            write_policy(arm, seed, folder, model)
+            write_json(folder / FINISHED_FILE, facts)
 
 
 def _learn(
@@ -124,12 +113,13 @@ def _learn(
         save_checkpoint(folder / CHECKPOINTS, model, facts, final)
         return facts
 
-    callbacks = [
+    callbacks: list[BaseCallback] = [
         CheckpointCallback(arm.checkpoint_every, save, progress),
         InterventionCallback(),
         EpisodeRows(folder / EPISODES),
-        *learner_callbacks(arm),
     ]
+    if arm.learner.cost_limit is not None:
+        callbacks.append(LagrangianMultiplier(arm.learner.cost_limit, arm.learner.multiplier_rate))
     try:
         model.learn(
             arm.total_steps - model.num_timesteps,
