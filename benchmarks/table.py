@@ -84,9 +84,9 @@ TASKS = (
     Task("SafeCarGoal2-v0", "goal_sac", 3, ("total_steps=50000", SBX, *SLOWER), "_sbx_8"),
     Task("SafeCarGoal2-v0", "goal_sac", 3, ("total_steps=125000", SBX, *SLOWER), "_sbx_8_1m"),
     Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5, ("total_steps=1000000", SBX), "_sbx_1m"),
-    Task("SafeHopperVelocity-v0", "velocity_sac", 3, ("total_steps=500000", SBX), "_sbx_500k"),
+    Task("SafeHopperVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX), "_sbx_1m"),
     Task("SafeWalker2dVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX, HALF), "_sbx_1m"),
-    Task("SafeAntVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX, HALF), "_sbx_1m"),
+    Task("SafeAntVelocity-v0", "velocity_sac", 3, ("total_steps=1500000", SBX, HALF), "_sbx_1500k"),
     Task("SafeHumanoidVelocity-v0", "velocity_sac", 3, ("total_steps=700000", SBX, HALF), "_sbx_700k"),
 )
 METRICS = ("return", "return_decile", "cost", "violations", "stuck", "infeasible", "intervention_rate")
