@@ -86,7 +86,7 @@ TASKS = (
     Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5, ("total_steps=1000000", SBX), "_sbx_1m"),
     Task("SafeHopperVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX), "_sbx_1m"),
     Task("SafeWalker2dVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX, HALF), "_sbx_1m"),
-    Task("SafeAntVelocity-v0", "velocity_sac", 3, ("total_steps=1500000", SBX, HALF), "_sbx_1500k"),
+    Task("SafeAntVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX, HALF), "_sbx_1m"),
     Task("SafeHumanoidVelocity-v0", "velocity_sac", 3, ("total_steps=700000", SBX, HALF), "_sbx_700k"),
 )
 METRICS = ("return", "return_decile", "cost", "violations", "stuck", "infeasible", "intervention_rate")
