@@ -1,4 +1,4 @@
-"""Contacts: friction cones, residuals of rigid contacts, peak force and braking of elastic ones.
+"""Contacts: friction cones, residuals of rigid contacts, peak force of elastic ones.
 
 **Friction.** A force f on the robot, at a contact with unit normal n (pointing at the robot) and friction coefficient
 mu, is feasible where `f_n = f . n >= 0` and `|f - f_n n| <= mu f_n`: Coulomb's law with one coefficient in every
@@ -100,27 +100,3 @@ def peak_force(
     """
     pressed, struck = stiffness * deflection - push, np.maximum(speed, 0.0) * np.sqrt(stiffness * mass)
     return np.asarray(push + np.hypot(pressed, struck))
-
-
-def braked_deflection(
-    speed: Numbers, mass: Numbers, stiffness: Numbers, braking: Numbers, latency: Numbers = 0.0
-) -> Array:
-    """The first peak of the deflection when a brake works against it, shape (...), m.
-
-    With b = m a / k and the unbraked peak `p = v sqrt(m / k)` it is `sqrt(b^2 + p^2 + 2 b p sin(latency sqrt(k / m)))
-    - b`. From the unbraked peak on, `pi / 2 sqrt(m / k)` after the touch, a brake changes nothing.
-
-    Args:
-        speed: v at the first touch, m/s.
-        mass: m, kg.
-        stiffness: k, N/m.
-        braking: Constant deceleration a >= 0 of brakes alone, without the contact's own, m/s^2.
-        latency: From the touch to the brake's action, at least 0, s.
-    """
-    late, root = np.asarray(latency, dtype=np.float64), np.sqrt(mass / stiffness)
-    free, b = np.maximum(speed, 0.0) * root, braking * root**2
-    in_time = (late < np.pi / 2.0 * root) & (free > 0.0)
-    # (x_max + b)^2 - b^2, divided rather than subtracted: for a strong brake the difference cancels.
-    gained = free**2 + 2.0 * b * free * np.sin(np.where(in_time, late, 0.0) / root)
-    braked = gained / np.where(in_time, np.sqrt(b**2 + gained) + b, 1.0)
-    return np.asarray(np.where(in_time, braked, free))
