@@ -107,16 +107,13 @@ class SafeActionSearch:
     def decide(self, proposal: Array, last: Array) -> Decision:
         """The executed control for a proposal inside the box; `last` is what was executed before."""
         self._tried = []
-        admitted = self._admitted(proposal)
-        if admitted and not self._ruling:
-            return Decision(proposal, Stage.PROPOSAL, changed=False)
-        decision = self._decide(proposal, admitted, last)
+        decision = self._decide(proposal, self._admitted(proposal), last)
         if decision.changed:
             decision.refused = np.array([not c.admits(proposal) for c in self._constraints], dtype=bool)
         return decision
 
     def _decide(self, proposal: Array, admitted: bool, last: Array) -> Decision:
-        strict = self._rows(self._ruling) if self._ruling else self._no_rows
+        strict = self._rows(self._ruling)
         if admitted:
             if not strict[1].size:
                 return Decision(proposal, Stage.PROPOSAL, changed=False)
