@@ -1,7 +1,6 @@
 """Half-spaces from predicted slacks, linearised about a control that the prediction has refused."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -29,12 +28,6 @@ def differences(slacks: Slacks, control: Array, low: Array, high: Array) -> Arra
         moved[j] += width[j]
         jacobian[:, j] = (slacks(moved) - base) / width[j]
     return jacobian
-
-
-def tangent_rows(base: Array, control: Array, jacobian: Array, inward: float = _INWARD) -> HalfSpaces:
-    """Rows of slacks that are `base` at a control and change by a Jacobian, aimed a little inward where violated."""
-    wanted = inward * np.maximum(-base, 0.0)
-    return HalfSpaces(-jacobian, base - jacobian @ control - wanted)
 
 
 class Tangents:
@@ -76,9 +69,8 @@ class Tangents:
         else:
             self._secants += known is not None
         self.slopes, self._control, self._slacks = slopes, control, slacks[: len(slopes)]
-        if not guessed:
-            return tangent_rows(self._slacks, control, slopes)
-        return replace(tangent_rows(self._slacks, control, slopes, _AGAIN), provisional=True)
+        wanted = (_AGAIN if guessed else _INWARD) * np.maximum(-self._slacks, 0.0)
+        return HalfSpaces(-slopes, self._slacks - slopes @ control - wanted, provisional=guessed)
 
     def _corrected(self, slopes: Array, step: Array, slacks: Array) -> Array | None:
         """The slopes after a secant update; None: it cannot be made, or they are not those of what is violated."""
