@@ -39,8 +39,6 @@ class AnalyticPlant(Plant):
     control_dt: float
     """Control interval, s; where the env's `dt` is taken, it is known once the plant is bound."""
     state: Array = np.zeros(0)  #: shape (n,), at the last observation
-    lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
-    upper: Array = np.zeros(0)  #: likewise
 
     def __init__(
         self,

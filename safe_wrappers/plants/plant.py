@@ -44,6 +44,8 @@ class Plant(Model):
         control_dt: Control interval in s: how long one action is held.
         delay_s: Evidence age plus detection plus actuation delay in s; the state that the constraints see is
             predicted over it with the commands in flight.
+        lower: Smallest control, the action space's, shape (m,), once bound; -inf: no bound.
+        upper: Largest control, likewise.
         observation_id: Number of observations so far.
         model_version: Number of changes of the model, after each of which a filter binds its constraints anew.
         has_acceleration: Whether a control acts as a force, so that `f` and `g` are known.
@@ -53,6 +55,8 @@ class Plant(Model):
 
     control_dt: float
     delay_s: float
+    lower: Array
+    upper: Array
     observation_id: int = 0
     model_version: int = 0
     has_acceleration: ClassVar[bool] = True
@@ -73,16 +77,6 @@ class Plant(Model):
     @abstractmethod
     def g(self) -> Array:
         """Control matrix at the state, shape (n, m)."""
-
-    @property
-    @abstractmethod
-    def lower(self) -> Array:
-        """Smallest control, the action space's, shape (m,)."""
-
-    @property
-    @abstractmethod
-    def upper(self) -> Array:
-        """Largest control, likewise."""
 
     @abstractmethod
     def bind(self, env: gym.Env[Any, Any]) -> None:

@@ -122,8 +122,6 @@ class SimulatorPlant(Plant):
     substeps: int = 1
     discrete: bool = False
     judges_substeps: bool = False
-    lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
-    upper: Array = np.zeros(0)
     delay_s = 0.0
     view: View
     _env: gym.Env[Any, Any]

@@ -62,8 +62,7 @@ class MujocoPlant(Plant):
     model: mujoco.MjModel  #: the plant's own
     data: mujoco.MjData  #: likewise; at the present state only after `forward` or `pose`
     _loaded = _forwarded = False
-    lower: Array = np.zeros(0)  #: of the action, shape (nu,), once bound: ctrlrange, or -inf and inf
-    upper: Array = np.zeros(0)
+    _range: tuple[Array, Array]  # of the controls, as `lower` and `upper` are of the actions
     action_map: binding.ActionMap | None = None
 
     def __init__(
@@ -87,7 +86,6 @@ class MujocoPlant(Plant):
         self._raw: Any = None
         self._sent: Array | None = None
         self._outdated = False
-        self._range: tuple[Array, Array] = self.lower, self.upper
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         raw: Any = env.unwrapped
