@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.errors import Array, ConfigurationError, non_negative, positive
-from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse_second_env
+from safe_wrappers.plants.env_checks import check_timing, refuse_second_env
 from safe_wrappers.plants.plant import Plant, Trajectory
 
 
@@ -56,7 +56,6 @@ class AnalyticPlant(Plant):
         if self._given_control_dt is not None:
             self.control_dt = self._given_control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
-        self._env: Any = None
         self._affine: tuple[Array, Array] | None = None
         self._pending: deque[Array] = deque()
 
@@ -152,6 +151,3 @@ class AnalyticPlant(Plant):
 
     def effect(self, x: Array) -> Array:
         return np.asarray(self._g(x), dtype=np.float64)
-
-    def attribute(self, name: str) -> Any:
-        return read_attribute(self._env, name)

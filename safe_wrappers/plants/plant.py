@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 
 from safe_wrappers.errors import Array, UnsupportedEnvError
+from safe_wrappers.plants.env_checks import read_attribute
 
 
 class Trajectory:
@@ -57,6 +58,7 @@ class Plant(Model):
     delay_s: float
     lower: Array
     upper: Array
+    _env: Any = None
     observation_id: int = 0
     model_version: int = 0
     has_acceleration: ClassVar[bool] = True
@@ -104,9 +106,9 @@ class Plant(Model):
     def executed(self, control: Array | None) -> None:
         """Remember a sent control, for the delay; None forgets all (a new episode)."""
 
-    @abstractmethod
     def attribute(self, name: str) -> Any:
         """Read a published fact of the env by name, for example the positions of its hazards."""
+        return read_attribute(self._env, name)
 
     @property
     def acting_range(self) -> tuple[Array, Array] | None:

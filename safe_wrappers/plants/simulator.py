@@ -22,7 +22,7 @@ from safe_wrappers.errors import (
     whole_number,
 )
 from safe_wrappers.plants.copies import Simulation, differing, reward_number
-from safe_wrappers.plants.env_checks import check_timing, name_of, read_attribute, refuse_second_env
+from safe_wrappers.plants.env_checks import check_timing, name_of, refuse_second_env
 from safe_wrappers.plants.mujoco.binding import physics_steps
 from safe_wrappers.plants.plant import Plant
 
@@ -124,7 +124,6 @@ class SimulatorPlant(Plant):
     judges_substeps: bool = False
     delay_s = 0.0
     view: View
-    _env: gym.Env[Any, Any]
     _control_dt: float | None = None
     _simulation: Simulation
 
@@ -142,7 +141,7 @@ class SimulatorPlant(Plant):
         self._sent = b""
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        refuse_second_env(getattr(self, "_env", None), env)
+        refuse_second_env(self._env, env)
         space = env.action_space
         self.discrete = isinstance(space, gym.spaces.Discrete)
         if isinstance(space, gym.spaces.Discrete):
@@ -223,9 +222,6 @@ class SimulatorPlant(Plant):
         self.require_acceleration("f or g")
 
     g = f
-
-    def attribute(self, name: str) -> Any:
-        return read_attribute(self._env, name)
 
     def require_acceleration(self, asker: str) -> NoReturn:
         raise UnsupportedEnvError(

@@ -414,7 +414,7 @@ class MujocoPlant(Plant):
 
     def attribute(self, name: str) -> Any:
         found = getattr(self._raw, name, None)
-        return found if found is not None else env_checks.read_attribute(self._env, name)
+        return found if found is not None else super().attribute(name)
 
 
 def _same(one: Array, other: Array) -> bool:
