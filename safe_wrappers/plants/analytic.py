@@ -36,8 +36,6 @@ class AnalyticPlant(Plant):
         >>> env = sw.CBFActionFilter(gym.make("Pendulum-v1", g=1.62), [slow], plant=plant)
     """
 
-    control_dt: float
-    """Control interval, s; where the env's `dt` is taken, it is known once the plant is bound."""
     state: Array = np.zeros(0)  #: shape (n,), at the last observation
 
     def __init__(
@@ -53,8 +51,6 @@ class AnalyticPlant(Plant):
                 raise ConfigurationError(f"{name} must be a function, got {function!r}")
         self._f, self._g, self._state_of = f, g, state
         self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
-        if self._given_control_dt is not None:
-            self.control_dt = self._given_control_dt
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._affine: tuple[Array, Array] | None = None
         self._pending: deque[Array] = deque()

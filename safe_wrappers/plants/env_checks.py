@@ -55,17 +55,16 @@ def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
 
 def check_timing(env: gym.Env[Any, Any], control_dt: float | None = None) -> float:
     """How long one action is held, s: the env's `dt`, or `control_dt` where the env has none; both must agree."""
-    given = None if control_dt is None else positive("control_dt", control_dt, "s")
     try:
         dt = float(env.get_wrapper_attr("dt"))
     except (AttributeError, TypeError, ValueError):
-        if given is None:
+        if control_dt is None:
             raise ConfigurationError(
                 f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass control_dt, in "
                 "seconds, to the plant, or give the env one, such as env.unwrapped.dt = 0.05"
             ) from None
-        return given
-    hold = positive("the env's dt", dt, "s") if given is None else given
+        return control_dt
+    hold = positive("the env's dt", dt, "s") if control_dt is None else control_dt
     if not np.isclose(dt, hold, rtol=1e-6):
         raise ConfigurationError(
             f"control_dt = {hold} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "

@@ -42,7 +42,7 @@ class Plant(Model):
     """A control-affine machine `x' = f(x) + g(x) u`, read afresh from an env at every step.
 
     Attributes:
-        control_dt: Control interval in s: how long one action is held.
+        control_dt: Control interval in s, once bound: how long one action is held.
         delay_s: Evidence age plus detection plus actuation delay in s; the state that the constraints see is
             predicted over it with the commands in flight.
         lower: Smallest control, the action space's, shape (m,), once bound; -inf: no bound.

@@ -209,12 +209,7 @@ class SimulatorPlant(Plant):
     @property
     def control_dt(self) -> float:  # type: ignore[override]
         """Control interval, s; an error where nothing says it."""
-        if self._control_dt is None:
-            raise ConfigurationError(
-                f"{name_of(self._env)} does not say how long a step lasts (it has no attribute dt): pass "
-                f"{type(self).__name__}(control_dt=...), in seconds"
-            )
-        return self._control_dt
+        return check_timing(self._env) if self._control_dt is None else self._control_dt
 
     @property
     def f(self) -> NoReturn:
