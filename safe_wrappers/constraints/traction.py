@@ -81,7 +81,8 @@ class Traction(Constraint):
     def __post_init__(self) -> None:
         self.wheels = name_list("wheels", self.wheels, "joint names", least=0)
         self.max_slip = positive("max_slip", self.max_slip, "slip, in (0, 1)")
-        slip_window(0.0, self.max_slip, 1.0)  # refuses a slip outside (0, 1)
+        if self.max_slip >= 1.0:
+            raise ConfigurationError(f"max_slip is a normalised slip ratio in (0, 1), got {self.max_slip}")
         if self.friction is not None:
             self.friction = positive("friction", self.friction, "force per load")
         self.regularization = positive("regularization", self.regularization, "m/s")

@@ -21,7 +21,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.errors import Array, whole_number
+from safe_wrappers.errors import Array
 
 Numbers = Array | float
 
@@ -68,7 +68,6 @@ def friction_pyramid(normals: ArrayLike, friction: ArrayLike, edges: int = 4) ->
     Returns:
         One row for each side, shape (..., edges, 3); together they imply that nothing pulls.
     """
-    edges = whole_number("edges", edges, 3)
     n, mu = np.asarray(normals, dtype=np.float64), np.asarray(friction, dtype=np.float64)
     middle = (np.arange(edges) + 0.5) * (2.0 * math.pi / edges)
     facing = np.stack([np.cos(middle), np.sin(middle)], axis=-1)

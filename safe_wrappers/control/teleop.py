@@ -5,7 +5,7 @@ rad/s); their product is power. A channel is passive when no more energy comes o
 went in; the wave transform keeps that for a *fixed* delay only. A sum of samples is the integral only if one of the
 two is held over the interval and the other is its mean.
 
-What is not finite raises `ConfigurationError`.
+The energy at a port that is not finite raises `ConfigurationError`; waves are not checked by themselves.
 """
 
 import math
@@ -13,34 +13,30 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.errors import Array, ConfigurationError, finite_array, float_array, positive
+from safe_wrappers.errors import Array, ConfigurationError, float_array
 
 
-def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> tuple[Array, Array]:
+def to_waves(effort: Array, flow: Array, impedance: float) -> tuple[Array, Array]:
     """The wave transform, `u = (F + b v) / sqrt(2 b)` and `w = (F - b v) / sqrt(2 b)` (equation 3), sqrt(W).
 
     Their power `(|u|^2 - |w|^2) / 2` is `F.v`.
 
     Args:
-        effort: F, N, shape (..., m), or a number.
+        effort: F, N, shape (..., m).
         flow: v, m/s, of the same shape, positive together with F into the component that u goes into.
         impedance: b > 0, N s/m.
     """
-    f, v = finite_array("effort", effort), finite_array("flow", flow)
-    b = positive("impedance", impedance, "N s/m")
-    root = math.sqrt(2.0 * b)
-    return (f + b * v) / root, (f - b * v) / root
+    root = math.sqrt(2.0 * impedance)
+    return (effort + impedance * flow) / root, (effort - impedance * flow) / root
 
 
-def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> tuple[Array, Array]:
+def effort_and_outgoing(flow: Array, incoming: Array, impedance: float) -> tuple[Array, Array]:
     """The operator's side: effort F, N, and outgoing wave u for a known flow, m/s, and the incoming wave w, sqrt(W).
 
-    All are of one shape (..., m), or numbers; the impedance b is in N s/m, > 0.
+    All are of one shape (..., m); the impedance b is in N s/m, > 0.
     """
-    v, w = finite_array("flow", flow), finite_array("incoming", incoming)
-    b = positive("impedance", impedance, "N s/m")
-    root = math.sqrt(2.0 * b)
-    return b * v + root * w, root * v + w
+    root = math.sqrt(2.0 * impedance)
+    return impedance * flow + root * incoming, root * flow + incoming
 
 
 def port_energy(effort: ArrayLike, flow: ArrayLike, time_s: float) -> float:

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_wrappers.errors import Array, ConfigurationError, finite_array
+from safe_wrappers.errors import Array
 
 PEAK_SLIPS: Final = (0.05, 0.07, 0.09, 0.11, 0.13, 0.15, 0.18, 0.22)
 """Slips of the peak, one per hypothesis."""
@@ -38,16 +38,10 @@ def slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike, regularization: 
     return np.asarray((wheel - ground) / np.maximum(larger, regularization))
 
 
-def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: float) -> tuple[Array, Array]:
-    """The smallest and largest r w, m/s, whose slip is at most `max_slip`, in (0, 1), in size; shape as of v_x, m/s.
-
-    Raises:
-        ConfigurationError: A `max_slip` outside (0, 1).
-    """
-    ground, slip = np.asarray(ground_speed, dtype=np.float64), finite_array("max_slip", max_slip)
-    if not ((slip > 0.0) & (slip < 1.0)).all():
-        raise ConfigurationError(f"max_slip is a normalised slip ratio in (0, 1), got {max_slip!r}")
-    return -_fastest(-ground, slip, regularization), _fastest(ground, slip, regularization)
+def slip_window(ground_speed: ArrayLike, max_slip: Array, regularization: float) -> tuple[Array, Array]:
+    """The least and largest r w, m/s, whose slip is at most `max_slip`, in (0, 1), in size; shape as of v_x, m/s."""
+    ground = np.asarray(ground_speed, dtype=np.float64)
+    return -_fastest(-ground, max_slip, regularization), _fastest(ground, max_slip, regularization)
 
 
 def _fastest(ground: Array, slip: Array, floor: float) -> Array:
