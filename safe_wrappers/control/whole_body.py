@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.contact import cone_excess, friction_pyramid, tangents
 from safe_wrappers.control.projection import Status
-from safe_wrappers.errors import Array, ConfigurationError, finite_array
+from safe_wrappers.errors import Array
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""
@@ -41,11 +41,7 @@ _RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class WholeBodyProblem:
-    """One instant of a robot in contact.
-
-    Raises:
-        ConfigurationError: A number that is not finite, but for bounds; bounds that cross, or a friction below 0.
-    """
+    """One instant of a robot in contact; all numbers but the bounds are finite, which is not checked."""
 
     inertia: Array  #: M, shape (nv, nv), positive definite
     bias: Array  #: h, shape (nv,): Coriolis, centrifugal and gravity forces minus passive ones
@@ -68,13 +64,6 @@ class WholeBodyProblem:
     )  #: wanted `J qacc`, `contact_acceleration` minus the drift, shape (k, 3)
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name not in ("lower", "upper", "breaking"):
-                finite_array(name, value)
-        if (self.friction < 0.0).any():
-            raise ConfigurationError(f"friction must be at least 0, got {self.friction}")
-        if not (self.lower <= self.upper).all():
-            raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
         opens = np.zeros(len(self.normals), bool) if self.breaking is None else self.breaking
         object.__setattr__(self, "stance", np.flatnonzero(~opens))
         object.__setattr__(self, "opening", np.flatnonzero(opens))
