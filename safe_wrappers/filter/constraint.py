@@ -52,7 +52,8 @@ class Constraint:
             no trajectory. It is checked at every step, and dropped with a warning when broken. None: unknown.
         unit: Of h, for messages.
         plant: Set by `setup`.
-        model: What predicts; it has `rollout(control, horizon)`. The plant by default.
+        model: What predicts; it has `rollout(control, horizon)`. Set by `setup`: the constraint itself if it is a
+            `Model`, else the plant.
         memory: Of the episode.
         report: The info keys of its own, those in `info_keys`; `setup` writes what they are where nothing is known,
             and `observe` or `h_along` what they are in this step, of the executed control in the end.
@@ -90,6 +91,7 @@ class Constraint:
     """Whether those are looked at by Euler steps."""
 
     plant: Any
+    model: Any
     memory: Memory
     report: dict[str, Any]
 
@@ -101,16 +103,7 @@ class Constraint:
             ConfigurationError: Names or numbers that do not fit the plant.
         """
         self.plant = plant
-
-    @property
-    def model(self) -> Any:
-        """What predicts: what was set, else the constraint itself if it is a `Model`, else the plant."""
-        own: Any = self
-        return vars(self).get("_model", own if isinstance(self, Model) else self.plant)
-
-    @model.setter
-    def model(self, model: Any) -> None:
-        self._model = model
+        self.model = self if isinstance(self, Model) else plant
 
     def observe(self, memory: Memory) -> None:
         """Take the plant's present state; `memory["control"]` is what was executed before, if anything was.
