@@ -1,5 +1,6 @@
 """Traction: keep driven wheels on the stable side of a traction curve that nobody knows."""
 
+import copy
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -112,7 +113,7 @@ class Traction(Constraint):
     def observe(self, memory: Memory) -> None:
         """Take the state and measure what the last control step showed."""
         before = memory.get("traction") or self._start()
-        seen = memory["traction"] = self.seen = replace(before, estimate=before.estimate.copy())
+        seen = memory["traction"] = self.seen = replace(before, estimate=copy.deepcopy(before.estimate))
         self._measure(seen)
         self.report[keys.SLIP_RATIO] = seen.slip.copy()
         self.report[keys.SLIP_MU_ESTIMATE] = seen.estimate.mean

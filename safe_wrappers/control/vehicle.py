@@ -97,13 +97,6 @@ class FrictionEstimate:
         self._variance = np.full((wheels, self._peaks.size), _PRIOR_STD**2)
         self._log_weight = np.zeros((wheels, self._peaks.size))  # the largest is 0
 
-    def copy(self) -> "FrictionEstimate":
-        """One that goes on from here by itself."""
-        other = FrictionEstimate(len(self._height))
-        other._height, other._variance = self._height.copy(), self._variance.copy()
-        other._log_weight = self._log_weight.copy()
-        return other
-
     @property
     def weights(self) -> Array:
         """Probability of each hypothesis in `PEAK_SLIPS`, shape (n, k)."""
