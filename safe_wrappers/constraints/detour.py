@@ -17,7 +17,7 @@ class Detour(Constraint):
 
     @abstractmethod
     def nearest(self, neighbours: int) -> Array:
-        """The nearest discs in the machine's frame: see `control/numerics/shapes.py`."""
+        """The nearest discs in the machine's frame: see `control/shapes.py`."""
 
     def surroundings(self, neighbours: int) -> Array:
         """The side of the present detour by the share of its time that is left, and the nearest discs."""

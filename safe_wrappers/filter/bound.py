@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_wrappers.control.numerics.shapes import NUMBERS, squashed
 from safe_wrappers.control.projection import keeps_rows
+from safe_wrappers.control.shapes import NUMBERS, squashed
 from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import Tangents, differences

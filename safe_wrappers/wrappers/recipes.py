@@ -26,7 +26,7 @@ from safe_wrappers.constraints import (
     Workspace,
 )
 from safe_wrappers.constraints.joints import driven_joints
-from safe_wrappers.control.numerics.shapes import merged
+from safe_wrappers.control.shapes import merged
 from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.envs.goal_robots import CAR
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADIUS

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from safe_wrappers.control.bandwidth import ControlLoop
-from safe_wrappers.control.numerics.shapes import convex_outline
 from safe_wrappers.control.projection import project
+from safe_wrappers.control.shapes import convex_outline
 from safe_wrappers.control.teleop import ChannelLedger
 from safe_wrappers.errors import ConfigurationError
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 
-from safe_wrappers.control.numerics.shapes import (
+from safe_wrappers.control.shapes import (
     clearances_on_a_course,
     convex_outline,
     distance_to_outline,

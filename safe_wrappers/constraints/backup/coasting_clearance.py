@@ -11,7 +11,7 @@ import numpy as np
 
 from safe_wrappers.constraints.detour import Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
-from safe_wrappers.control.numerics.shapes import clearances_on_a_course, convex_outline, nearest_discs
+from safe_wrappers.control.shapes import clearances_on_a_course, convex_outline, nearest_discs
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,

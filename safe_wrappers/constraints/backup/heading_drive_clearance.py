@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers.constraints.detour import Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup.heading_drive import clearances, look, way_to_rest
-from safe_wrappers.control.numerics.shapes import nearest_discs
+from safe_wrappers.control.shapes import nearest_discs
 from safe_wrappers.errors import (
     Array,
     ConfigurationError,

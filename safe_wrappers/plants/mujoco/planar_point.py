@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.control.backup.damped_axis import DampedAxis, damped_axis
-from safe_wrappers.control.numerics.shapes import Rectangle, merged
+from safe_wrappers.control.shapes import Rectangle, merged
 from safe_wrappers.errors import Array, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.binding import refuse_mapped
 from safe_wrappers.plants.mujoco.model import AT_A_JOINT, SLIDE
