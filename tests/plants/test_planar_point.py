@@ -78,8 +78,6 @@ AMONG_OTHERS = [
     ({"slides": SLIDES + YAW, "ball": BALL.replace("size", 'pos="0.2 0 0" size')}, "is .* off that"),
     ({"ball": BALL + f'<body>{YAW}<geom pos="0.2 0 0" size="0.1"/></body>'}, "is .* off that"),
     ({"motors": TWO_MOTORS}, "only one"),
-    ({"slides": LIMITED}, "no limits"),
-    ({"slides": SPRINGS}, "springs"),
 ]
 """What is no point mass on two slides, alone or as the named body among other things that move."""
 
