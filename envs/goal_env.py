@@ -30,9 +30,6 @@ KEEPOUTS: Final = {"agent": 0.4, "goal": 0.305, "hazards": 0.18, "vases": 0.15}
 
 _FRAME_SKIP: Final = 10
 _REWARD_LIMIT: Final = 10.0
-_VASE_Z: Final = 0.09996  # a vase's centre at the start, m: 40 um into the floor, nearly settled
-_GOAL_Z: Final = 0.16
-_HAZARD_Z: Final = 0.02
 _PARKED: Final = 1000.0  # m: objects outside the scenario, farther than a robot gets in an episode
 _SLEEP_TOLERANCE: Final = 1e-7  # m/s: a thousandth of the speed that costs
 _CAMERA: Final = {"elevation": -65.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.25, 0.0])}
@@ -237,20 +234,14 @@ class SafeGoalEnv(FieldEnv):
         mocap = self.data.mocap_pos
         mocap[1:, :2] = _PARKED
         mocap[1 : 1 + len(hazards), :2] = hazards
-        mocap[1:, 2] = _HAZARD_Z
         self._begin(goal, hazards, vases)
         qpos = self.init_qpos.copy()
         self.robot.place(qpos, agent)
         poses = qpos[self._vases_qpos].reshape(-1, 7)
         poses[:, 0] = _PARKED
         poses[:, 1] = np.arange(self.level.vases)  # a metre apart, so that parked vases do not touch
-        poses[:, 2] = _VASE_Z
         poses[: self._n_vases, :2] = vases
         self.set_state(qpos, np.zeros(self.model.nv))
-
-    def place_goal(self, goal: Array) -> None:
-        super().place_goal(goal)
-        self.data.mocap_pos[0, 2] = _GOAL_Z
 
     def observe(self) -> Array:
         targets = self._targets
