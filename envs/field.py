@@ -19,6 +19,8 @@ from .layout import Given
 
 ASSETS: Final = Path(__file__).parent / "assets"
 """Where the models are."""
+PARKED: Final = 1000.0
+"""m: where objects outside the scenario are, farther than a robot gets in an episode."""
 METADATA: Final[dict[str, Any]] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}
 
 
@@ -145,10 +147,15 @@ class FieldEnv(TaskEnv):
     def _get_reset_info(self) -> dict[str, Any]:
         return {"goal_met": self._goal_met, GOALS_REACHED: self._goals_reached}
 
-    def _begin(self, goal: Array, *objects: Array) -> None:
-        """A new episode: no goal reached, and what the lidars see stands at these centres, shapes (n, 2), m."""
+    def _begin(self, goal: Array, fixed: Array, *others: Array) -> None:
+        """A new episode: no goal reached, and what the lidars see stands at these centres, shapes (n, 2), m.
+
+        What is `fixed` are the mocap bodies behind the goal; those that are more are parked.
+        """
         self._goals_reached, self._goal_met = 0, False
-        self._targets = np.concatenate([goal[None], *objects])
+        self._targets = np.concatenate([goal[None], fixed, *others])
+        self.data.mocap_pos[1:, :2] = PARKED
+        self.data.mocap_pos[1 : 1 + len(fixed), :2] = fixed
         self.place_goal(goal)
 
     def place_goal(self, goal: Array) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from safe_wrappers.errors import Array, ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP
 
-from .field import ASSETS, FieldEnv
+from .field import ASSETS, PARKED, FieldEnv
 from .goal_robots import CAR, LIDAR_BINS, POINT, Robot, pseudo_lidar
 from .layout import PLACE, POSE, Given, parse_layout, place_goal_beside, place_objects, places
 
@@ -30,7 +30,6 @@ KEEPOUTS: Final = {"agent": 0.4, "goal": 0.305, "hazards": 0.18, "vases": 0.15}
 
 _FRAME_SKIP: Final = 10
 _REWARD_LIMIT: Final = 10.0
-_PARKED: Final = 1000.0  # m: objects outside the scenario, farther than a robot gets in an episode
 _SLEEP_TOLERANCE: Final = 1e-7  # m/s: a thousandth of the speed that costs
 _CAMERA: Final = {"elevation": -65.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.25, 0.0])}
 _CAMERA_DISTANCE: Final = 2.8  # in half extents of the field
@@ -231,14 +230,11 @@ class SafeGoalEnv(FieldEnv):
         self._hazards, self._n_vases = hazards, len(vases)
         # Of the lidars: without hazards, vases are the second.
         self._groups = np.repeat([0, 1, 1 + (self.level.hazards > 0)], [1, len(hazards), len(vases)])
-        mocap = self.data.mocap_pos
-        mocap[1:, :2] = _PARKED
-        mocap[1 : 1 + len(hazards), :2] = hazards
         self._begin(goal, hazards, vases)
         qpos = self.init_qpos.copy()
         self.robot.place(qpos, agent)
         poses = qpos[self._vases_qpos].reshape(-1, 7)
-        poses[:, 0] = _PARKED
+        poses[:, 0] = PARKED
         poses[:, 1] = np.arange(self.level.vases)  # a metre apart, so that parked vases do not touch
         poses[: self._n_vases, :2] = vases
         self.set_state(qpos, np.zeros(self.model.nv))

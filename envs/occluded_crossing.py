@@ -140,7 +140,7 @@ class OccludedCrossingEnv(FieldEnv):
     @property
     def pillar_positions(self) -> Array:
         """Centres of the pillars, shape (4, 2), m."""
-        return self._pillars.copy()
+        return np.array(self._targets[1:])
 
     @property
     def car_positions(self) -> Array:
@@ -182,7 +182,7 @@ class OccludedCrossingEnv(FieldEnv):
         self._judge(self.data.qpos[None, :2], self.data.qpos[None, _CARS])
 
     def _next_goal(self) -> Array:
-        return _sample_goal(self.np_random, self.agent_position, self._pillars)
+        return _sample_goal(self.np_random, self.agent_position, self._targets[1:])
 
     def _is_finite(self, observation: Array) -> bool:
         return math.isfinite(float(self.data.qpos.sum() + self.data.qvel.sum()))
@@ -193,7 +193,7 @@ class OccludedCrossingEnv(FieldEnv):
         goal_x, goal_y = self._targets[0].tolist()
         observation = np.empty(9 + 2 * PILLARS)
         observation[:9] = x, y, vx, vy, math.cos(heading), math.sin(heading), yaw_rate, goal_x - x, goal_y - y
-        observation[9:] = (self._pillars - self.data.qpos[:2]).ravel()
+        observation[9:] = (self._targets[1:] - self.data.qpos[:2]).ravel()
         return observation
 
     def _get_reset_info(self) -> dict[str, Any]:
@@ -234,9 +234,7 @@ class OccludedCrossingEnv(FieldEnv):
 
     def _apply(self, agent: Array, goal: Array, cars: Array, pillars: Array) -> None:
         """Start an episode from a layout, the robot at rest."""
-        self._pillars = pillars
-        self.data.mocap_pos[1:, :2] = pillars
-        self._begin(goal)
+        self._begin(goal, pillars)
         qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
         qpos[:3] = agent
         qpos[_CARS], qvel[_CARS] = cars.T

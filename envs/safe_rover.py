@@ -51,9 +51,6 @@ LAYOUT_KEYS: Final = ("agent", "goal", "hazards", "patches", "ground", "speed")
 _FRAME_SKIP: Final = 5
 _LIDAR_RANGE: Final = 12.0  # m: across the field
 _SETTLING: Final = 12  # rounds until loads and tyre forces agree: each leaves a quarter of the difference
-_PARKED: Final = (
-    1000.0  # m: hazards and patches that are not there, farther than the rover gets in an episode
-)
 _COLOURS: Final = {
     "dry": (0.55, 0.5, 0.45, 0.6),
     "wet": (0.25, 0.35, 0.45, 0.6),
@@ -280,7 +277,7 @@ class SafeRoverEnv(FieldEnv):
         self._hazards = hazards.tolist()
         self._grounds = Ground(ground, patches)
         self._begin(goal, hazards)
-        self._show(hazards)
+        self._show_grounds()
         x, y, heading = agent.tolist()
         qpos, qvel = self.init_qpos.copy(), np.zeros(self.model.nv)
         qpos[:2] = x, y
@@ -289,11 +286,9 @@ class SafeRoverEnv(FieldEnv):
         qvel[self.wheel_dofs] = speed / self.wheel_radius
         self.set_state(qpos, qvel)
 
-    def _show(self, hazards: Array) -> None:
-        """Move what is drawn of hazards and patches where they are; none of it touches anything."""
+    def _show_grounds(self) -> None:
+        """Move what is drawn of patches where they are; none of it touches anything."""
         mocap, model, ground = self.data.mocap_pos, self.model, self._grounds
-        mocap[1:, :2] = _PARKED
-        mocap[1 : 1 + len(hazards), :2] = hazards
         first = len(mocap) - len(self._patch_geoms)
         for i, (patch, geom) in enumerate(zip(ground.patches, self._patch_geoms, strict=False)):
             mocap[first + i, :2] = patch.center
