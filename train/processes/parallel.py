@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
 from typing import Any, Final
 
 from rich.console import Console
@@ -20,6 +21,7 @@ from ..files import say
 from . import ONE_THREAD, STOPPED, Interrupted, Job, Message, RunsFailedError, environment, work
 
 _POLL_S: Final = 0.2
+_KILLED: Final = "its process was killed (out of memory?). The same command goes on from its last checkpoint."
 _SAVE_S: Final = 60.0
 """How long stopped jobs may take: a rollout, its update and a checkpoint with a large replay buffer."""
 
@@ -114,66 +116,58 @@ def _noted_signals() -> Iterator[list[int]]:
             signal.signal(which, signal.SIG_DFL if handler is None else handler)
 
 
-_here: dict[str, Any] = {}
-"""In a job's process: the queue of its messages, and the event that stops it."""
-
-
 class LocalWorkers:
-    """An executor of one process for each job: one that is killed, or runs out of memory, takes no other with it."""
+    """A process for each job: one that is killed, or runs out of memory, takes no other with it."""
 
     def __init__(self, at_once: int | None) -> None:
         # A container may have fewer than the machine; macOS does not tell.
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self.at_once = at_once or cores
-        self._running: dict[Future[str], tuple[Job, ProcessPoolExecutor, Any, Any]] = {}
+        self._running: dict[Connection, tuple[Job, SpawnProcess, Any]] = {}
 
     def start(self, job: Job) -> None:
         """Begins a job."""
         context = multiprocessing.get_context("spawn")
-        queue, stop = context.SimpleQueue(), context.Event()
-        pool = ProcessPoolExecutor(1, context, _begin, (queue, stop))
-        self._running[pool.submit(_work, job)] = job, pool, queue, stop
+        stop, (messages, told) = context.Event(), context.Pipe(duplex=False)
+        process = context.Process(target=_work, args=(pickle.dumps(job), told, stop))
+        process.start()
+        told.close()  # the job's process alone has it now: its end is seen here
+        self._running[messages] = job, process, stop
 
     def messages(self, timeout_s: float) -> Iterator[tuple[str, Message]]:
-        """What jobs have to say, by their names; waits for an end, for at most so long."""
-        ended = wait(self._running, timeout_s, "FIRST_COMPLETED").done if self._running else set()
-        for future, (job, pool, queue, _) in list(self._running.items()):
-            while not queue.empty():
-                yield job.name, queue.get()
-            if future in ended:
-                del self._running[future]
-                pool.shutdown(wait=False)  # taking torch down can take seconds
-                yield job.name, ("end", _told(future))
+        """What jobs have to say, by their names; waits for a message, for at most so long."""
+        wait(list(self._running), timeout_s)
+        for messages, (job, _, _) in list(self._running.items()):
+            if not messages.poll():
+                continue
+            try:
+                message: Message = messages.recv()
+            except (EOFError, OSError):
+                message = "end", _KILLED
+            if message[0] == "end":  # not waited for: taking torch down can take seconds
+                del self._running[messages]
+            yield job.name, message
 
     def stop(self, name: str) -> None:
         """Asks a job to save and end."""
-        for job, _, _, stop in self._running.values():
+        for job, _, stop in self._running.values():
             if job.name == name:
                 stop.set()
 
     def kill(self) -> None:
         """Ends all jobs at once."""
-        if self._running:
-            for child in multiprocessing.active_children():
-                child.kill()
-        for _, pool, _, _ in self._running.values():
-            pool.shutdown()
+        for _, process, _ in self._running.values():
+            process.kill()
+            process.join()
 
 
-def _told(future: Future[str]) -> str:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        return "its process was killed (out of memory?). The same command goes on from its last checkpoint."
-
-
-def _begin(queue: Any, stop: Any) -> None:
-    """In a job's process, before all else."""
-    _here.update(queue=queue, stop=stop)
+def _work(pickled: bytes, told: Connection, stop: Any) -> None:
+    """A job's process; what the job needs is imported when signals are dealt with."""
     # A terminal, or a machine that goes down, sends these to every process; the first one's answer is enough.
     for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(which, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    told.send(("end", work(pickle.loads(pickled), told.send, stop.is_set)))
 
 
 def _end_with_parent() -> None:
@@ -181,7 +175,3 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-def _work(job: Job) -> str:
-    return work(job, _here["queue"].put, _here["stop"].is_set)
