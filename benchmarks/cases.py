@@ -15,6 +15,7 @@ from benchmarks.car_drivers import DRIVERS as CAR_GOAL
 from benchmarks.drivers import CROSSING, PATROLLED, Maker
 from benchmarks.drivers import DRIVERS as POINT_GOAL
 from benchmarks.judges import Judge, Replay, Reported
+from safe_wrappers.envs import SPEED_LIMITS
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
 from safe_wrappers.wrappers.recipes import SHADOW_HAND_TIED
 
@@ -153,7 +154,7 @@ _OFF_THE_TABLE = drivers.point_seeking(
 )
 
 
-def _velocity(robot: str, limit: float, plane: bool = False) -> Case:
+def _velocity(robot: str, limit: float, plane: bool) -> Case:
     sprint = drivers.sprinting if plane else drivers.sprinting_along_x
     return Case(
         f"Safe{robot}Velocity-v0",
@@ -216,12 +217,7 @@ PROTECTED: dict[str, Case] = _by_name(
         ),
         _SPEED | {"off the table": _OFF_THE_TABLE},
     ),
-    _velocity("HalfCheetah", 3.2096),
-    _velocity("Hopper", 0.7402),
-    _velocity("Walker2d", 2.3415),
-    _velocity("Swimmer", 0.2282),
-    _velocity("Ant", 2.6222, plane=True),
-    _velocity("Humanoid", 1.4149, plane=True),
+    *(_velocity(robot, limit, robot in ("Ant", "Humanoid")) for robot, limit in SPEED_LIMITS.items()),
     Case("HumanoidStandup-v5", _replayed(_joint_speeds(20.0)), _SPEED),
     # At the edge of another ground a step or two overshoot the limit of 0.15; beyond 0.2 all grounds have fallen.
     Case(
@@ -268,11 +264,9 @@ PROTECTED: dict[str, Case] = _by_name(
 )
 """Every env that `protect` knows, by the name of its row."""
 
-HARD: dict[str, Case] = _by_name(
+CASES: dict[str, Case] = PROTECTED | _by_name(
     Case("InvertedPendulum-v5", _RAIL_ENDS, _RAIL),
-    _fallen("InvertedPendulum-v5"),
     Case("InvertedDoublePendulum-v5", _RAIL_ENDS, _RAIL),
-    _fallen("InvertedDoublePendulum-v5"),
     Case(
         "Reacher-v5",
         _replayed(
@@ -283,10 +277,6 @@ HARD: dict[str, Case] = _by_name(
         _reacher_and_disc,
         note="with a disc",
     ),
-    PROTECTED["Pusher-v5"],
-    PROTECTED["PointMaze_UMaze-v3"],
     _point_maze("Large"),
 )
-"""The envs with a hard limit, likewise: what tests and other benchmarks attack besides."""
-
-CASES: dict[str, Case] = PROTECTED | HARD
+"""Likewise, with those that tests and other benchmarks attack besides."""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from benchmarks import judges
 from benchmarks.__main__ import names
-from benchmarks.cases import HARD, PROTECTED
+from benchmarks.cases import CASES, PROTECTED
 from benchmarks.judges import Replay, Reported
 from safe_wrappers.wrappers.recipes import RECIPES
 
@@ -85,7 +85,7 @@ def test_a_fingertip_in_a_disc_or_a_joint_with_a_motor_that_is_too_fast(reacher,
     x, y = 0.1 * np.cos(shoulder) + 0.11 * np.cos(both), 0.1 * np.sin(shoulder) + 0.11 * np.sin(both)
     inside = 0.05 - np.hypot(x + 0.1, y - 0.1)
     assert PROTECTED["Reacher-v5"].judge(raw).start() == pytest.approx(fast)
-    missed = HARD["Reacher-v5, with a disc"].judge(raw).start()
+    missed = CASES["Reacher-v5, with a disc"].judge(raw).start()
     assert missed == pytest.approx(max(inside, fast), abs=1e-9)
 
 
