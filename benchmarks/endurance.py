@@ -31,6 +31,7 @@ import safe_wrappers as sw
 from benchmarks import trained_adversary
 from benchmarks.cases import CASES
 from benchmarks.drivers import Maker
+from benchmarks.judges import counted
 from benchmarks.mujoco_drivers import corner_seeking
 from benchmarks.searching_drivers import SEARCHES, SearchingDriver
 from benchmarks.tables import keep, markdown, measured, options, total
@@ -52,6 +53,7 @@ CARS_EVERY, SEARCHES_EVERY = 3, 10
 """Rounds: a car's step takes four times as long as a point's, and one of a search a hundred times."""
 TOGETHER = 16
 """Envs that a hand-written driver attacks at once."""
+_READ = ("cost_substep", "cbf/margin", *(f"cbf/{name}" for name in FLAGS))
 _VERSIONS = ("safe-wrappers", "mujoco", "gymnasium", "gymnasium-robotics", "numpy", "numba", "torch")
 
 
@@ -126,18 +128,10 @@ def attack(chunk: Chunk) -> dict[str, Any]:
             judges[i].before()
         _, _, terminated, truncated, infos = envs.step(actions)
         for i in judged:
-            info = {key: infos[key][i] for key in ("cost_substep",) if key in infos}
+            info = {key: infos[key][i].item() for key in _READ if key in infos}
             missed = judges[i].after(infos["executed_action"][i] if chunk.filtered else actions[i], info)
-            if not missed <= 0.0:  # so that what is not a number counts
-                tally.violations += 1
-                flags = [name for name in FLAGS if chunk.filtered and infos[f"cbf/{name}"][i]]
-                tally.unflagged += not {*flags} - {"intervened"}
-        if chunk.filtered and judged:
-            for name in FLAGS:
-                setattr(tally, name, getattr(tally, name) + int(infos[f"cbf/{name}"][judged].sum()))
-            lowest = float(infos["cbf/margin"][judged].min())
-            tally.smallest = lowest if tally.smallest is None else min(lowest, tally.smallest)
-        tally.steps += len(judged)
+            found = counted(info, not missed <= 0.0)  # so that what is not a number counts
+            tally = tally.plus(Tally(1, **found, smallest=info.get("cbf/margin")))
         ended = terminated | truncated
     row = asdict(tally)
     envs.close()
