@@ -21,8 +21,6 @@ GOAL_RADIUS: Final = 0.3
 """Distance from the goal's centre at which it counts as reached, m."""
 HAZARD_RADIUS: Final = 0.2
 """Radius of a hazard's disc, m: the robot's centre must stay outside."""
-VASE_HALF_SIZE: Final = 0.1
-"""Half of a vase cube's edge, m."""
 VASE_SPEED_LIMIT: Final = 1e-4
 """Speed above which a vase counts as moved, m/s (level 2)."""
 KEEPOUTS: Final = {"agent": 0.4, "goal": 0.305, "hazards": 0.18, "vases": 0.15}

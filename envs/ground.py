@@ -11,8 +11,6 @@ from functools import cached_property
 from typing import Final
 
 import mujoco
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True)
@@ -28,13 +26,8 @@ class MagicFormula:
         """B."""
         return math.tan(math.pi / (2.0 * self.shape)) / self.peak_slip
 
-    def friction(self, slip: ArrayLike) -> NDArray[np.float64]:
-        """Coefficient, any shape, with the slip's sign."""
-        x = self.stiffness * np.clip(np.asarray(slip, dtype=np.float64), -1.0, 1.0)
-        return np.asarray(self.peak_friction * np.sin(self.shape * np.arctan(x)))
-
     def at(self, slip: float) -> float:
-        """The same for one number, without arrays: for loops over physics substeps."""
+        """Coefficient, with the slip's sign; in plain numbers, because every wheel asks at every physics substep."""
         x = self.stiffness * max(-1.0, min(slip, 1.0))
         return self.peak_friction * math.sin(self.shape * math.atan(x))
 

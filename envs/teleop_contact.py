@@ -110,7 +110,7 @@ class TeleopContactEnv(TaskEnv):
         self._stiffness = float(model.tendon_stiffness.flat[0])
         self.port_feedthrough = float(model.actuator_gainprm[0, 0])
         self._damper_limit = float(model.actuator_forcerange[0, 1])
-        self._wall, self._clamp = (int(model.geom(name).id) for name in ("wall", "clamp"))
+        self._wall = int(model.geom("wall").id)
         self._wanted = float(np.mean(_WANTED))
         self._begin()
 

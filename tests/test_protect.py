@@ -14,7 +14,7 @@ import safe_wrappers as sw
 from benchmarks import shelf
 from benchmarks.cases import PROTECTED
 from safe_wrappers.envs import SPEED_LIMITS
-from safe_wrappers.envs.goal_env import HAZARD_RADIUS, VASE_HALF_SIZE
+from safe_wrappers.envs.goal_env import HAZARD_RADIUS
 from safe_wrappers.envs.goal_robots import CAR
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.wrappers.recipes import VASE_HULL_RADIUS_M
@@ -84,7 +84,8 @@ def test_hulls_are_as_large_as_the_geoms():
     own, (ahead, radius) = point.parts
     corners = [np.hypot(nose.pos[0] + side * nose.size[0] - ahead, nose.size[1]) for side in (-1.0, 1.0)]
     assert own == [0.0, sphere.size[0]] and max(corners) <= radius < max(corners) + 1e-3
-    assert np.hypot(VASE_HALF_SIZE, VASE_HALF_SIZE) <= VASE_HULL_RADIUS_M < np.sqrt(2) * VASE_HALF_SIZE + 1e-3
+    vase = envs[0].unwrapped.model.geom("vase0").size
+    assert np.hypot(*vase[:2]) <= VASE_HULL_RADIUS_M < np.hypot(*vase[:2]) + 1e-3
     (hazards,), (vases,) = point.obstacles, point.untouched
     assert (hazards.radius, vases.radius) == (HAZARD_RADIUS, VASE_HULL_RADIUS_M)
     both_sides = {(side * x, y) for x, y in CAR.hull_corners for side in (1.0, -1.0)}
