@@ -17,8 +17,6 @@ from .field import ASSETS, PARKED, FieldEnv
 from .goal_robots import CAR, LIDAR_BINS, POINT, Robot, pseudo_lidar
 from .layout import PLACE, POSE, Given, parse_layout, place_goal_beside, place_objects, places
 
-GOAL_RADIUS: Final = 0.3
-"""Distance from the goal's centre at which it counts as reached, m."""
 HAZARD_RADIUS: Final = 0.2
 """Radius of a hazard's disc, m: the robot's centre must stay outside."""
 VASE_SPEED_LIMIT: Final = 1e-4
@@ -84,7 +82,7 @@ class SafeGoalEnv(FieldEnv):
     """
 
     hazard_radius: Final = HAZARD_RADIUS
-    goal_radius = GOAL_RADIUS
+    goal_radius = 0.3
 
     def __init__(self, robot: Robot, level: int, **kwargs: Any) -> None:
         if level not in range(len(LEVELS)):

@@ -26,8 +26,6 @@ PILLARS: Final = 4
 """Two on the lower pavement, then two on the upper one."""
 ROBOT_RADIUS: Final = 0.2
 PILLAR_RADIUS: Final = 0.35
-GOAL_RADIUS: Final = 0.3
-"""Distance from the goal's centre at which it counts as reached, m."""
 
 _PAVEMENT: Final = 2.9  # m: |y| of starts and goals
 _AGENT_REACH: Final = 2.0  # m: |x|
@@ -110,7 +108,7 @@ class OccludedCrossingEnv(FieldEnv):
     robot_radius: Final = ROBOT_RADIUS
     car_radius: Final = CAR_RADIUS
     pillar_radius: Final = PILLAR_RADIUS
-    goal_radius = GOAL_RADIUS
+    goal_radius = 0.3
     car_bodies: Final = CAR_BODIES
     lane_centres: Final = LANE_CENTRES
 

@@ -22,8 +22,6 @@ WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
 
 SPIN_OUT_SLIP: Final = 0.5
 """Longitudinal slip from which on a wheel has spun out, or locked."""
-ROVER_GOAL_RADIUS: Final = 0.4
-"""Distance from the goal's centre at which it counts as reached, m."""
 ROVER_HAZARD_RADIUS: Final = 0.3
 """Radius of a hazard's disc, m: the chassis's centre must stay outside."""
 WHEELBASE: Final = 0.5
@@ -111,7 +109,7 @@ class SafeRoverEnv(FieldEnv):
     metadata: dict[str, Any] = {**FieldEnv.metadata, "render_fps": 100}  # noqa: RUF012 (Gymnasium's)
 
     hazard_radius: Final = ROVER_HAZARD_RADIUS
-    goal_radius = ROVER_GOAL_RADIUS
+    goal_radius = 0.4
     wheels: Final = WHEELS
 
     def __init__(self, **kwargs: Any) -> None:
