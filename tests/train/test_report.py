@@ -284,8 +284,3 @@ def test_the_planted_pair_is_found_wherever_it_is_in_any_unit(planted, columns):
     a, b = columns[:2]
     chosen = PLANTED[planted](NOISE[:, a], NOISE[:, b])
     assert telling_pair(np.exp(NOISE) * 1e4, chosen) == (min(a, b), max(a, b))
-
-
-def test_many_steps_are_thinned_but_rare_flags_are_kept():
-    coordinates = np.random.default_rng(0).normal(size=(60_000, 2))
-    assert telling_pair(coordinates, np.arange(60_000) == 1) == (0, 1)  # thinning by three would leave none

@@ -54,7 +54,6 @@ WIDTH: Final = 4.7
 """Inches: half of the page, or the whole of a phone's, so that the text can be read on both."""
 _CELLS: Final = 32
 _BINS: Final = 8
-_MOST_ROWS: Final = 20_000
 
 
 class Picture(NamedTuple):
@@ -155,9 +154,6 @@ def telling_pair(coordinates: NDArray[np.floating], flags: NDArray[np.bool_]) ->
     Returns:
         Their columns, in order.
     """
-    every = -(-len(flags) // _MOST_ROWS)
-    if flags[::every].any() and not flags[::every].all():
-        coordinates, flags = coordinates[::every], flags[::every]
     inner = np.linspace(0, 1, _BINS + 1)[1:-1]
     cells = [np.searchsorted(np.unique(np.quantile(column, inner)), column) for column in coordinates.T]
 
