@@ -74,15 +74,14 @@ def short_rows(summary: Summary, arm: ArmConfig) -> Iterator[tuple[str, list[Cel
         cell = summary.table[arm.name][condition]
         if not cell:
             continue
-        rows = [row for row in summary.per_seed if (row["arm"], row["condition"]) == (arm.name, condition)]
-        total = {key: int(sum(row.get(key, 0) for row in rows)) for key in ("steps", *SHORT)}
+        side = _side(summary, [arm], condition)
         violations, changed = Cell(NOT_JUDGED), [Cell("-")] * 3
-        if "violations" in cell:
-            mood = "bad" if total["violations"] else "good"
-            violations = Cell(f"{total['violations']:,}", f"of {total['steps']:,}", mood)
-        if "intervention_rate" in cell:
-            share = Cell(f"{100 * cell['intervention_rate'].iqm:.3g} %")
-            changed = [share, Cell(f"{total['infeasible']:,}"), Cell(f"{total['fallback']:,}")]
+        if side.violations is not None:
+            mood = "bad" if side.violations else "good"
+            violations = Cell(f"{side.violations:,}", f"of {side.steps:,}", mood)
+        if side.changed is not None:
+            share = Cell(f"{100 * side.changed:.3g} %")
+            changed = [share, Cell(f"{side.infeasible:,}"), Cell(f"{side.fallback:,}")]
         yield title, [_estimate(cell, "return"), _estimate(cell, "cost"), violations, *changed]
 
 
