@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.tables import options
-from safe_wrappers.envs.patrolled_maze import MarkingRenderer
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.videos import encode, with_strip
 from safe_wrappers.wrappers.safety_overlay import set_size
@@ -74,7 +73,6 @@ class Side:
         set_size(self.env, PANEL, PANEL)
         self.task: Any = self.env.unwrapped
         self.task.mujoco_renderer.default_cam_config = CAMERA
-        self.task.mujoco_renderer = MarkingRenderer(self.task.mujoco_renderer, self._markers)
         model = self.task.model
         for geom in range(model.ngeom):
             if model.geom(geom).name in ("agent", "pointarrow"):
@@ -100,6 +98,8 @@ class Side:
 
     def frame(self) -> Image.Image:
         """The picture of now, between words, and the strip of time."""
+        for marker in self._markers():
+            self.task.mujoco_renderer._get_viewer("rgb_array").add_marker(**marker)
         whole = Image.new("RGB", (PANEL, HEAD + PANEL + FOOT), PAPER)
         whole.paste(Image.fromarray(np.asarray(self.env.render(), dtype=np.uint8)), (0, HEAD))
         draw, count, top = ImageDraw.Draw(whole), self.count, HEAD + PANEL + 6

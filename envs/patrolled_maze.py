@@ -1,12 +1,10 @@
 """PointMaze with patrols: discs that go up and down its corridors, hidden by its walls."""
 
 import math
-from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
 
 from safe_wrappers.control.estimation import Motion, Tracks
@@ -45,35 +43,6 @@ U_MAZE_PATROLS: Final = (((1, 1), (1, 3)), ((3, 1), (3, 3)))
 """The two long corridors of the U maze, each from its first cell to its last (row, column)."""
 
 
-class MarkingRenderer(MujocoRenderer):
-    """Draws what another renderer draws, and markers on top: in frames and in the window alike.
-
-    Markers lie in the renderer's scene alone. Model and data stay bit for bit as they are. Of the given renderer no
-    frame has been asked yet; `markers` is asked at every frame for what `mujoco.mjv_initGeom` takes: ``type``,
-    ``size``, ``pos``, ``rgba``.
-    """
-
-    def __init__(self, renderer: MujocoRenderer, markers: Callable[[], Sequence[dict[str, Any]]]) -> None:
-        super().__init__(
-            renderer.model,
-            renderer.data,
-            renderer.default_cam_config,
-            renderer.width,
-            renderer.height,
-            renderer.max_geom,
-            renderer.camera_id,
-            visual_options=renderer._vopt,
-        )
-        self._markers = markers
-
-    def render(self, render_mode: str | None) -> Any:
-        """A frame, as `MujocoRenderer.render`."""
-        viewer = self._get_viewer(render_mode)
-        for marker in self._markers():
-            viewer.add_marker(**marker)
-        return super().render(render_mode)
-
-
 class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     """gymnasium-robotics' PointMaze with discs that patrol; the ball's physics, observations and rewards stay.
 
@@ -82,7 +51,7 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     (standard deviation 0.15 m/s, time constant 2 s; `safe_wrappers.envs.traffic`), drawn without a discretisation
     error; at an end they turn about, as a ball off a wall. Patrols are no bodies of the model: they pass through the
     ball, and walls hide them from whoever looks along the floor. The observation has nothing of them. Frames show
-    them in orange, which the renderer adds (`MarkingRenderer`).
+    them in orange, in the renderer's scene alone: model and data stay bit for bit as they are.
 
     **Attributes**: `patrol_positions` and `patrol_velocities`, shape (2, 2), m and m/s; `patrol_tracks` (a
     `control.estimation.Tracks`): the same as tracks that are known exactly now. `agent_position`,
@@ -128,16 +97,19 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
         self._touching = np.zeros(len(ends), dtype=bool)
         renderer = self.point_env.mujoco_renderer
         renderer.default_cam_config = {**renderer.default_cam_config, **_CAMERA}
-        self.point_env.mujoco_renderer = MarkingRenderer(renderer, self._markers)
 
-    def _markers(self) -> list[dict[str, Any]]:
-        """The patrols, as a renderer draws them."""
-        size = np.array([PATROL_RADIUS, PATROL_RADIUS, _HEIGHT])
-        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
-        return [
-            {"type": kind, "size": size, "pos": np.array([x, y, 0.0]), "rgba": np.array(_COLOUR)}
-            for x, y in self.patrol_positions
-        ]
+    def render(self) -> Any:
+        """A frame with the patrols."""
+        self._mark_patrols()
+        return super().render()
+
+    def _mark_patrols(self) -> None:
+        """Have the next frame show the patrols."""
+        viewer = self.point_env.mujoco_renderer._get_viewer(self.render_mode)
+        size, colour = np.array([PATROL_RADIUS, PATROL_RADIUS, _HEIGHT]), np.array(_COLOUR)
+        for place in self.patrol_positions:
+            pos = np.append(place, 0.0)
+            viewer.add_marker(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=pos, rgba=colour)
 
     @property
     def dt(self) -> float:
@@ -206,6 +178,8 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     ) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Step PointMaze, move the patrols, and judge the whole way."""
         before = self.patrol_positions - self.agent_position
+        if self.render_mode == "human":  # the robot's own step draws
+            self._mark_patrols()
         observation, reward, terminated, truncated, info = super().step(action)
         if self._traffic.step_s != self.dt:
             self._traffic = Traffic(np.full(len(self._gone), PATROL_MEAN_SPEED), self.dt, 1)

@@ -230,7 +230,7 @@ def test_the_camera_follows_the_robot(env_id, monkeypatch):
         pytest.importorskip("gymnasium_robotics")
     env = for_film(gym.make(env_id, render_mode="rgb_array"))
     renderer, camera = find_renderer(env), mujoco.MjvCamera()
-    viewer = SimpleNamespace(cam=camera, scn=mujoco.MjvScene(renderer.model, 1000))
+    viewer = SimpleNamespace(cam=camera, scn=mujoco.MjvScene(renderer.model, 1000), add_marker=Mock())
     black = np.zeros((renderer.height, renderer.width, 3), dtype=np.uint8)
     monkeypatch.setattr(renderer, "_get_viewer", lambda mode: viewer)  # without GL
     monkeypatch.setattr(renderer, "render", lambda mode: black)
