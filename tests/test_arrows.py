@@ -25,8 +25,6 @@ FORBIDDEN = dict.fromkeys(("control", "filter", "errors", "info"), LEARNERS | SI
     "train": set(),
 }
 """By folder; elsewhere the learners."""
-IN_A_FUNCTION = {"models.py": {"torch"}}
-"""What a module imports only where it is asked to fit; the test of the wheel says that importing us does not."""
 
 
 def imports(path, module):
@@ -65,7 +63,7 @@ def test_no_arrow_points_back_up_and_heavy_libraries_stay_in_their_layers(module
     used = {place(name) for name in IMPORTS[module] if name.partition(".")[0] == "safe_wrappers"}
     assert used <= {own}.union(*FLOORS[:floor])
     roots = {name.partition(".")[0] for name in IMPORTS[module]}
-    assert not roots & FORBIDDEN.get(own, LEARNERS) - IN_A_FUNCTION.get(PATHS[module].name, set())
+    assert not roots & FORBIDDEN.get(own, LEARNERS)
 
 
 # The appendix's systems: every row's formulas are used by what it says --------------------------------------------
