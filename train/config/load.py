@@ -153,7 +153,7 @@ def _conflicts(arm: ArmConfig) -> list[tuple[bool, str]]:
             " {ornstein_uhlenbeck: 0.1} or none.",
         ),
         (
-            learner.of_filter and arm.filter.kind == "none",
+            learner.kind != "naive" and arm.filter.kind == "none",
             "without a filter no action is ever changed; leave `learner` out, or give the arm a filter.",
         ),
         (

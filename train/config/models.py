@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
 
@@ -45,10 +45,6 @@ def check_env_id(env_id: str) -> str:
     return check_name(env_id, gym.registry)
 
 
-def _check_algorithm(name: str) -> str:
-    return check_name(name, ALGORITHMS)
-
-
 @dataclass(frozen=True)
 class LearnerConfig(Section):
     """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
@@ -81,11 +77,6 @@ class LearnerConfig(Section):
     def penalised(self) -> bool:
         """Whether the reward is reduced where the action was changed."""
         return self.kind == "adaption_penalty"
-
-    @property
-    def of_filter(self) -> bool:
-        """Whether it needs a filter: all but a price on cost does."""
-        return replace(self, cost_limit=None, multiplier_rate=NAIVE.multiplier_rate) != NAIVE
 
     @property
     def stores_executed(self) -> bool:
@@ -214,7 +205,7 @@ class ArmConfig(Section):
     name: FolderName
     env: EnvConfig
     """The env: an id, or the keys of [`env`](#env)."""
-    algorithm: Annotated[str, AfterValidator(_check_algorithm)]
+    algorithm: Annotated[str, AfterValidator(lambda name: check_name(name, ALGORITHMS))]
     """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.7,<3'` also `TQC`, `CrossQ`,
     `TRPO`, `QRDQN`; with `pip install 'safe-wrappers[sbx]'` also `sbx.SAC`, `sbx.TD3`, `sbx.TQC`, `sbx.CrossQ`,
     `sbx.PPO`, [in JAX](concepts/learner.md#which-algorithm-can-do-which). `DQN` and `QRDQN` are for discrete actions;
