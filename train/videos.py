@@ -11,7 +11,6 @@ import json
 import os
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -231,8 +230,7 @@ def record_video(
     """Runs the shown episode and writes its film, with what a filter knows drawn into it, and its facts."""
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint.folder)
-    filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
-    with contextlib.closing(for_film(make_stack(filmed, used))) as env:
+    with contextlib.closing(for_film(make_stack(arm.env, used, render_mode="rgb_array"))) as env:
         animation, said = film_episode(policy, env, shown.episode_seed)
     write_bytes(path, animation)
     state = _state(arm, used, shown, checkpoint.timesteps)
