@@ -20,7 +20,7 @@ from .evaluation.evaluate import typical_seed
 from .files import say, write_bytes
 from .policies import load_policy
 from .run.stack import make_env
-from .videos import drawing_without_a_screen, film_episode, for_film, without_gl
+from .videos import drawing_without_a_screen, film_episode, for_film, why_blind
 
 Policy = Callable[[Any], Any]
 
@@ -41,11 +41,7 @@ def enjoy_command(
     mode = "human" if window else "rgb_array" if film is not None else None
     if mode is not None:
         with closing(trained.make_env("none")) as bare:
-            modes, blind = bare.unwrapped.metadata.get("render_modes") or (), without_gl(bare)
-        if mode not in modes:
-            raise ConfigurationError(
-                f"{trained.arm.env.id} has no render mode {mode}; it has: {', '.join(modes)}"
-            )
+            blind = why_blind(bare, mode)
         if blind is not None:
             raise ConfigurationError(f"{'--render' if window else '--output'}: {blind}")
     found: list[dict[str, Any]] = []

@@ -61,8 +61,12 @@ def drawing_without_a_screen() -> Iterator[None]:
         yield
 
 
-def without_gl(env: gym.Env[Any, Any]) -> str | None:
-    """Says that MuJoCo is to draw an env and may not; None otherwise."""
+def why_blind(env: gym.Env[Any, Any], mode: str) -> str | None:
+    """Says why an env draws nothing in a render mode: it has no such one, or MuJoCo may not; None if it draws."""
+    modes = env.unwrapped.metadata.get("render_modes") or ["none"]
+    if mode not in modes:
+        env_id = env.spec.id if env.spec is not None else env.unwrapped
+        return f"{env_id} has no render mode {mode}; it has: {', '.join(modes)}."
     if find_renderer(env) is None or hasattr(mujoco, "GLContext"):
         return None
     return f"MUJOCO_GL={os.environ.get('MUJOCO_GL')} has MuJoCo draw nothing."
@@ -198,9 +202,7 @@ def record_videos(experiment: ExperimentConfig, console: Console) -> None:
     for arm in experiment.arms:
         folder = experiment.run_folder(arm, shown.seed)
         with contextlib.closing(make_env(arm.env.id, arm.env.kwargs)) as env:
-            draws = "rgb_array" in (env.unwrapped.metadata.get("render_modes") or ())
-            blind = None if draws else f"{arm.env.id} draws no frames (it has no render mode rgb_array)."
-            blind = blind or without_gl(env)
+            blind = why_blind(env, "rgb_array")
         for condition, used in conditions(arm, experiment.evaluation_filter).items():
             path = video_path(experiment, arm, condition)
             state = _state(arm, used, shown, finished_checkpoint(arm, shown.seed, folder).timesteps)

@@ -132,7 +132,7 @@ def test_where_nothing_can_be_drawn_one_line_says_so_and_nothing_is_tried(finish
     monkeypatch.delattr("mujoco.GLContext", raising=False)
     assert said(experiment) == "No videos: MUJOCO_GL=disabled has MuJoCo draw nothing.\n"
     monkeypatch.setattr(videos, "make_env", lambda *_: gym.make("fake_task:FakeGoal-v0"))
-    assert "draws no frames (it has no render mode rgb_array)" in said(experiment)
+    assert "FakeGoal-v0 has no render mode rgb_array; it has: none." in said(experiment)
     assert said(finished("evaluation.films=false")) == "" and taken(inline) == []
 
 
