@@ -81,10 +81,7 @@ def write_report(
             and (video := load_video(video_path(experiment, arm, condition))) is not None
         ],
         acting=acting,
-        interventions=[] if not acting else [
-            refusals(acting),
-            *_places(experiment, acting),
-        ],
+        interventions=[refusals(acting), *_places(experiment, acting)],
         most_steps=MOST_STEPS,
         left_out=sum(log.left_out for log in acting.values()),
         curves=[curve_picture(*_CURVES[metric], of_arms, names) for metric, of_arms in curves.items()],
