@@ -152,8 +152,13 @@ def crash(progress):
     raise ValueError("nobody expected this")
 
 
-def vanish(progress):
-    """A job whose process is killed."""
+def vanish(pid_file, progress):
+    """A job whose process is killed; one that it began lives on, and its number stands in the file until it ends."""
+    if not (child := os.fork()):
+        time.sleep(20.0)
+        pid_file.unlink()
+        os._exit(0)
+    pid_file.write_text(str(child))
     os.kill(os.getpid(), signal.SIGKILL)
 
 

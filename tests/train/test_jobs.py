@@ -23,10 +23,12 @@ def job(name, call, *arguments):
     return Job(name, 100, "steps", call, arguments)
 
 
-def test_side_by_side_lines_in_a_file_and_a_failure_beside_others():
-    text, jobs = io.StringIO(), [job("gone", fake_task.vanish), job("good", fake_task.count, 10)]
+def test_side_by_side_lines_in_a_file_and_a_failure_beside_others(tmp_path):
+    text, left = io.StringIO(), tmp_path / "pid"
+    jobs = [job("gone", fake_task.vanish, left), job("good", fake_task.count, 10)]
     with pytest.raises(RunsFailedError) as failure:
         run_jobs(jobs, 2, Console(file=text, width=100), "Counting")
+    os.kill(int(left.read_text()), signal.SIGKILL)  # what the killed job began was not waited for
     assert failure.value.names == {"gone"}
     assert str(failure.value).startswith("Counting: 1 of 2 failed.\ngone: its process was killed")
     begun, lines = text.getvalue().splitlines()[:2], text.getvalue().splitlines()[2:]

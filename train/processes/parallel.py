@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, Final
@@ -137,13 +137,14 @@ class LocalWorkers:
     def messages(self, timeout_s: float) -> Iterator[tuple[str, Message]]:
         """What jobs have to say, by their names; waits for a message, for at most so long."""
         wait(list(self._running), timeout_s)
-        for messages, (job, _, _) in list(self._running.items()):
-            if not messages.poll():
+        for messages, (job, process, _) in list(self._running.items()):
+            alive = process.is_alive()  # asked first, as the last message may come in between
+            message: Message = "end", _KILLED  # also where a process that the job began holds the pipe open
+            if messages.poll():
+                with suppress(EOFError, OSError):
+                    message = messages.recv()
+            elif alive:
                 continue
-            try:
-                message: Message = messages.recv()
-            except (EOFError, OSError):
-                message = "end", _KILLED
             if message[0] == "end":  # not waited for: taking torch down can take seconds
                 del self._running[messages]
             yield job.name, message
