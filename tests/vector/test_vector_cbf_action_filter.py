@@ -3,8 +3,10 @@
 The oracle is Gymnasium's own vector env around `CBFActionFilter`s.
 """
 
+import copy
 import dataclasses
 import functools
+import pickle
 from unittest import mock
 
 import gymnasium as gym
@@ -124,11 +126,19 @@ def test_it_is_a_vector_env_of_filtered_envs(name):
     assert [one.filter_calls for one in together.filters] == [one.filter_calls for one in alike.envs]
 
 
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
+def test_a_copy_has_the_same_episodes(again):
+    alike, used = pair(functools.partial(gym.make, "Reacher-v5"), [sw.constraints.JointSpeedLimit(1.0)])
+    assert play(alike, used, script(used)) > 3
+    play(alike, again(used), script(used))
+
+
 def test_actions_of_another_shape_and_other_vector_envs_are_refused():
     envs = sw.protect(gym.make_vec("SafePointGoal1-v0", 2, vectorization_mode="sync"))
     envs.reset(seed=0)
-    with pytest.raises(sw.SafeWrappersError, match="expected an action of shape"):
-        envs.step(np.zeros(2))
+    for wrong in (np.zeros(2), np.zeros((3, 2)), [[0.1], [0.1, 0.2]], "fast", None, np.ma.masked_all((2, 2))):
+        with pytest.raises(sw.SafeWrappersError, match="expected an action of shape"):
+            envs.step(wrong)
     with pytest.raises(sw.SafeWrappersError, match="VectorCBFActionFilter inside the filter"):
         sw.protect(envs)
     scaled = gym.wrappers.vector.ClipAction(gym.make_vec("SafePointGoal1-v0", 2, vectorization_mode="sync"))
@@ -146,13 +156,15 @@ def test_it_goes_around_vector_wrappers_and_warns_once_and_not_once_for_every_en
     assert len(said) == 1
 
 
-def test_after_a_reset_that_one_env_refuses_no_step_is_made():
+def test_before_a_reset_and_after_one_that_an_env_refuses_no_step_is_made():
     envs = sw.VectorCBFActionFilter(
         gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="sync"),
         [sw.constraints.JointSpeedLimit(limit=4.0)],
     )
-    envs.reset(seed=0)
     actions = np.zeros((2, 2), dtype=np.float32)
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.step(actions)
+    envs.reset(seed=0)
     envs.step(actions)
     refuses = mock.patch.object(
         envs.filters[1].filter.bound[0], "observe", side_effect=ConfigurationError("no")
