@@ -388,6 +388,9 @@ def no_array_of_numbers(action):
         "masked": masked,
         "a list with a masked entry": list(masked),
         "text": np.full(action.shape, "0.1"),
+        "ragged": ([0.5], [1, 2]),
+        "nothing": None,
+        "a mapping": {},
     }
 
 

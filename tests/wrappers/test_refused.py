@@ -256,25 +256,3 @@ def test_an_env_that_does_not_say_how_long_a_step_lasts_is_told_what_to_give(kin
         FAULTS[kind](env, *arguments)
     env.unwrapped.dt = 0.05
     assert FAULTS[kind](env, *arguments).control_dt == 0.05
-
-
-@pytest.mark.parametrize("name", ["CBFActionFilter", "LeaseExpiry", "TeleopChannel", "ChunkHandover"])
-def test_an_action_of_another_shape_is_refused_and_the_env_not_stepped(name):
-    env_id, arguments = example(name, next(iter(EXAMPLES[name])))
-    env = getattr(sw, name)(gym.make(env_id), **arguments())
-    env.reset(seed=0)
-    shape = env.action_space.shape
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(env.unwrapped, "step", lambda action: pytest.fail("the env was stepped"))
-        for action in (
-            np.zeros((*shape, 1)),
-            np.zeros((1, *shape)),
-            0.5,
-            [],
-            "left",
-            None,
-            [[0.5], [1, 2]],
-            {},
-        ):
-            with pytest.raises(sw.errors.ActionError, match=rf"expected an action of shape \({shape[0]},"):
-                env.step(action)
