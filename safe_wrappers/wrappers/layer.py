@@ -2,10 +2,9 @@
 
 import inspect
 import math
-import os
 import warnings
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar, Final, Self, SupportsFloat
 
 import gymnasium as gym
@@ -23,7 +22,6 @@ from safe_wrappers.errors import (
     numbers_of,
     shown,
 )
-from safe_wrappers.plants import Plant, PlantTemplate
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.serialize import plain_data
 from safe_wrappers.wrappers.stack import Layer, refuse_order
@@ -51,7 +49,7 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         """A wrapper whose constructor's arguments are recorded as they were given, as plain data."""
         made = super().__new__(cls)
         if arguments or named:  # a copy is made without any, and gets the recorded ones with its state
-            given = _plain(_by_name(made, arguments, named))
+            given = plain_data(_by_name(made, arguments, named))
             gym.utils.RecordConstructorArgs.__init__(made, **given)
         return made
 
@@ -171,22 +169,6 @@ def _by_name(made: Env, arguments: tuple[Any, ...], named: dict[str, Any]) -> di
         elif nameless := [one for one in value if not isinstance(one, gym.Env)]:
             found[f"*{name}"] = nameless
     return {name: value for name, value in found.items() if name != "env" and value is not made}
-
-
-def _plain(given: Any) -> Any:
-    """An argument as plain data, where it is any; a plant as a template."""
-    if isinstance(given, Plant):
-        return PlantTemplate(given)
-    if isinstance(given, Mapping):
-        return {name: _plain(value) for name, value in given.items()}
-    if isinstance(given, list | tuple):
-        return [_plain(one) for one in given]
-    if isinstance(given, np.ndarray | np.generic):
-        return given.tolist()
-    if isinstance(given, os.PathLike):
-        return os.fspath(given)
-    plain = plain_data(given)
-    return _plain(plain) if isinstance(plain, dict) else plain
 
 
 def refuse_vector_env(env: Any, name: str) -> None:

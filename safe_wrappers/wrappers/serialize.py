@@ -1,17 +1,20 @@
-"""Constraints, obstacles and settings as plain data: to record a wrapper, rebuild it, and write it as JSON."""
+"""Constructor arguments as plain data: to record a wrapper, rebuild it, and write it as JSON."""
 
+import os
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
+
+import numpy as np
 
 from safe_wrappers import constraints
 from safe_wrappers.constraints.obstacles import KINDS as OBSTACLES
 from safe_wrappers.errors import of_kind
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.plants import Plant, PlantTemplate
 
-_EXPORTED = [getattr(constraints, name) for name in constraints.__all__ if name != "Constraint"]
-KINDS: dict[str, type[Constraint]] = {
-    kind.__name__: kind for kind in _EXPORTED if issubclass(kind, Constraint)
-}
+_EXPORTED = [getattr(constraints, name) for name in constraints.__all__]
+KINDS: dict[str, type[Constraint]] = {k.__name__: k for k in _EXPORTED if issubclass(k, Constraint)}
 
 
 def constraint_from(data: Any) -> Constraint:
@@ -22,12 +25,21 @@ def constraint_from(data: Any) -> Constraint:
 
 
 def plain_data(value: Any) -> Any:
-    """The dict of a dataclass of this library, or a list of such dicts; any other value unchanged.
+    """An argument as plain data, where it is any, with all that it holds; a plant as a template.
 
-    Constraints and obstacles have their class under `kind`. One that holds functions or models is left unchanged.
+    A dataclass of this library is the dict of its fields; constraints and obstacles have their class under `kind`.
+    One of these that holds functions or models is left unchanged.
     """
-    if isinstance(value, list | tuple) and any(is_dataclass(one) for one in value):
+    if isinstance(value, Plant):
+        return PlantTemplate(value)
+    if isinstance(value, Mapping):
+        return {name: plain_data(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
         return [plain_data(one) for one in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     kind = type(value)
     known = kind in KINDS.values() or kind in OBSTACLES.values()
     ours = is_dataclass(kind) and kind.__module__.startswith("safe_wrappers.")
