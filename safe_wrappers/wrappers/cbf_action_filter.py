@@ -129,20 +129,21 @@ class CBFActionFilter(LayerWrapper):
         Another thread's step is waited for, as another reset.
         """
         with self._deciding:
-            self.warned.discard("unsafe")
-            self.started = self._observed = False
-            observation, info = self.env.reset(seed=seed, options=options)
-            self.plant.received(observation, info)
-            self.filter.start()
-            info |= dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
-            info[keys.CBF_MARGIN], info[keys.CBF_UNSAFE] = self._margin()
-            info[keys.CBF_REFUSED] = np.zeros(len(self.filter.bound), dtype=bool)
-            info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
-            # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
-            info[keys.PROPOSED_ACTION], info[keys.EXECUTED_ACTION] = np.zeros((2, *self._shape))
-            info |= self.filter.info()
-            self.started = True
-            return observation, info
+            return super().reset(seed=seed, options=options)
+
+    def _begin(self, observation: Any, info: dict[str, Any], seed: int | None) -> Any:
+        self.warned.discard("unsafe")
+        self._observed = False
+        self.plant.received(observation, info)
+        self.filter.start()
+        info |= dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
+        info[keys.CBF_MARGIN], info[keys.CBF_UNSAFE] = self._margin()
+        info[keys.CBF_REFUSED] = np.zeros(len(self.filter.bound), dtype=bool)
+        info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
+        # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
+        info[keys.PROPOSED_ACTION], info[keys.EXECUTED_ACTION] = np.zeros((2, *self._shape))
+        info |= self.filter.info()
+        return observation
 
     def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed; another thread waits meanwhile."""
