@@ -1,11 +1,12 @@
-"""The memory of a detour around an obstacle."""
+"""What clearances share whose proposals lead around discs: their checks, and the memory of a detour."""
 
 from abc import abstractmethod
 from typing import ClassVar
 
 import numpy as np
 
-from safe_wrappers.errors import Array
+from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
+from safe_wrappers.errors import Array, ConfigurationError, true_or_false
 from safe_wrappers.filter.constraint import Constraint, Memory
 
 
@@ -14,6 +15,16 @@ class Detour(Constraint):
 
     detour_steps: ClassVar[int]
     """Control steps for which a side is kept after it was last needed, so that proposals do not alternate."""
+    detour: bool
+
+    def _check_shared(self, *names: str) -> None:
+        """Check `detour`, and the fields of these names: discs that stand still, or none."""
+        self.detour = true_or_false("detour", self.detour)
+        for name in names:
+            discs = obstacles_from(getattr(self, name), name, (Disc, Discs), optional=True)
+            if any(getattr(disc, "velocity_attribute", None) is not None for disc in discs):
+                raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
+            setattr(self, name, discs)
 
     @abstractmethod
     def nearest(self, neighbours: int) -> Array:

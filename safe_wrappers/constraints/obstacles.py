@@ -283,16 +283,9 @@ KINDS: dict[str, type[Any]] = {k.__name__: k for k in (Disc, Sphere, Plane, Box,
 
 
 def obstacles_from(
-    given: Any,
-    name: str = "obstacles",
-    kinds: tuple[type[Any], ...] = (),
-    optional: bool = False,
-    still: bool = False,
+    given: Any, name: str = "obstacles", kinds: tuple[type[Any], ...] = (), optional: bool = False
 ) -> list[Any]:
-    """A list of obstacles, each itself or as its dict, of these kinds (none: all); it may be empty if `optional`.
-
-    With `still` those that publish a velocity are refused.
-    """
+    """A list of obstacles, each itself or as its dict, of these kinds (none: all); it may be empty if `optional`."""
     fitting = " and ".join(kind.__name__ for kind in kinds) or "obstacles"
     if isinstance(given, dict | str) or not isinstance(given, Sequence) or not (given or optional):
         wanted = f"list of {fitting}" if optional else "list with at least one obstacle"
@@ -301,6 +294,4 @@ def obstacles_from(
     for obstacle in found:
         if kinds and not isinstance(obstacle, kinds):
             raise ConfigurationError(f"{name} holds {fitting}, got {type(obstacle).__name__}")
-        if still and getattr(obstacle, "velocity_attribute", None) is not None:
-            raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
     return found

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.constraints.detour import Detour
-from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.shapes import clearances_on_a_course, convex_outline, nearest_discs
 from safe_wrappers.errors import (
     Array,
@@ -19,7 +18,6 @@ from safe_wrappers.errors import (
     finite_array,
     non_negative,
     positive,
-    true_or_false,
     whole_number,
 )
 from safe_wrappers.filter.constraint import Memory
@@ -80,13 +78,7 @@ class CoastingClearance(Detour, Model):
     detour_steps: ClassVar[int] = 25
 
     def __post_init__(self) -> None:
-        for name in ("keep_out", "untouched"):
-            setattr(
-                self,
-                name,
-                obstacles_from(getattr(self, name), name, (Disc, Discs), optional=True, still=True),
-            )
-        self.detour = true_or_false("detour", self.detour)
+        self._check_shared("keep_out", "untouched")
         if not (self.keep_out or self.untouched):
             raise ConfigurationError("give obstacles in keep_out (for the origin) or untouched (the outline)")
         self.outline = _checked_outline(self.outline)

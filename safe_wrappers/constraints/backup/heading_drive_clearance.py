@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers.constraints.detour import Detour
-from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup.heading_drive import clearances, look, way_to_rest
 from safe_wrappers.control.shapes import nearest_discs
 from safe_wrappers.errors import (
@@ -16,7 +15,6 @@ from safe_wrappers.errors import (
     check_fields,
     finite_array,
     non_negative,
-    true_or_false,
 )
 from safe_wrappers.filter.constraint import HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.planar_robot import PlanarFrame, heading_drive
@@ -64,12 +62,7 @@ class HeadingDriveClearance(Detour, Model):
     detour_steps: ClassVar[int] = 50
 
     def __post_init__(self) -> None:
-        for name in ("obstacles", "untouched"):
-            setattr(
-                self,
-                name,
-                obstacles_from(getattr(self, name), name, (Disc, Discs), optional=True, still=True),
-            )
+        self._check_shared("obstacles", "untouched")
         if not (self.obstacles or self.untouched):
             raise ConfigurationError("give obstacles (for the axis) or untouched (for the robot's parts)")
         parts = finite_array("parts", self.parts)
@@ -81,7 +74,6 @@ class HeadingDriveClearance(Detour, Model):
             )
         self.parts = parts.tolist()
         check_fields(self, non_negative, ("margin", "state_error"), "m")
-        self.detour = true_or_false("detour", self.detour)
         self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
         if self.uncertainty >= 1.0:
             raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
