@@ -191,23 +191,18 @@ def mujoco_env(env: Env, name: str) -> Any:
 class WrapperRng:
     """Random numbers of a `stream` apart from the env's; a reset's seed starts them anew, at first the env's own."""
 
+    draw: np.random.Generator
+    """The generator, from the first reset on."""
+
     def __init__(self, stream: str) -> None:
         self._stream = zlib.crc32(stream.encode())
-        self._generator: np.random.Generator | None = None
 
     def reset(self, env: Env, seed: int | None) -> None:
         """Call it after the env's own reset."""
-        if seed is None and self._generator is None:
+        if seed is None and not hasattr(self, "draw"):
             seed = env.unwrapped.np_random_seed
         if seed is not None:
-            self._generator = np.random.default_rng([self._stream, abs(int(seed))])
-
-    @property
-    def draw(self) -> np.random.Generator:
-        """The generator; an error before the first reset."""
-        if self._generator is None:
-            raise gym.error.ResetNeeded("call reset before step")
-        return self._generator
+            self.draw = np.random.default_rng([self._stream, abs(int(seed))])
 
 
 SAME_STEP: Final = 1e-6
