@@ -65,10 +65,8 @@ class SingularityMargin(RolloutConstraint):
     def __post_init__(self) -> None:
         self._check_shared()
         check_fields(self, positive, ("threshold", "task_speed", "rate_limit"), "the task's units")
-        both = self.task_speed, self.rate_limit
-        if (self.threshold is None) is (None in both) or (
-            self.threshold is not None and both != (None, None)
-        ):
+        given = [one is not None for one in (self.threshold, self.task_speed, self.rate_limit)]
+        if given not in ([True, False, False], [False, True, True]):
             raise ConfigurationError(
                 "give a threshold on the manipulability, or a task_speed and a rate_limit to validate one for; got "
                 f"threshold={self.threshold!r}, task_speed={self.task_speed!r}, rate_limit={self.rate_limit!r}"
@@ -80,12 +78,10 @@ class SingularityMargin(RolloutConstraint):
         self._kind = named[0]
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
-        given = self.directions
-        if not (
-            isinstance(given, str) and given and set(given) <= set("xyz") and len(set(given)) == len(given)
-        ):
-            raise ConfigurationError(f'directions is some of "xyz", each once; got {given!r}')
-        self._rows = ["xyz".index(direction) for direction in given]
+        axes = self.directions
+        if not (isinstance(axes, str) and axes and set(axes) <= set("xyz") and len(set(axes)) == len(axes)):
+            raise ConfigurationError(f'directions is some of "xyz", each once; got {axes!r}')
+        self._rows = ["xyz".index(axis) for axis in axes]
 
     def setup(self, plant: Plant) -> None:
         super().setup(plant)
