@@ -225,14 +225,12 @@ class Stance(Constraint, Model):
         attainable = whole_body.attainable_contact_acceleration(problem)
         return replace(problem, contact_acceleration=attainable)
 
-    def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
-        exact = self.cone == "exact"
-        return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, _EDGES)
-
     def _solved(self, problem: WholeBodyProblem, control: Array) -> WholeBodySolution:
         key = control.tobytes()
         if key not in self._answers:
-            self._answers[key] = self.solve(replace(problem, nominal=control))
+            asked, exact = replace(problem, nominal=control), self.cone == "exact"
+            answer = whole_body.solve_cone(asked) if exact else whole_body.solve_pyramid(asked, _EDGES)
+            self._answers[key] = answer
         return self._answers[key]
 
     def _holds(self, problem: WholeBodyProblem, control: Array) -> bool:
