@@ -22,6 +22,7 @@ from wrapper_examples import CHUNKED, EXAMPLES, EXPORTED, FILTERS, INSIDE, ONLY_
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import SafeWrappersError
+from safe_wrappers.plants.env_checks import wrappers_of
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 BEFORE, LONG = 7, 25
@@ -77,14 +78,8 @@ class Session:
     """A wrapper of the contract around a `Bottom`."""
 
     def __init__(self, name):
-        self.name, found = name, []
-
-        def around(env):
-            found.append(Bottom(env))
-            return found[-1]
-
-        self.env = build(name, next(iter(EXAMPLES[name])), around)
-        (self.bottom,) = found
+        self.name, self.env = name, build(name, next(iter(EXAMPLES[name])), Bottom)
+        self.bottom = next(one for one in wrappers_of(self.env) if isinstance(one, Bottom))
         self.actions = actions(self.env, LONG)
 
     def begin(self):
