@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import blind_covariance
+from scenes import Scene
 from scipy.spatial.transform import Rotation
 
 import safe_wrappers as sw
@@ -37,36 +38,21 @@ HIGH, LEVEL = 9.0, 0.5
 """Where the wall stands: above everything, or between the robot and what is beyond 2 m."""
 
 
-class Turning(gym.Env):
+class Turning(Scene):
     """A robot that turns, things that drive straight on, and a wall between.
 
     `start` is qpos and qvel at every reset: heading, thing's x and y, thing2's x and y.
     """
 
-    frame_skip, dt = 4, 0.04
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
     spots = np.array([[1.0, 0.0], [0.0, 1.0]])
 
     def __init__(self, start=((0, 1, 0, -1, 0), (0, 0, 0, 0, 0)), wall=HIGH, arm="0.4 0 0"):
-        self.start, self.text = start, TEXT.format(wall=wall, arm=arm)
-        self.build(self.text)
+        self.start = start
+        self.build(TEXT.format(wall=wall, arm=arm))
 
     def build(self, text):
-        self.model = mujoco.MjModel.from_xml_string(text)
-        self.data = mujoco.MjData(self.model)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:], self.data.qvel[:] = self.start
-        mujoco.mj_forward(self.model, self.data)
-        return np.zeros(1), {}
-
-    def step(self, action):
-        self.data.ctrl[:] = action
-        mujoco.mj_step(self.model, self.data, self.frame_skip)
-        return np.zeros(1), 1.0, False, False, {}
+        super().__init__(text, frame_skip=4)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
 
 
 STILL = np.zeros(1)
@@ -188,7 +174,7 @@ def test_another_model_is_looked_at_from_the_next_reset_on_if_it_has_the_same_th
     assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == [False, True]
     world.build(TEXT.format(wall=HIGH, arm="0.4 0 0"))
     assert env.reset(seed=0)[1]["occlusion/visible"].all()
-    world.build(world.text.replace("thing2", "thingy"))
+    world.build(world.xml.replace("thing2", "thingy"))
     with pytest.raises(ConfigurationError, match="other things: thing, thingy and not thing, thing2"):
         env.reset(seed=0)
 
@@ -299,7 +285,7 @@ def reckoning(position_std=1e-3, **options):
 def test_its_readings_are_those_of_mujocos_sensors():
     env = reckoning()
     raw = env.unwrapped
-    spec = mujoco.MjSpec.from_string(raw.text)
+    spec = mujoco.MjSpec.from_string(raw.xml)
     for kind in (mujoco.mjtSensor.mjSENS_ACCELEROMETER, mujoco.mjtSensor.mjSENS_GYRO):
         spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="eye")
     model = spec.compile()
