@@ -232,10 +232,7 @@ class Calls(RuleBasedStateMachine):
     @invariant()
     def nothing_wrong_reached_the_task(self):
         if hasattr(self, "stack"):
-            bottom = self.stack
-            while not isinstance(bottom, Bottom):
-                bottom = bottom.env
-            assert not bottom.wrong
+            assert not self.stack.get_wrapper_attr("wrong")
 
 
 def run(machine, examples, steps):
