@@ -2,8 +2,8 @@
 
 import mujoco
 import numpy as np
+from oracles import support_margin
 from scenes import Scene
-from scipy.spatial import ConvexHull
 
 from safe_wrappers.plants.mujoco.contacts import Replay
 
@@ -177,19 +177,12 @@ def cone_room(share, tolerance=0.0):
 
 
 def inside_the_hull(inset):
-    """Distance of the centre of pressure from the edge of the contacts' hull, by scipy; infinite without one."""
+    """Distance of the zero moment point from the edge of the contacts' hull; infinite without one."""
 
     def room(model, data):
         found = list(touches(model, data))
-        points, forces = (np.array([one[i] for one in found]).reshape(-1, 3) for i in (0, 2))
-        flat, pressure = points[:, :2], forces[:, 2]
-        lifted = len(found) < 3 or pressure.sum() <= 0.0
-        if lifted or np.linalg.matrix_rank(flat - flat.mean(axis=0), 1e-6) < 2:
-            return np.inf
-        # Points above the mean height have moments of their own tangential forces.
-        up = points[:, 2] - points[:, 2].mean()
-        centre = (flat * pressure[:, None] - up[:, None] * forces[:, :2]).sum(axis=0) / pressure.sum()
-        return -float((ConvexHull(flat).equations @ [*centre, 1.0]).max()) - inset
+        margin = support_margin(*(np.array([one[i] for one in found]).reshape(-1, 3) for i in range(3)))
+        return np.inf if np.isnan(margin) else margin - inset
 
     return room
 

@@ -6,8 +6,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from oracles import support_margin
 from scenes import Scene
-from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -65,12 +65,12 @@ def limbs(model, names):
 
 
 def balance_by_hand(raw, data, bodies):
-    """Used friction, and the margin by the textbook's formula and scipy's hull; the ground is level."""
+    """Used friction, and the margin of the support."""
     own = limbs(raw.model, bodies)
     weight = float(raw.model.body_mass[own].sum()) * 9.81
     used, margins = 0.0, []
     for found in substeps(raw, data):
-        points, forces = [], []
+        points, normals, forces = [], [], []
         for k, (one, two), force in found:
             if (
                 {one, two} - {0} - set(np.flatnonzero(own))
@@ -78,20 +78,14 @@ def balance_by_hand(raw, data, bodies):
                 or data.contact.efc_address[k] < 0
             ):
                 continue
+            frame = (1.0 if one == 0 else -1.0) * data.contact.frame[k].reshape(3, 3)
             points.append(data.contact.pos[k].copy())
-            forces.append((1.0 if one == 0 else -1.0) * data.contact.frame[k].reshape(3, 3).T @ force)
+            normals.append(frame[0])
+            forces.append(frame.T @ force)
             if force[0] >= PRESSING * weight:
                 used = max(used, np.hypot(*force[1:]) / (data.contact.friction[k, 0] * force[0]))
-        if len(points) < 3 or sum(f[2] for f in forces) <= 0.0:
-            continue
-        p, f = np.array(points), np.array(forces)
-        height = p[:, 2] - p[:, 2].mean()
-        if np.abs(height).max() > 0.01:
-            continue
-        zmp = (p[:, :2] * f[:, 2:] - height[:, None] * f[:, :2]).sum(axis=0) / f[:, 2].sum()
-        hull = ConvexHull(p[:, :2]).equations
-        margins.append(-(hull[:, :2] @ zmp + hull[:, 2]).max())
-    return [used, min(margins, default=np.nan)]
+        margins.append(support_margin(*(np.reshape(one, (-1, 3)) for one in (points, normals, forces))))
+    return [used, min((margin for margin in margins if not np.isnan(margin)), default=np.nan)]
 
 
 def watched(env, count, share=1.0):
