@@ -1,6 +1,7 @@
-"""A constraint on a plant, asked at whatever state the plant has observed, and the plainest one."""
+"""A constraint on a plant, asked at whatever state the plant has observed; the plainest one; an analytic plant."""
 
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
@@ -18,6 +19,19 @@ class Below(sw.Constraint):
     def rows(self):
         left = self.limit - self.plant.state[self.of]
         return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
+
+
+def falling(x):
+    return np.array([x[1], 15.0 * np.sin(x[0])])
+
+
+def torque(x):
+    return np.array([[0.0], [3.0]])
+
+
+def pendulum_plant():
+    """Of Pendulum-v1; it can be pickled."""
+    return sw.AnalyticPlant(falling, torque, attrgetter("state"), control_dt=0.05)
 
 
 def bound(env, **options):

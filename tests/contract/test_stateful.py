@@ -12,6 +12,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import pendulum_plant
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -46,18 +47,6 @@ class Bottom(gym.Wrapper):
         return super().step(action)
 
 
-def drift(x):
-    return np.array([x[1], 15.0 * np.sin(x[0])])
-
-
-def push(x):
-    return np.array([[0.0], [3.0]])
-
-
-def angle_and_speed(env):
-    return env.state
-
-
 def slow(x):
     return 9.0 - x[1] ** 2  # rad^2/s^2
 
@@ -77,10 +66,8 @@ def reacher():
 
 
 def pendulum():
-    plant = sw.AnalyticPlant(drift, push, angle_and_speed, control_dt=0.05)
-    return sw.RecordInterventions(
-        sw.CBFActionFilter(made("Pendulum-v1"), [sw.constraints.Barrier(slow)], plant)
-    )
+    limits = [sw.constraints.Barrier(slow)]
+    return sw.RecordInterventions(sw.CBFActionFilter(made("Pendulum-v1"), limits, pendulum_plant()))
 
 
 STACKS = [point_goal, reacher, pendulum]

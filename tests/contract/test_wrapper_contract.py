@@ -13,6 +13,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import pendulum_plant
 from episodes import actions, lowest, trace
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
@@ -77,14 +78,8 @@ def test_every_constructor_argument_is_recorded(name, case):
 
 
 def test_what_is_not_plain_data_is_still_recorded_for_gym_make():
-    plant = sw.AnalyticPlant(
-        f=lambda x: np.array([x[1], 15 * np.sin(x[0])]),
-        g=lambda x: np.array([[0.0], [3.0]]),
-        state=lambda env: env.state,
-        control_dt=0.05,
-    )
     slow = sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
-    env = sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant, fallback=lambda plant: [0.0])
+    env = sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], pendulum_plant(), lambda plant: [0.0])
     again = gym.make(env.spec)
     with warnings.catch_warnings(action="ignore"):
         assert trace(again, steps=100) == trace(env, steps=100)

@@ -11,7 +11,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Below
+from asking import Below, pendulum_plant
 from hypothesis import given
 from hypothesis import strategies as st
 from worlds import Cart, Raw, filtered_cart
@@ -304,15 +304,8 @@ def slow_pendulum(alpha, torque):
     env = gym.make("Pendulum-v1")
     env.unwrapped.max_torque = torque
     env.unwrapped.action_space = gym.spaces.Box(-torque, torque, (1,), np.float32)
-    plant = sw.AnalyticPlant(
-        f=lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
-        g=lambda x: np.array([[0.0], [3.0]]),
-        state=lambda raw: raw.state,
-        control_dt=0.05,
-    )
-    return sw.CBFActionFilter(
-        env, [sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2, alpha=alpha)], plant=plant
-    )
+    limits = [sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2, alpha=alpha)]
+    return sw.CBFActionFilter(env, limits, plant=pendulum_plant())
 
 
 @pytest.mark.parametrize("alpha", [5.0, 20.0])
