@@ -120,11 +120,9 @@ class WholeBodyFilter(CBFActionFilter):
             joints, low, high = stops(model)
             if not joints:
                 raise UnsupportedEnvError("no driven joint has a range: pass joint_tolerance=None")
-            ranges, names = (
-                ((low - wider).tolist(), (high + wider).tolist()),
-                [model.joint(j).name for j in joints],
-            )
-            constraints.append(JointPositionLimit(*ranges, joints=names, horizon=3))
+            names = [model.joint(j).name for j in joints]
+            lower, upper = (low - wider).tolist(), (high + wider).tolist()
+            constraints.append(JointPositionLimit(lower, upper, names, horizon=3))
         CBFActionFilter.__init__(self, env, constraints)
 
 
