@@ -83,7 +83,7 @@ def test_the_observer_reads_the_force_back_and_the_mean_of_one_that_changes(rate
 def learn(estimate, friction, slips, seed=0, noise=0.02):
     rng, n = np.random.default_rng(seed), estimate.mean.size
     for slip in slips:
-        measured = friction(np.full(n, slip)) + noise * rng.normal(size=n)
+        measured = friction(slip) + noise * rng.normal(size=n)
         estimate.travel(np.full(n, 0.01))
         estimate.update(np.full(n, slip), np.abs(measured), np.full(n, noise))
 
@@ -113,7 +113,7 @@ def test_the_height_is_the_truth_but_for_a_few_hundredths():
         slip = rng.uniform(0.06, 0.2)
         curve = MagicFormula(rng.uniform(0.1, 1.1), slip)
         estimate = FrictionEstimate(1)
-        learn(estimate, curve.friction, rng.uniform(0.0, 1.2 * slip, 40), seed=seed)
+        learn(estimate, curve.at, rng.uniform(0.0, 1.2 * slip, 40), seed=seed)
         off.append(abs(estimate.mean[0] - curve.peak_friction))
     assert np.quantile(off, 0.9) < 0.03
 
@@ -135,8 +135,8 @@ def test_on_another_ground_the_hypotheses_start_afresh():
     grounds = MagicFormula(peak_friction=0.3, peak_slip=0.05), MagicFormula(peak_friction=0.9, peak_slip=0.15)
     for first, second in (grounds, grounds[::-1]):
         moved, fresh = FrictionEstimate(1), FrictionEstimate(1)
-        learn(moved, first.friction, slips[:300])
+        learn(moved, first.at, slips[:300])
         for each in (moved, fresh):
-            learn(each, second.friction, slips[300:], seed=1)
+            learn(each, second.at, slips[300:], seed=1)
         np.testing.assert_allclose(moved.mean, fresh.mean, atol=0.02)
         np.testing.assert_allclose(moved.peak_slip[0], fresh.peak_slip[0], atol=0.01)
