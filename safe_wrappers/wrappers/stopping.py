@@ -285,7 +285,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
         """Step the env; returns what was executed, which a filter inside may have changed, and the env's answer."""
         # Before the step: an env may scale the command in place.
         executed = np.array(command, dtype=np.float64)
-        answer = self.env.step(command)
+        answer = self._pass_on(command)
         info = answer[4]
         if self._filtered:
             executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)

@@ -260,8 +260,9 @@ def test_waves_in_a_queue_are_as_old_as_they_are():
 
 
 class Liar(gym.Env):
-    """Publishes a `Port` that shows no effort, and first resists with 5 N."""
+    """Publishes a `Port` that shows an effort of `shown`, and first resists with 5 N."""
 
+    shown = 0.0
     dt, port_flow, port_effort_observed, port_feedthrough = TICK, [0], [0], 0.0
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
     observation_space = gym.spaces.Box(-9.0, 9.0, (1,), np.float64)
@@ -271,8 +272,9 @@ class Liar(gym.Env):
         return np.zeros(1), {}
 
     def step(self, action):
+        assert np.isfinite(action).all()
         self.port_effort_acted = np.array([next(self.efforts)])
-        return np.zeros(1), 0.0, False, False, {}
+        return np.array([self.shown]), 0.0, False, False, {}
 
 
 def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
@@ -284,6 +286,15 @@ def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
     np.testing.assert_allclose(flows, [1.0] + 9 * [0.0] + 4 * [1.0], atol=1e-6)
     assert [info["teleop/created_j"] for info in infos] == pytest.approx([4.5e-3] * 14)
     assert env.stored_j <= env.ledger.net_j + 1e-12
+
+
+def test_an_effort_that_is_not_finite_makes_no_command():
+    env = sw.TeleopChannel(Liar(), 0.0, 1.0, impedance=2.0)
+    env.reset(seed=0)
+    env.unwrapped.shown = np.nan
+    env.step(np.array([0.5]))
+    with pytest.raises(ActionError, match="finite numbers.*was not stepped"):
+        env.step(np.array([0.5]))
 
 
 # Authority ------------------------------------------------------------------------------------------------------
