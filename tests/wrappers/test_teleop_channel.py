@@ -293,7 +293,7 @@ def test_an_effort_that_is_not_finite_makes_no_command():
     env.reset(seed=0)
     env.unwrapped.shown = np.nan
     env.step(np.array([0.5]))
-    with pytest.raises(ActionError, match="finite numbers.*was not stepped"):
+    with pytest.raises(ActionError, match=r"finite numbers.*was not stepped"):
         env.step(np.array([0.5]))
 
 
