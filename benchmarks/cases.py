@@ -79,7 +79,7 @@ def driven(
         yield action, float(reward), info, not missed <= 0.0, over  # what is not a number is a violation
 
 
-def crossing(env: gym.Env[Any, Any], tolerance: float = 0.5) -> sw.OcclusionPenalty:
+def crossing(env: gym.Env[Any, Any], tolerance: float = 0.5, weight: float = 0.0) -> sw.OcclusionPenalty:
     """OccludedCrossing with its cars tracked, as configs/occluded_crossing_ppo.yaml has it."""
     car = {
         # 2 * 0.15^2 / 2 = 0.0225 m^2/s^3 along their lanes, and nothing across: safe_wrappers.envs.traffic.
@@ -91,7 +91,7 @@ def crossing(env: gym.Env[Any, Any], tolerance: float = 0.5) -> sw.OcclusionPena
     lanes = (("car[012]", 1), ("car[345]", -1))
     tracks = [{"bodies": bodies, "mean_velocity": [mean, 0], **car} for bodies, mean in lanes]
     sensor = {"camera": "eye", "view_deg": 120, "range_m": 6, "position_std": 0.05}
-    return sw.OcclusionPenalty(env, tracks, sensor, tolerance)
+    return sw.OcclusionPenalty(env, tracks, sensor, tolerance, weight)
 
 
 def patrolled(env: gym.Env[Any, Any]) -> sw.OcclusionPenalty:

@@ -1,4 +1,4 @@
-"""A constraint on a plant, asked at whatever state the plant has observed; the plainest one; an analytic plant."""
+"""A constraint on a plant, asked at whatever state the plant has observed; the plainest one; analytic plants."""
 
 from dataclasses import dataclass
 from operator import attrgetter
@@ -32,6 +32,12 @@ def torque(x):
 def pendulum_plant():
     """Of Pendulum-v1; it can be pickled."""
     return sw.AnalyticPlant(falling, torque, attrgetter("state"), control_dt=0.05)
+
+
+def pushed(state, push=(1.0,), **timing):
+    """Of x'' = push . u; the state of an env is (x, x')."""
+    effect = np.array([np.zeros(len(push)), push])
+    return sw.AnalyticPlant(lambda x: np.array([x[1], 0.0]), lambda x: effect, state, **timing)
 
 
 def bound(env, **options):

@@ -1,8 +1,20 @@
-"""An MJCF as an env, with nothing that a filter does not ask for."""
+"""An MJCF as an env, with nothing that a filter does not ask for; and other packages' envs."""
+
+import warnings
 
 import gymnasium as gym
 import mujoco
 import numpy as np
+import pytest
+
+
+def make(env_id, **options):
+    """`gym.make`, also of gymnasium-robotics' envs; whoever asks for one without it is skipped."""
+    if any(word in env_id for word in ("Maze", "Fetch", "Hand")):
+        gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*is out of date")
+        return gym.make(env_id, **options)
 
 
 class Scene(gym.Env):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from scenes import make
 
 import safe_wrappers as sw
 from benchmarks import shelf
@@ -23,14 +24,6 @@ RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
 KNOWN = sorted({env_id for case in PROTECTED.values() for env_id in (case.env_id, *case.also)})
 TOUCHING = ("FetchPush", "FetchSlide")
 """Their own resets put the fingers 3 mm into the table."""
-
-
-def make(env_id, **options):
-    if any(word in env_id for word in ("Maze", "Fetch", "Hand")):
-        gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*is out of date")
-        return gym.make(env_id, **options)
 
 
 @pytest.mark.parametrize("env_id", KNOWN)

@@ -46,10 +46,10 @@ def clearance() -> sw.constraints.HeadingDriveClearance:
     )
 
 
-def rail() -> sw.constraints.Clearance:
+def rail(**more: Any) -> sw.constraints.Clearance:
     """On the rail."""
     ends = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
-    return sw.constraints.Clearance(ends, bodies=["cart"], braking=8.0)
+    return sw.constraints.Clearance(ends, bodies=["cart"], braking=8.0, **more)
 
 
 def _joint_speed(env: Any) -> float:

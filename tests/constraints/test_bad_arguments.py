@@ -138,6 +138,7 @@ BOUND = {
         (of.EscapeClearance, {"body": "robo"}, "robo.*robot, car0"),
         (of.EscapeClearance, {"obstacles": [of.TrackedDiscs(0.4)]}, "no attribute 'tracking'"),
         (of.TrackPermission, {}, "track_names"),
+        (of.TrackPermission, {"body": "robo"}, "robo.*robot, car0"),
     ],
     ("OccludedCrossing-v0", ConfigurationError): [
         (of.EscapeClearance, {"body": "car0"}, "two slides"),

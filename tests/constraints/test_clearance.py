@@ -4,7 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asking import Asked, asked
+from asking import Asked, asked, pushed
 from judged_loops import slider
 from scenes import Scene
 
@@ -184,17 +184,8 @@ def test_only_the_tracks_that_count_stop_it(tracks, stops):
         info = env.step(np.array([0.0, 1.0, 0.0]))[4]
     assert info["occlusion/expired"].tolist() == [True] + 5 * [False]
     assert info["cbf/intervened"] == stops
-
-
-@pytest.mark.parametrize(
-    ("body", "tracks", "words"),
-    [("robot", ["car9"], "no track 'car9'; there are car0"), ("robo", None, "robo")],
-)
-def test_names_that_are_not_there_are_refused(body, tracks, words):
-    sure = sw.occlusion.Track("car*", acceleration_noise=0.0)
-    inside = sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), [sure], NOTHING_SEEN, 1.0)
-    with pytest.raises(UnknownNameError, match=words):
-        sw.CBFActionFilter(inside, [of.TrackPermission(body, 3.0, tracks=tracks)])
+    with pytest.raises(UnknownNameError, match="no track 'car9'; there are car0"):
+        permitted(0.5, [unsure, sure], tracks=["car9"])
 
 
 # Barrier ------------------------------------------------------------------------------------------------------
@@ -226,9 +217,7 @@ def test_row_is_the_barrier_condition(x):
 
 
 def slider_filter(h, **options):
-    f, g = lambda x: np.array([x[1], 0.0]), lambda x: np.array([[0.0], [1.0]])
-    state = lambda env: np.concatenate([env.data.qpos, env.data.qvel])  # noqa: E731
-    plant = sw.AnalyticPlant(f, g, state, control_dt=0.05)
+    plant = pushed(lambda env: np.concatenate([env.data.qpos, env.data.qvel]), control_dt=0.05)
     return sw.CBFActionFilter(slider(), [of.Barrier(h, **options)], plant=plant)
 
 

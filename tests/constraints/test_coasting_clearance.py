@@ -101,11 +101,8 @@ def test_far_from_everything_nothing_is_forecast():
 
 
 def test_a_reach_that_is_broken_is_dropped_with_a_warning_and_more_discs_come_into_play():
-    hazards = [
-        [0.203, 0.0],
-        [-0.2035, 0.0],
-        [0.0, 0.2105],
-    ]  # two inside the margin, one beyond the declared reach
+    # Two inside the margin, one beyond the declared reach.
+    hazards = [[0.203, 0.0], [-0.2035, 0.0], [0.0, 0.2105]]
     _, constraint, _ = bound(hazards, max_decrease=0.001)
     with pytest.warns(UserWarning, match=r"farther than the declared max_decrease of 0\.001 m"):
         assert not constraint.admits(FULL)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from asking import asked
 from judged_loops import manipulability
-from scenes import Scene
+from scenes import Scene, make
 
 import safe_wrappers as sw
 from safe_wrappers import constraints as of
@@ -53,8 +53,7 @@ def linkage(equality="", cable=""):
 
 
 def fetch():
-    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    return gym.make("FetchPickAndPlace-v4")
+    return make("FetchPickAndPlace-v4")
 
 
 FINGERS = {"robot0:l_gripper_finger_joint", "robot0:r_gripper_finger_joint"}

@@ -82,10 +82,7 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
         assert sum(info["cbf/intervened"] for info in infos) > 20
         return np.array([info["executed_action"] for info in infos]), calls[0]
 
-    (free, often), (bounded, seldom) = (
-        driven(None),
-        driven(0.5),
-    )  # at most 2 m/s, four control steps are 0.2 s
+    (free, often), (bounded, seldom) = map(driven, (None, 0.5))  # at most 2 m/s, four control steps are 0.2 s
     np.testing.assert_array_equal(free, bounded)
     assert seldom < often - 50
 

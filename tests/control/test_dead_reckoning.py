@@ -3,8 +3,6 @@
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from safe_wrappers.control.dead_reckoning import (
@@ -28,7 +26,6 @@ THROWN = """
 </mujoco>
 """
 EVERY = 10  # physics steps of an interval: 0.005 s
-VECTORS = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0))
 
 
 def orientation_of(quaternion):

@@ -195,11 +195,8 @@ def by_points(x, y, around):
 @given(st.integers(0, 2**31), st.tuples(*[st.integers(0, 3)] * 3))
 def test_the_nearest_of_all_counts_at_the_worst_instant_and_no_number_is_not_clear(seed, counts):
     rng = np.random.default_rng(seed)
-    around, places, wanted = (
-        surroundings(rng, *counts),
-        rng.uniform(-1.5, 1.5, (4, 6, 2)),
-        rng.uniform(0.0, 0.3, 6),
-    )
+    around, places = surroundings(rng, *counts), rng.uniform(-1.5, 1.5, (4, 6, 2))
+    wanted = rng.uniform(0.0, 0.3, 6)
     lost = places.copy()
     lost[1, 2, 0] = np.nan
     if not sum(counts):

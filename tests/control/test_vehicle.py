@@ -13,12 +13,8 @@ SPEEDS = st.floats(-30.0, 30.0)
 
 
 def test_slips_that_have_a_name():
-    rolls, spins_on_the_spot, locked, at_rest = (
-        (2.0, 2.0, 0.0),
-        (3.0, 0.0, 1.0),
-        (0.0, 3.0, -1.0),
-        (0.0, 0.0, 0.0),
-    )
+    rolls, at_rest = (2.0, 2.0, 0.0), (0.0, 0.0, 0.0)
+    spins_on_the_spot, locked = (3.0, 0.0, 1.0), (0.0, 3.0, -1.0)
     drives, brakes, against = (2.0, 1.0, 0.5), (1.0, 2.0, -0.5), (1.0, -1.0, 2.0)
     in_reverse = (-2.0, -1.0, -0.5), (-1.0, -2.0, 0.5)  # driving pushes backwards, braking forwards
     cases = rolls, spins_on_the_spot, locked, at_rest, drives, brakes, against, *in_reverse

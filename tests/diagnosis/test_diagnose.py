@@ -24,11 +24,8 @@ def waving(share=0.3, period=60.0, seam=0):
     """Slow sines; with a `seam` another phase every so many steps, as chunks have that do not fit together."""
 
     def policy(env):
-        high, rng, state = (
-            env.action_space.high.astype(float),
-            np.random.default_rng(0),
-            {"k": 0, "phase": 0.0},
-        )
+        high, rng = env.action_space.high.astype(float), np.random.default_rng(0)
+        state = {"k": 0, "phase": 0.0}
 
         def act(observation):
             if seam and state["k"] % seam == 0:

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from asking import bound
+from scenes import make
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
@@ -175,8 +176,7 @@ def test_a_step_of_a_dm_control_task_is_its_forecast(task, scale):
     ("env_id", "substeps", "control_dt"), [("AntMaze_UMaze-v5", 5, 0.05), ("PointMaze_UMaze-v3", 1, 0.01)]
 )
 def test_the_hold_of_a_maze_is_the_inner_env_s(env_id, substeps, control_dt):
-    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    env = gym.make(env_id)
+    env = make(env_id)
     plant = bound(env)
     assert plant.substeps == substeps and plant.control_dt == pytest.approx(control_dt)
     env.reset(seed=0)
@@ -280,11 +280,6 @@ def test_a_filter_decides_as_on_the_twin(limits):
     assert changed >= 5
 
 
-def fetch():
-    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    return gym.make("FetchReach-v4")
-
-
 def taking(size, wrapped=False):
     """A machine with another action space, or in a wrapper that has one."""
     env = gym.Wrapper(Machine()) if wrapped else Machine()
@@ -300,7 +295,7 @@ REFUSED = {
     partial(Machine, how="frozen"): r"no copy .* \(RuntimeError: no robot is connected\).*AnalyticPlant\(",
     partial(taking, 1): "has not one action for each control. Use AnalyticPlant",
     partial(taking, 2, wrapped=True): "a wrapper of .* changes its action space; the filter must be inside",
-    fetch: r"moves its gripper by displacements: take DisplacementPlant\(\)",
+    partial(make, "FetchReach-v4"): r"moves its gripper by displacements: take DisplacementPlant\(\)",
     partial(gym.make, "Pendulum-v1"): r"has no MuJoCo .*; .*AnalyticPlant.*MujocoPlant\(model=",
 }
 

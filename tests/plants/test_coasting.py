@@ -54,11 +54,8 @@ def test_the_forecast_is_what_the_env_then_does_to_its_rest(level, seed):
 def test_a_car_that_stands_for_an_instant_while_it_reverses_does_not_rest():
     """It tips back and rolls on by 4 mm; a state that an attacker found."""
     env, plant = car(0, 0)
-    tilted, wheels, caster = (
-        [-0.9594, 0.0017, -0.0012, -0.2821],
-        [333.0, 195.8],
-        [-0.9104, -0.142, 0.2321, 0.3116],
-    )
+    tilted, wheels = [-0.9594, 0.0017, -0.0012, -0.2821], [333.0, 195.8]
+    caster = [-0.9104, -0.142, 0.2321, 0.3116]
     body = [0.0731, -0.0907, -0.0261, -0.2886, 0.5017, -0.2943]
     env.set_state(
         np.array([0.0, 0.0, 0.0995, *tilted, *wheels, *caster]),

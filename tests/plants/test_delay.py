@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from asking import pushed
 from scenes import Scene
 
 import safe_wrappers as sw
@@ -21,12 +22,7 @@ def simulated(delay_s):
 
 
 def analytic(delay_s):
-    return sw.AnalyticPlant(
-        f=lambda x: np.array([x[1], 0.0]),
-        g=lambda x: np.array([[0.0], [1.0]]),
-        state=lambda env: [env.data.qpos[0], env.data.qvel[0]],
-        delay_s=delay_s,
-    )
+    return pushed(lambda env: [env.data.qpos[0], env.data.qvel[0]], delay_s=delay_s)
 
 
 def observing(kind, delay_s, x=0.2, v=1.5, sent=()):

@@ -2,11 +2,10 @@
 
 import copy
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from scenes import Legs, Scene
+from scenes import Legs, Scene, make
 
 import safe_wrappers as sw
 from safe_wrappers.errors import UnsupportedEnvError
@@ -23,9 +22,7 @@ HANDS = ("HandReach-v3", *(f"AdroitHand{task}-v1" for task in ("Door", "Hammer",
 
 
 def made(env_id):
-    if env_id in (*FETCH, *HANDS):
-        gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    env = gym.make(env_id, disable_env_checker=True)
+    env = make(env_id, disable_env_checker=True)
     env.reset(seed=0)
     return env
 

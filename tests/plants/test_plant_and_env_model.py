@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
+from scenes import make
 
 import safe_wrappers as sw
 
@@ -25,13 +26,6 @@ CHANGES = {
     "wind": lambda m: (m.opt.wind.__iadd__(0.3), setattr(m.opt, "density", m.opt.density + 0.1)),
     "flags": lambda m: setattr(m.opt, "disableflags", int(mujoco.mjtDisableBit.mjDSBL_CONTACT)),
 }
-
-
-def made(env_id):
-    if env_id in ROBOTICS:
-        gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    with warnings.catch_warnings(action="ignore"):
-        return gym.make(env_id)
 
 
 def driven(env, plan, actions=None):
@@ -56,10 +50,10 @@ def test_a_filtered_env_goes_on_with_its_own_model(env_id):
     if "Point" in env_id:  # its constraint refuses a machine that is no damped point
         kinds = ["mass", "gear", "gravity"]
     plan = {step: rng.choice(kinds, 2, replace=False) for step in (-1, 2, 7)}
-    env = sw.protect(made(env_id))
+    env = sw.protect(make(env_id))
     filtered = driven(env, plan)
     executed = [info["executed_action"].astype(env.action_space.dtype) for _, info in filtered[1:]]
-    for (one, info), (two, _) in zip(filtered, driven(made(env_id), plan, executed), strict=True):
+    for (one, info), (two, _) in zip(filtered, driven(make(env_id), plan, executed), strict=True):
         theirs = two if isinstance(two, dict) else {"all": two}
         mine = one if isinstance(one, dict) else {"all": one}
         assert all(np.array_equal(mine[key], theirs[key]) for key in theirs)
@@ -190,7 +184,7 @@ def test_a_simulation_follows_the_model_of_its_env():
 
 
 def test_a_machine_that_has_become_unfit_is_refused_from_the_next_comparison_on_every_time():
-    damped = sw.protect(made("SafePointGoal1-v0"))
+    damped = sw.protect(make("SafePointGoal1-v0"))
     damped.reset(seed=0)
     damped.unwrapped.model.dof_damping[0] *= 2.0
     clamped = sw.CBFActionFilter(gym.make("Reacher-v5"), [SPEEDS])

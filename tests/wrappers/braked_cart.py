@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 
 import gymnasium as gym
 import numpy as np
+from asking import pushed
 
 import safe_wrappers as sw
 
@@ -116,10 +117,4 @@ def stop(plant):
 
 def cart_plant(dt, delay_s=0.0):
     """For fallbacks, which want one."""
-    return sw.AnalyticPlant(
-        f=lambda x: np.array([x[1], 0.0]),
-        g=lambda x: np.array([[0.0, 0.0], [1.0, -1.0]]),
-        state=lambda env: np.array([env.x, env.v]),
-        control_dt=dt,
-        delay_s=delay_s,
-    )
+    return pushed(lambda env: np.array([env.x, env.v]), [1.0, -1.0], control_dt=dt, delay_s=delay_s)

@@ -10,8 +10,10 @@ from braked_cart import BrakedCart, cart_plant, lease, read_cart, stop
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from hypothesis import given
 from hypothesis import strategies as st
+from wrapper_examples import rail
 
 import safe_wrappers as sw
+from safe_wrappers.control.watchdog import longest_lease
 from safe_wrappers.errors import ConfigurationError
 
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action is not finite")
@@ -45,22 +47,6 @@ def worst_way(tau, v, drive, top=math.inf):
     rising = min(tau, (top - v) / drive)
     cruising = top * (tau - rising) if tau > rising else 0.0
     return v * rising + 0.5 * drive * rising**2 + cruising, v + drive * rising
-
-
-def lease_by_bisection(room, v, braking, drive, top, delays):
-    """The longest lease by the appendix's inequality, found by trying."""
-
-    def fits(tau):
-        way, speed = worst_way(tau, v, drive, top)
-        return way + max(speed, 0.0) ** 2 / (2.0 * braking) <= room
-
-    if not fits(0.0) or (v <= 0.0 and room <= 0.0):
-        return -math.inf
-    low, high = 0.0, 1e3
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return (1e3 if fits(1e3) else low) - delays
 
 
 class Book:
@@ -146,8 +132,8 @@ def follow(seed, steps=40):
     counts = np.zeros(2, int)
 
     def leases(clearance, v, more):
-        delays = options["delays_s"] + more
-        return lease_by_bisection(clearance - cart.reserve, v, cart.braking, cart.drive, cart.top, delays)
+        known = {"acceleration": cart.drive, "top_speed": cart.top}
+        return longest_lease(clearance - cart.reserve, v, cart.braking, options["delays_s"] + more, **known)
 
     for _ in range(2):
         env.reset(seed=seed)
@@ -185,19 +171,21 @@ def test_the_random_episodes_have_everything_in_them():
 @given(
     dt=st.sampled_from([0.02, 0.1]),
     drive=st.sampled_from([0.0, 1.5]),
+    top=st.sampled_from([math.inf, 1.0]),
     braking=st.floats(1.0, 6.0),
     v=st.floats(0.3, 3.0),
     steps=st.integers(2, 40),
     delay_steps=st.floats(0.0, 6.0),
     age_steps=st.floats(0.0, 2.0),
 )
-def test_a_lease_is_just_long_enough(dt, drive, braking, v, steps, delay_steps, age_steps):
+def test_a_lease_is_just_long_enough(dt, drive, top, braking, v, steps, delay_steps, age_steps):
     delay, age = delay_steps * dt, age_steps * dt
-    way, speed = worst_way(steps * dt + delay + age, v, drive)
-    cart = BrakedCart(dt, way + speed**2 / (2.0 * braking) + 1e-7, drive, braking, delay_s=delay)
+    way, speed = worst_way(steps * dt + delay + age, v, drive, top)
+    cart = BrakedCart(dt, way + speed**2 / (2.0 * braking) + 1e-7, drive, braking, top, delay_s=delay)
     # The worst case of an old reading: full drive from the moment on at which it was taken.
-    cart.start, cart.measured = worst_way(age, v, drive), lambda: (cart.wall, v)
-    env = leased(cart, delays_s=delay + age, max_lease_s=10.0)
+    cart.start, cart.measured = worst_way(age, v, drive, top), lambda: (cart.wall, v)
+    declared = {} if math.isinf(top) else {"top_speed": top}
+    env = leased(cart, delays_s=delay + age, max_lease_s=10.0, **declared)
     env.reset()
     cart.applied = (1.0, 0.0)
     assert steps_until_braking(env) == steps
@@ -267,17 +255,11 @@ def test_a_fallback_is_asked_at_the_present_state_and_kept_finite_and_in_the_box
 
 # Clearances, constraints and functions --------------------------------------------------------------------------
 
-RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
-
-
-def rail(**more):
-    return sw.constraints.Clearance(RAIL, bodies=["cart"], braking=8.0, **more)
-
 
 def by_clearance(away):
     def longest(x, v):
-        to_ends = (0.9 - x - away, v), (0.9 + x - away, -v)
-        return min(lease_by_bisection(room, towards, 8.0, 20.0, 3.0, 0.01) for room, towards in to_ends)
+        rooms, towards = [0.9 - x - away, 0.9 + x - away], [v, -v]
+        return longest_lease(rooms, towards, 8.0, 0.01, acceleration=20.0, top_speed=3.0).min()
 
     return longest
 

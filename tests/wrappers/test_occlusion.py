@@ -11,6 +11,7 @@ from scenes import Scene
 from scipy.spatial.transform import Rotation
 
 import safe_wrappers as sw
+from benchmarks.cases import crossing
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from safe_wrappers.wrappers.occlusion import Imu, Sensor, Track
 
@@ -72,22 +73,6 @@ def looking(world, track, sensor=EYE, tolerance=1.0, **options):
     return env
 
 
-def crossing(weight=0.0, tolerance=1.0):
-    cars = [
-        Track(
-            f"car[{names}]",
-            acceleration_noise=[0.0225, 0.0],
-            reversion_s=2.0,
-            mean_velocity=[speed, 0.0],
-            start_position_std=[0.3, 0.0],
-            start_velocity_std=[0.15, 0.0],
-        )
-        for names, speed in (("012", 1.0), ("345", -1.0))
-    ]
-    sensor = Sensor("eye", view_deg=120, range_m=6.0)
-    return sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), cars, sensor, tolerance, weight)
-
-
 def steps(env, count, seed=0):
     rng = np.random.default_rng(seed)
     low, high = env.action_space.low, env.action_space.high
@@ -99,7 +84,7 @@ def steps(env, count, seed=0):
 
 
 def test_errors_have_the_covariances_that_are_given_seen_and_unseen():
-    env = crossing()
+    env = crossing(gym.make("OccludedCrossing-v0"))
     raw, squared = env.unwrapped, {True: [], False: []}
     for seed in range(60):
         env.reset(seed=seed)
@@ -131,7 +116,7 @@ def test_a_sharp_sensor_on_a_lever_arm_sees_the_truth(arm):
 def test_velocities_alone_leave_positions_unresolved_and_it_says_so():
     env = looking(Turning(), straight("thing*"), Sensor(site="eye", position_std=None, velocity_std=0.1))
     assert env.unobservable == {"thing": ["x", "y"], "thing2": ["x", "y"]}
-    assert crossing().unobservable == {f"car{i}": [] for i in range(6)}
+    assert crossing(gym.make("OccludedCrossing-v0")).unobservable == {f"car{i}": [] for i in range(6)}
     fix = env.last_seen_positions.copy()
     for _ in range(100):
         info = env.step(STILL)[4]
@@ -232,7 +217,8 @@ def test_time_that_runs_backwards_is_an_error():
 
 
 def test_the_penalty_is_what_it_says_is_taken_off_and_not_counted_as_the_task_s():
-    env = sw.RecordInterventions(gym.wrappers.TimeLimit(crossing(weight=0.3, tolerance=0.8), 150))
+    env = crossing(gym.make("OccludedCrossing-v0"), tolerance=0.8, weight=0.3)
+    env = sw.RecordInterventions(gym.wrappers.TimeLimit(env, 150))
     bare, tracking = gym.make("OccludedCrossing-v0"), env.get_wrapper_attr("tracking")
     env.reset(seed=3)
     bare.reset(seed=3)

@@ -9,6 +9,8 @@ import pytest
 from episodes import trace
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import make
+from wrapper_examples import rail
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -16,14 +18,11 @@ from safe_wrappers.wrappers.safety_overlay import KEEP_OUT, LIMIT, MOST_MARKS, W
 from safe_wrappers.wrappers.strip import STATES, STEPS, state_of, with_strip
 
 TASK = "SafePointGoal1-v0"
-RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
 STILL, AHEAD = np.zeros(2, np.float32), np.array([1.0, 0.0], np.float32)
 
 
 def made(task, wrap=sw.protect):
-    if "Fetch" in task or "Maze" in task:
-        gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    return wrap(gym.make(task, render_mode="rgb_array"))
+    return wrap(make(task, render_mode="rgb_array"))
 
 
 def crossing(env):
@@ -33,8 +32,7 @@ def crossing(env):
 
 def leased(env):
     speed = sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(1.0, joints=["slider"])])
-    rail = sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"])
-    return sw.LeaseExpiry(speed, sw.StoppingBudget(rail, acceleration=30.0))
+    return sw.LeaseExpiry(speed, sw.StoppingBudget(rail(), acceleration=30.0))
 
 
 class Looking(sw.SafetyOverlay):
@@ -87,7 +85,7 @@ def test_every_disc_has_a_ring_where_the_margin_begins(task):
 
 
 def test_planes_are_moved_by_what_is_kept_free():
-    keep = sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"], radius=0.1, margin=0.05, state_error=0.01)
+    keep = rail(radius=0.1, margin=0.05, state_error=0.01)
     env = sw.SafetyOverlay(made("InvertedPendulum-v5", lambda env: sw.CBFActionFilter(env, [keep])))
     env.reset(seed=0)
     env.step(np.array([3.0], np.float32))

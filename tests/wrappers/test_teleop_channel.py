@@ -199,11 +199,8 @@ def test_pressing_by_waves_creates_nothing_where_plain_coding_creates_energy_and
 def test_a_filter_inside_pays_for_itself():
     # It brakes hard before the clamp, again and again; none of that is the channel's energy.
     env = channel(0.02, 0.02, lambda env: sw.CBFActionFilter(env, [clamp()]), impedance=IMPEDANCE)
-    operator, observation, changed = (
-        TeleopOperator(0, stops=False, sweep_speed=0.4),
-        place(env, (0.184, 0.2)),
-        0,
-    )
+    operator, changed = TeleopOperator(0, stops=False, sweep_speed=0.4), 0
+    observation = place(env, (0.184, 0.2))
     for _ in range(1600):
         observation, *_, info = env.step(operator.act(observation))
         changed += info["cbf/intervened"]

@@ -2,6 +2,7 @@
 
 import gymnasium as gym
 import numpy as np
+from asking import pushed
 
 import safe_wrappers as sw
 
@@ -34,18 +35,9 @@ class Cart(gym.Env):
         return self.state.copy(), 0.0, False, False, {}
 
 
-def cart_plant(dt=0.1, delay_s=0.0):
-    return sw.AnalyticPlant(
-        f=lambda x: np.array([x[1], 0.0]),
-        g=lambda x: np.array([[0.0], [1.0]]),
-        state=lambda env: env.state,
-        control_dt=dt,
-        delay_s=delay_s,
-    )
-
-
 def filtered_cart(constraints, *, dt=0.1, env=None, delay_s=0.0, **options):
-    return sw.CBFActionFilter(env or Cart(dt), constraints, plant=cart_plant(dt, delay_s), **options)
+    plant = pushed(lambda env: env.state, control_dt=dt, delay_s=delay_s)
+    return sw.CBFActionFilter(env or Cart(dt), constraints, plant=plant, **options)
 
 
 class Raw(sw.Constraint):
