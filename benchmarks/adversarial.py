@@ -11,7 +11,6 @@ A violation is a control step in which the env's own truth was broken at any phy
 
 import argparse
 import itertools
-import multiprocessing
 import warnings
 from collections import Counter
 from typing import Any, NamedTuple
@@ -21,7 +20,7 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks.cases import CASES, driven
 from benchmarks.judges import counted
-from benchmarks.tables import keep, made, markdown, options, total
+from benchmarks.tables import CORES, keep, made, markdown, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 
@@ -105,9 +104,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run the jobs in parallel, print the table, keep the rows."""
-    workers = multiprocessing.cpu_count()
     given = options(
-        __doc__, steps=1_000_000, parts=4, workers=workers, robot="point", mismatch=False, off=False
+        __doc__, steps=1_000_000, parts=4, workers=CORES, robot="point", mismatch=False, off=False
     )
     if given.mismatch and given.robot != "point":
         raise SystemExit("--mismatch is for the point: the car's filter declares no uncertainty")

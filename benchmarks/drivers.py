@@ -81,8 +81,7 @@ def uniform(env: Any, rng: np.random.Generator) -> Driver:
 
 def obstacles(env: Any) -> NDArray[np.float64]:
     """Places of all hazards and vases."""
-    vases = env.vase_positions
-    return np.concatenate([env.hazard_positions, vases]) if len(vases) else np.asarray(env.hazard_positions)
+    return np.concatenate([env.hazard_positions, env.vase_positions])
 
 
 DRIVERS: dict[str, Maker] = {

@@ -38,8 +38,9 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks import mujoco_drivers as drivers
 from benchmarks.cases import CASES, PROTECTED, Case
+from benchmarks.judges import Reported
 from benchmarks.mujoco_drivers import Maker
-from benchmarks.tables import made, options
+from benchmarks.tables import CORES, made, options
 from safe_wrappers.envs.teleop_contact import (
     CLAMP_Y,
     TELEOP_ACCELERATION,
@@ -163,7 +164,7 @@ def trace(make: Make, driver: Maker, seed: int, case: Case | None = None) -> dic
     Violations are None where nobody judges: in stacks that execute several control steps at once.
     """
     env = make()
-    judge = case.judge(env.unwrapped) if case is not None else None
+    judge = Reported(lambda info: -np.inf) if case is None else case.judge(env.unwrapped)
     rng = np.random.default_rng(seed)
     # A chunk is asked of the driver command by command.
     commands = int(math.prod(env.action_space.shape or ())) // int(
@@ -174,17 +175,14 @@ def trace(make: Make, driver: Maker, seed: int, case: Case | None = None) -> dic
     lines: dict[str, list[str]] = {}
     sums = dict.fromkeys(TOLERANCES, 0.0)
     observation, info = env.reset(seed=seed)
-    if judge is not None:
-        judge.start()
+    judge.start()
     episode = seed * 1_000
     for step in range(STEPS):
         row = np.concatenate([np.asarray(act()) for _ in range(commands)])
         action = row.astype(env.action_space.dtype).reshape(env.action_space.shape)
-        if judge is not None:
-            judge.before()
+        judge.before()
         observation, reward, terminated, truncated, info = env.step(action)
-        if judge is not None:
-            sums["violations"] += not judge.after(info["executed_action"], info) <= 0.0
+        sums["violations"] += not judge.after(info.get("executed_action", action), info) <= 0.0
         sums["changed"] += int(np.any(info.get("cbf/intervened", False)))
         for name in ("infeasible", "fallback", "unsafe"):
             sums[name] += int(np.any(info.get(f"cbf/{name}", False)))
@@ -202,7 +200,7 @@ def trace(make: Make, driver: Maker, seed: int, case: Case | None = None) -> dic
             env.reset(seed=episode)
     env.close()
     behaviour: dict[str, float | None] = {name: round(total / STEPS, 6) for name, total in sums.items()}
-    if judge is None:
+    if case is None:
         behaviour["violations"] = None
     digests_by_field = {field: " ".join(found) for field, found in sorted(lines.items())}
     return {"behaviour": behaviour, "digests": digests_by_field}
@@ -293,7 +291,7 @@ def misbehaviour(recorded: Mapping[str, Any], today: Mapping[str, Any]) -> list[
 
 
 def main() -> None:
-    given = options(__doc__, write=False, behaviour=False, short=False, envs=[], workers=os.cpu_count() or 1)
+    given = options(__doc__, write=False, behaviour=False, short=False, envs=[], workers=CORES)
     if any(os.environ.get(name) != value for name, value in SAME_BITS.items()):
         words = [sys.executable, "-W", "ignore", "-m", "benchmarks", "golden_traces", *sys.argv[1:]]
         sys.exit(subprocess.run(words, env=os.environ | SAME_BITS).returncode)

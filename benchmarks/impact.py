@@ -9,7 +9,6 @@ normal force of any physics substep. The filter keeps 2 % of the limit as its ma
 """
 
 import itertools
-import multiprocessing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import RUNS, keep, markdown, measured, options, total
+from benchmarks.tables import CORES, RUNS, keep, markdown, measured, options, total
 
 TIMESTEP_S, SUBSTEPS = 0.002, 10
 """A control step of 20 ms, as Reacher's."""
@@ -212,6 +211,6 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, print the table."""
-    given = options(__doc__, approaches=10_000, workers=multiprocessing.cpu_count())
+    given = options(__doc__, approaches=10_000, workers=CORES)
     jobs = [Job(limited, block) for block in range(given.approaches // BLOCK) for limited in (False, True)]
     keep("impact", table(measured(RUNS / "impact/impact.jsonl", jobs, run, given.workers)))

@@ -16,7 +16,6 @@ under one that is 5 % longer. Clearances are drawn so that a lease is a whole nu
 """
 
 import math
-import multiprocessing
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import RUNS, keep, markdown, measured, options, total
+from benchmarks.tables import CORES, RUNS, keep, markdown, measured, options, total
 from safe_wrappers.control.watchdog import longest_lease
 from safe_wrappers.errors import Array
 from safe_wrappers.wrappers.faults import Outages
@@ -308,7 +307,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, print the table."""
-    given = options(__doc__, episodes=10_000, workers=multiprocessing.cpu_count())
+    given = options(__doc__, episodes=10_000, workers=CORES)
     blocks = range(math.ceil(given.episodes / BLOCK))
     jobs = [Job(mode, block) for block in blocks for mode in MODES]
     keep("leases", table(measured(RUNS / "leases/leases.jsonl", jobs, run, given.workers)))

@@ -105,13 +105,12 @@ def speed_seeking(env: Any, rng: np.random.Generator) -> Iterator[Action]:
             yield np.where(forward, high, low)
 
 
-def point_seeking(body: str, points: list[tuple[float, ...]], hold: int = 50) -> Maker:
-    """Pulls a body to one point after another by its Jacobian's transpose; between two of them, anywhere.
+def point_seeking(body: str, points: list[tuple[float, ...]]) -> Maker:
+    """Pulls a body to one point after another by its Jacobian's transpose, 50 steps; between two of them, anywhere.
 
     Args:
         body: Its name; the origin is meant.
         points: In the world, (x, y, z), m.
-        hold: Steps for each; the bodies are thrown about for half as long before.
     """
 
     @stepwise
@@ -123,8 +122,8 @@ def point_seeking(body: str, points: list[tuple[float, ...]], hold: int = 50) ->
         jacobian = np.zeros((3, model.nv))
         while True:
             thrown, point = rng.uniform(low, high), np.array(points[rng.integers(len(points))])
-            yield from [thrown] * (hold // 2)
-            for _ in range(hold):
+            yield from [thrown] * 25
+            for _ in range(50):
                 data.qpos[:] = env.data.qpos
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_comPos(model, data)

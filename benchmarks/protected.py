@@ -9,7 +9,6 @@ neither as infeasible or fallback nor as one that started unsafe.
 """
 
 import itertools
-import multiprocessing
 import warnings
 from collections import Counter
 from dataclasses import fields
@@ -17,7 +16,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.cases import PROTECTED, Case, driven
 from benchmarks.judges import counted
-from benchmarks.tables import RUNS, keep, markdown, measured, options, total
+from benchmarks.tables import CORES, RUNS, keep, markdown, measured, options, total
 from safe_wrappers.errors import UnsafeStateWarning
 
 CHUNK = 10_000
@@ -71,7 +70,9 @@ def table(cases: dict[str, Case], rows: list[dict[str, Any]]) -> str:
             "; ".join(kinds),
             "proved" if proved else "best effort",
         ]
-        cells += [_violations(on), f"{total(off, 'violations'):,}", f"{total(on, 'steps'):,}"]
+        violations, unflagged = total(on, "violations"), total(on, "unflagged")
+        counts = f"{violations:,} ({unflagged:,} unflagged)" if unflagged else f"{violations:,}"
+        cells += [counts, f"{total(off, 'violations'):,}", f"{total(on, 'steps'):,}"]
         cells.append(f"{total(on, 'intervened') / total(on, 'steps'):.1%}")
         lines.append([*cells, *(f"{total(on, flag):,}" for flag in ("infeasible", "fallback"))])
     head = "env | constraints | class | violations on | off"
@@ -94,14 +95,9 @@ def spelled(constraint: Any) -> str:
     return f"{type(constraint).__name__}: {', '.join(told)}" if told else type(constraint).__name__
 
 
-def _violations(rows: list[dict[str, Any]]) -> str:
-    violations, unflagged = total(rows, "violations"), total(rows, "unflagged")
-    return f"{violations:,} ({unflagged:,} unflagged)" if unflagged else f"{violations:,}"
-
-
 def main() -> None:
     """Run the jobs, write each row as it comes, print the table."""
-    given = options(__doc__, steps=10_000, envs=[], workers=multiprocessing.cpu_count())
+    given = options(__doc__, steps=10_000, envs=[], workers=CORES)
     cases = {
         name: case
         for name, case in PROTECTED.items()

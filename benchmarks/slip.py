@@ -10,7 +10,6 @@ what speed and steering ask for.
 
 import itertools
 import math
-import multiprocessing
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import keep, made, markdown, options, total
+from benchmarks.tables import CORES, keep, made, markdown, options, total
 
 SLIPPING, YAW_EXCURSION = 0.2, 0.5
 EPISODE_STEPS = 300
@@ -107,7 +106,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run the jobs in parallel, print the table."""
-    given = options(__doc__, steps=200_000, workers=multiprocessing.cpu_count())
+    given = options(__doc__, steps=200_000, workers=CORES)
     kinds = itertools.product(DRIVERS, (False, True), range(PARTS))
     jobs = [Job(driver, limited, given.steps // PARTS, part) for driver, limited, part in kinds]
     keep("slip", table(list(made(run, jobs, given.workers))))

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from benchmarks.tables import RESULTS as FOLDER
-from benchmarks.tables import options
+from benchmarks import tables
 from safe_wrappers.train.config import parse_experiment, read_config
 from safe_wrappers.train.config.models import ExperimentConfig
 from safe_wrappers.train.evaluation.summary import estimate, number, summarize
@@ -32,7 +31,7 @@ from safe_wrappers.train.run.folder import POLICY
 from safe_wrappers.train.run.policy import CONFIG
 
 ROOT = Path(__file__).parents[1]
-RESULTS = FOLDER / "table.csv"
+RESULTS = tables.RESULTS / "table.csv"
 VERSIONS = ("gymnasium", "mujoco", "stable-baselines3", "torch", "sbx-rl")
 
 
@@ -160,11 +159,7 @@ def cell(rows: Iterable[dict[str, Any]], metric: str) -> str:
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """The table that the docs show."""
-    lines = [
-        "| task | learner | control steps x seeds | steps per action | trained | training: violations, all seeds "
-        "| filter off: return; cost | filter on: return; cost | lowest tenth of the episodes | stuck | infeasible |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for told in dict.fromkeys(tuple(row[key] for key in KEY[:4]) for row in rows):
         task, algorithm, steps, repeat = told
         of_task = [row for row in rows if tuple(row[key] for key in KEY[:4]) == told]
@@ -180,7 +175,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
                 else "-"
                 for key in ("stuck", "infeasible")
             ]
-            columns = [
+            cells = [
                 task.removesuffix("-v0"),
                 algorithm,
                 f"{int(steps):,} x {len(on)}",
@@ -192,14 +187,18 @@ def markdown(rows: list[dict[str, Any]]) -> str:
                 cell(on, "return_decile"),
                 *shares,
             ]
-            lines.append("| " + " | ".join(columns) + " |")
+            lines.append(cells)
+    head = "task | learner | control steps x seeds | steps per action | trained | training: violations, all seeds"
+    head += " | filter off: return; cost | filter on: return; cost | lowest tenth of the episodes"
     versions = "; or ".join(dict.fromkeys(row["versions"] for row in rows))
-    return "\n".join([*lines, "", f"Made with {versions}.", ""])
+    return f"{tables.markdown(f'{head} | stuck | infeasible', lines)}\n\nMade with {versions}.\n"
 
 
 def main() -> None:
     names = [task.name for task in TASKS]
-    arguments = options(__doc__, only=names, arms=[], seeds=[], workers=int, output="runs", collect=False)
+    arguments = tables.options(
+        __doc__, only=names, arms=[], seeds=[], workers=int, output="runs", collect=False
+    )
     rows = []
     for task in TASKS:
         whole = experiment_of(task, arguments.output)

@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar
 
 RESULTS: Final = Path(__file__).parent / "results"
 RUNS: Final = Path("runs")
+CORES: Final = multiprocessing.cpu_count()
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Row = dict[str, Any]

@@ -14,14 +14,13 @@ acted on the tool by the env's own account; clearance is the env's, at every phy
 
 import itertools
 import math
-import multiprocessing
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.tables import RUNS, keep, markdown, measured, options, total
+from benchmarks.tables import CORES, RUNS, keep, markdown, measured, options, total
 from safe_wrappers.envs.teleop_contact import TELEOP_ACCELERATION, TELEOP_BRAKING, TELEOP_TOP_SPEED
 from safe_wrappers.envs.teleop_operator import TeleopOperator
 from safe_wrappers.wrappers.faults import Outages
@@ -140,7 +139,7 @@ def clearance_table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, print the tables."""
-    given = options(__doc__, seeds=5, workers=multiprocessing.cpu_count())
+    given = options(__doc__, seeds=5, workers=CORES)
     kinds = itertools.product(range(given.seeds), NETWORKS, DELAYS_S, CODINGS, OPERATORS, (False, True))
     jobs = [
         Job(coding, net, delay, who, revocation, seed) for seed, net, delay, coding, who, revocation in kinds

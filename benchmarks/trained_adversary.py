@@ -89,18 +89,15 @@ class Adversary(Judged):
         case = CASES[env_id]
         bare = case.make()
         super().__init__(case.protect(bare) if filtered else bare, case.judge(bare.unwrapped))
-        self._filtered, self._scale = filtered, SCALES.get(env_id, 1.0)
+        self._scale = SCALES.get(env_id, 1.0)
         self.tally = Tally()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Steps, judges, counts and pays."""
         observation, _, terminated, truncated, info = super().step(action)
-        reward, tally = float(info["cost_substep"]), self.tally
-        for name, count in {"steps": 1, **counted(info, reward > 0.0)}.items():
-            setattr(tally, name, getattr(tally, name) + count)
-        if self._filtered:
-            margin = float(info["cbf/margin"])
-            tally.smallest = margin if tally.smallest is None else min(tally.smallest, margin)
+        reward, margin = float(info["cost_substep"]), info.get("cbf/margin")
+        self.tally = self.tally.plus(Tally(1, **counted(info, reward > 0.0), smallest=margin))
+        if margin is not None:
             reward += NEARNESS * nearness(margin, self._scale)
         return observation, reward, terminated, truncated, info
 

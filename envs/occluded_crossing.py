@@ -153,8 +153,7 @@ class OccludedCrossingEnv(FieldEnv):
     @property
     def car_tracks(self) -> Tracks:
         """The cars' true states, without uncertainty now, and how they move: what a perfect tracker would know."""
-        states = np.zeros((CARS, 4))
-        states[:, :2], states[:, 2:] = self.car_positions, self.car_velocities
+        states = np.concatenate([self.car_positions, self.car_velocities], axis=1)
         self._tracks.start(states, np.zeros((CARS, 4, 4)))
         return self._tracks
 

@@ -111,6 +111,8 @@ class SafeRoverEnv(FieldEnv):
     hazard_radius: Final = ROVER_HAZARD_RADIUS
     goal_radius = 0.4
     wheels: Final = WHEELS
+    ground: Ground
+    """The grounds of this episode: the truth that no driver may see."""
 
     def __init__(self, **kwargs: Any) -> None:
         EzPickle.__init__(self, **kwargs)
@@ -145,14 +147,9 @@ class SafeRoverEnv(FieldEnv):
         """Centres of the hazards, shape (n, 2), m."""
         return np.array(self._targets[1:])
 
-    @property
-    def ground(self) -> Ground:
-        """The grounds of this episode: the truth that no driver may see."""
-        return self._grounds
-
     def ground_under(self, wheel: str) -> str:
         """Name of the ground under a wheel now; `ValueError` for no wheel."""
-        return self._grounds.at(*self.data.xpos[self._tyres.bodies[WHEELS.index(wheel)], :2].tolist())
+        return self.ground.at(*self.data.xpos[self._tyres.bodies[WHEELS.index(wheel)], :2].tolist())
 
     def _parse(self, options: Mapping[str, Any] | None) -> Given:
         given = layout_option(options, LAYOUT_KEYS)
@@ -181,7 +178,7 @@ class SafeRoverEnv(FieldEnv):
         super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         for _ in range(_SETTLING):
             data.userdata[:] = data.sensordata[:4]
-            self._tyres.apply(data, self._grounds.curve_at)
+            self._tyres.apply(data, self.ground.curve_at)
             mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, 0)
         data.userdata[:] = data.sensordata[:4]
         self._begin_judging()
@@ -228,14 +225,14 @@ class SafeRoverEnv(FieldEnv):
         self._begin_judging()
         for k in range(n_frames):
             mujoco.mj_step1(model, data)
-            self._tyres.apply(data, self._grounds.curve_at)
+            self._tyres.apply(data, self.ground.curve_at)
             if k:  # the first substep's start was judged as the end of the control step before
                 self._judge()
             mujoco.mj_step2(model, data)
             data.userdata[:] = loads
         # Sensors and loads of the state reached.
         mujoco.mj_step1(model, data)
-        self._tyres.apply(data, self._grounds.curve_at)
+        self._tyres.apply(data, self.ground.curve_at)
         self._judge()
         mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, 0)
         data.userdata[:] = loads
@@ -273,7 +270,7 @@ class SafeRoverEnv(FieldEnv):
         """Start an episode from a layout, the wheels rolling along."""
         self._groups = np.repeat([0, 1], [1, len(hazards)])
         self._hazards = hazards.tolist()
-        self._grounds = Ground(ground, patches)
+        self.ground = Ground(ground, patches)
         self._begin(goal, hazards)
         self._show_grounds()
         x, y, heading = agent.tolist()
@@ -286,7 +283,7 @@ class SafeRoverEnv(FieldEnv):
 
     def _show_grounds(self) -> None:
         """Move what is drawn of patches where they are; none of it touches anything."""
-        mocap, model, ground = self.data.mocap_pos, self.model, self._grounds
+        mocap, model, ground = self.data.mocap_pos, self.model, self.ground
         first = len(mocap) - len(self._patch_geoms)
         for i, (patch, geom) in enumerate(zip(ground.patches, self._patch_geoms, strict=False)):
             mocap[first + i, :2] = patch.center

@@ -102,6 +102,8 @@ class TeleopContactEnv(TaskEnv):
     """Entries of the action that are the port's flow."""
     port_effort_observed: Final = (4, 5)
     """Entries of the observation that are its effort."""
+    wanted_force: float
+    """N."""
 
     def __init__(self, **kwargs: Any) -> None:
         EzPickle.__init__(self, **kwargs)
@@ -111,7 +113,7 @@ class TeleopContactEnv(TaskEnv):
         self.port_feedthrough = float(model.actuator_gainprm[0, 0])
         self._damper_limit = float(model.actuator_forcerange[0, 1])
         self._wall = int(model.geom("wall").id)
-        self._wanted = float(np.mean(_WANTED))
+        self.wanted_force = float(np.mean(_WANTED))
         self._begin()
 
     @property
@@ -128,11 +130,6 @@ class TeleopContactEnv(TaskEnv):
     def clearance(self) -> float:
         """Between tool and clamp, m."""
         return CLAMP_Y - TOOL_RADIUS - float(self.data.qpos[1])
-
-    @property
-    def wanted_force(self) -> float:
-        """N."""
-        return self._wanted
 
     @property
     def port_effort(self) -> Array:
@@ -162,7 +159,7 @@ class TeleopContactEnv(TaskEnv):
 
     def reset_model(self) -> Array:
         drawn = self.np_random.uniform(*np.transpose([_START_X, _START_Y, _WANTED]))
-        self._wanted = float(self._given.get("wanted_force", drawn[2]))
+        self.wanted_force = float(self._given.get("wanted_force", drawn[2]))
         self.set_state(self._given.get("tool", drawn[:2]), self._given.get("velocity", np.zeros(2)))
         return self.observe()
 
@@ -179,7 +176,7 @@ class TeleopContactEnv(TaskEnv):
     def observe(self) -> Array:
         data = self.data
         tool = [*data.qpos.tolist(), *data.qvel.tolist(), *self._coupling(data.ctrl)]
-        return np.array([*tool, self._force, self.clearance, self._wanted])
+        return np.array([*tool, self._force, self.clearance, self.wanted_force])
 
     def _get_reset_info(self) -> dict[str, Any]:
         cost = float(self.clearance <= 0.0)
@@ -239,7 +236,7 @@ class TeleopContactEnv(TaskEnv):
         self._farthest = float(self.data.qpos[1])
 
     def _reward(self) -> float:
-        error = abs(self._force - self._wanted) / self._wanted
+        error = abs(self._force - self.wanted_force) / self.wanted_force
         place = min(float(self.data.qpos[1]), CLAMP_Y - TOOL_RADIUS - CLOSE_TO_CLAMP)
         gained = place - self._farthest if error <= _PRESSING else 0.0
         if gained <= 0.0:

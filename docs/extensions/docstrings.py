@@ -8,14 +8,10 @@ from sphinx.application import Sphinx
 _BAR = re.compile(r"(`+)(?:(?!\1).)*\1|\|")
 """A span in backticks, or a bar outside of them."""
 _ARRAY_LIKE = re.compile(r"~numpy\._typing\.\S+ \| .*?_NestedSequence\[[a-z |]+\]")
-_ARRAY = re.compile(
-    r"~numpy\.ndarray\[tuple\[~typing\.Any, \.\.\.\], ~numpy\.dtype\[~numpy\.(\w+)\]\]"
-)
+_ARRAY = re.compile(r"~numpy\.ndarray\[tuple\[~typing\.Any, \.\.\.\], ~numpy\.dtype\[~numpy\.(\w+)\]\]")
 
 
-def _escape(
-    app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]
-) -> None:
+def _escape(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """`|x|` is an absolute value here and a substitution there; types of returns are in the signature.
 
     And whoever reads of "the appendix" finds which one.
@@ -28,9 +24,7 @@ def _escape(
             lines[i] = line
         if not line.lstrip().startswith((">>>", "...")):
             line = _BAR.sub(lambda m: m[0] if m[0] != "|" else r"\|", line)
-            lines[i] = line.replace(
-                "Source: appendix", "Source: :doc:`appendix </references>`"
-            )
+            lines[i] = line.replace("Source: appendix", "Source: :doc:`appendix </references>`")
 
 
 def _shorten(
@@ -44,9 +38,7 @@ def _shorten(
 ) -> tuple[str | None, str | None]:
     """NumPy's aliases are expanded by the time they come here."""
     short = (
-        None
-        if part is None
-        else _ARRAY.sub(r"NDArray[\1]", _ARRAY_LIKE.sub("ArrayLike", part))
+        None if part is None else _ARRAY.sub(r"NDArray[\1]", _ARRAY_LIKE.sub("ArrayLike", part))
         for part in (signature, returns)
     )
     one, two = short

@@ -28,20 +28,14 @@ class Drawn(SphinxDirective):
         name = self.arguments[0]
         names = runpy.run_path(str(_FIGURES / "draw.py"))
         if name not in names["names"]():
-            raise self.error(
-                f"no picture {name!r}; there are {', '.join(names['names']())}"
-            )
+            raise self.error(f"no picture {name!r}; there are {', '.join(names['names']())}")
         if not self.options.get("alt"):
             raise self.error(f"picture {name!r} needs :alt:")
         alt = html.escape(" ".join(self.options["alt"].split()))
-        picture = names["svg"](name).replace(
-            "<svg ", f'<svg role="img" aria-label="{alt}" ', 1
-        )
+        picture = names["svg"](name).replace("<svg ", f'<svg role="img" aria-label="{alt}" ', 1)
         caption = self.parse_content_to_nodes()
         return [
-            nodes.raw(
-                "", f'<figure class="drawn">{picture}<figcaption>', format="html"
-            ),
+            nodes.raw("", f'<figure class="drawn">{picture}<figcaption>', format="html"),
             *caption,
             nodes.raw("", "</figcaption></figure>", format="html"),
         ]

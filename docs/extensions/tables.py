@@ -30,9 +30,7 @@ class ConfigKeys(SphinxDirective):
         """One row per key."""
         rows = ["| Key | Type | Default | Meaning |", "|---|---|---|---|"]
         for key in _KEYS(self.arguments[0], self.options.get("prefix", "")):
-            rows.append(
-                f"| `{key.name}` | {key.type} | {key.default} | {key.meaning} |"
-            )
+            rows.append(f"| `{key.name}` | {key.type} | {key.default} | {key.meaning} |")
         return self.parse_text_to_nodes(StringList(rows, self.arguments[0]))
 
 
@@ -41,9 +39,7 @@ class _InfoTable(SphinxDirective):
         """A table of cells in reStructuredText, the first row its head."""
         text = [".. list-table::", "   :header-rows: 1", f"   :widths: {widths}", ""]
         for row in rows:
-            text += [
-                f"   {'*' if i == 0 else ' '} - {cell}" for i, cell in enumerate(row)
-            ]
+            text += [f"   {'*' if i == 0 else ' '} - {cell}" for i, cell in enumerate(row)]
         return self.parse_text_to_nodes(StringList(text, _MODULE))
 
 

@@ -16,7 +16,7 @@ _LEANING = np.array([1.0, -1.0, -1.0, 1.0])
 """Which way each leg's ankle bends."""
 
 
-def gait(env: Any, strength: float = 1.2) -> Callable[[int], NDArray[np.float32]]:
+def gait(env: Any) -> Callable[[int], NDArray[np.float32]]:
     """Hips swing, ankles lift while they do; a torque for each joint's error."""
     raw = env.unwrapped
     m = raw.model
@@ -29,20 +29,20 @@ def gait(env: Any, strength: float = 1.2) -> Callable[[int], NDArray[np.float32]
         phase = 2.0 * np.pi * STEP_S * step / _PERIOD_S + np.pi * (np.arange(4) % 2)
         lifted = 0.9 - 0.3 * np.maximum(np.cos(phase), 0.0)
         wanted = np.where(hip, 0.35 * np.sin(phase)[leg], (_LEANING * lifted)[leg])
-        torque = strength * (wanted - raw.data.qpos[qpos]) - 0.05 * raw.data.qvel[dofs]
+        torque = 1.2 * (wanted - raw.data.qpos[qpos]) - 0.05 * raw.data.qvel[dofs]
         return np.clip(torque, -1.0, 1.0).astype(np.float32)
 
     return act
 
 
 def walk(
-    wrap: Callable[[Any], Any], steps: int, strength: float = 1.2, seed: int = 0
+    wrap: Callable[[Any], Any], steps: int
 ) -> tuple[list[NDArray[np.float64]], list[dict[str, Any]], float]:
     """Per step the normal and tangential force of each contact with the floor, over the weight; infos; metres."""
     env = wrap(gym.make("Ant-v5", healthy_z_range=(0.1, 2.0)))
     raw = env.unwrapped
-    env.reset(seed=seed)
-    replay, act = Replay(raw), gait(env, strength)
+    env.reset(seed=0)
+    replay, act = Replay(raw), gait(env)
     weight = float(raw.model.body_mass.sum() * 9.81)
     fixed = raw.model.body_weldid == 0
     forces, infos, wrench = [], [], np.zeros(6)

@@ -38,10 +38,9 @@ def drive(
     driver: Callable[[Any], Any],
     steps: int,
     read: Callable[[Any, dict[str, Any]], Any],
-    seed: int = 0,
 ) -> tuple[Array, list[dict[str, Any]]]:
     """What `read` reads after every step (episodes are not ended), and the infos."""
-    env.reset(seed=seed)
+    env.reset(seed=0)
     seen, infos = [], []
     for _ in range(steps):
         info = env.step(driver(env))[4]

@@ -168,7 +168,7 @@ def test_spaces_are_the_envs_own(name, case):
         assert env.observation_space == env.env.observation_space
 
 
-# 4, 5: reset --------------------------------------------------------------------------------------------------
+# 4, 5, 9: reset, pickling -------------------------------------------------------------------------------------
 
 
 class Witness(gym.Wrapper):
@@ -302,19 +302,6 @@ def test_inside_a_vector_env_infos_are_whole(kind, name, case):
                 assert infos[key].dtype == np.asarray(value).dtype, key
                 np.testing.assert_array_equal(infos[key][0], value, err_msg=key)
     raise AssertionError("the first episode does not end")
-
-
-# 9: pickling --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("case", EXAMPLES["CBFActionFilter"])
-def test_bound_constraints_and_their_plant_survive_pickling(case):
-    env = build("CBFActionFilter", case)
-    env.reset(seed=0)
-    bound, plant = pickle.loads(pickle.dumps((env.filter.bound, env.plant)))
-    assert plant.observation_id == env.plant.observation_id
-    for mine, theirs in zip(env.filter.bound, bound, strict=True):
-        np.testing.assert_array_equal(mine.value(), theirs.value())
 
 
 # 10, 11: actions ----------------------------------------------------------------------------------------------

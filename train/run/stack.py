@@ -97,7 +97,9 @@ def make_stack(
     return AdaptionPenalty(monitored, learner.penalty) if learner.penalised else monitored
 
 
-def _called(where: str, make: Callable[..., Any], env: gym.Env[Any, Any], given: Mapping[str, Any]) -> Any:
+def _called(
+    where: str, make: Callable[..., gym.Env[Any, Any]], env: gym.Env[Any, Any], given: Mapping[str, Any]
+) -> gym.Env[Any, Any]:
     """What is made around an env; arguments that are missing or unknown are refused."""
     try:
         return make(env, **given)
@@ -109,17 +111,14 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
     """The task in its filter; as it is if there is none."""
     if action_filter.protect is not None:
         try:
-            protected: gym.Env[Any, Any] = _called("filter.protect", protect, task, action_filter.protect)
-            return protected
+            return _called("filter.protect", protect, task, action_filter.protect)
         except UnsupportedEnvError as error:
             raise ConfigurationError(
                 f"filter: {error}\nPut these lines into a function of the env, in a module beside the config; then"
                 ' filter: {factory: "module:function"}.'
             ) from None
     if action_filter.factory is not None:
-        factory = _factory(action_filter.factory)
-        filtered: gym.Env[Any, Any] = _called("filter.kwargs", factory, task, action_filter.kwargs)
-        return filtered
+        return _called("filter.kwargs", _factory(action_filter.factory), task, action_filter.kwargs)
     return task
 
 
@@ -147,8 +146,7 @@ def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> gym.Env[An
                 "budget: {clearance: {kind: ..., ...}, ...}"
             )
         budget = {"clearance": constraints[0], **budget}
-    leased: gym.Env[Any, Any] = _called("filter.lease", LeaseExpiry, task, {**arguments, "budget": budget})
-    return leased
+    return _called("filter.lease", LeaseExpiry, task, {**arguments, "budget": budget})
 
 
 def _factory(name: str) -> Any:
