@@ -178,7 +178,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             cells = [
                 task.removesuffix("-v0"),
                 algorithm,
-                f"{int(steps):,} x {len(on)}",
+                f"{int(steps):,} x {len({row['seed'] for row in same})}",
                 str(repeat),
                 arm,
                 number(sum(float(row["violations"]) for row in training)),
