@@ -332,6 +332,20 @@ def test_a_barrier_is_never_broken_in_silence_and_held_where_the_motor_can(torqu
     assert (broken == 0) == holds
 
 
+@pytest.mark.parametrize("fallback", ["hold", "zero", lambda plant: np.array([1.0, 1.0])])
+def test_a_proved_constraint_stays_proved_with_any_fallback(fallback):
+    env = sw.protect(gym.make("SafePointGoal2-v0"), detour=False, fallback=fallback)
+    rng = np.random.default_rng(1)
+    env.reset(seed=0)
+    raw = env.unwrapped
+    for k in range(600):
+        if k % 60 == 0:
+            target = raw.hazard_positions[rng.integers(len(raw.hazard_positions))]
+        angle = np.angle((target - raw.agent_position) @ [1, 1j] / np.exp(1j * raw.agent_heading))
+        action = np.array([1.0, np.clip(4.0 * angle, -1.0, 1.0)], np.float32)
+        assert env.step(action)[4]["cost_substep"] == 0.0
+
+
 # Broken readings --------------------------------------------------------------------------------------------------
 
 
