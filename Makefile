@@ -112,7 +112,7 @@ shelf: .venv/shelf
 table: .venv/sbx
 	$(BIN)/python -m benchmarks table
 
-# Attackers against the proved filters, 20,000,000 steps: hours on one core; goes on where it was stopped.
+# Attackers against the proved filters: hours on one core; goes on where it was stopped.
 endurance: .venv/installed
 	$(BIN)/python -m benchmarks endurance
 
@@ -122,11 +122,6 @@ RUN = $(BIN)/python -m benchmarks
 COMPARED = pointgoal1_300k pointgoal1_learners velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
 	outages saferover_ppo occluded_crossing_ppo
 figures: .venv/installed
-	$(RUN) adversarial
-	$(RUN) adversarial --mismatch
-	$(RUN) adversarial --off --steps 100000
-	$(RUN) adversarial --robot car --steps 500000
-	$(RUN) adversarial --robot car --off --steps 49000 --parts 1
 	$(RUN) protected --steps 3000
 	for name in trained_adversary leases slip impact occlusion teleop kills training_time; do $(RUN) $$name || exit 1; done
 	$(RUN) kills --seeds 2 --workers 2 --name kills_together

@@ -6,7 +6,8 @@
 Chunks of one env, driver and seed are made one after the other in the same process, each a line in
 `runs/endurance/endurance.jsonl`. The hand-written drivers attack 16 envs at once through a `VectorCBFActionFilter`.
 CEM and differences search 30 steps ahead in copies of the env, filter included. The learner is PPO that is paid for
-violations, anew in each chunk.
+violations, anew in each chunk. Filters with a wrong plant are attacked on SafePointGoal by those written by hand: by
+20 % in mass and in damping, all four corners, with 25 % of uncertainty declared (true is the plant's times 1 / 0.8).
 
 A violation is a control step in which the env's own truth (`benchmarks/judges.py`) was broken at any physics substep.
 The memory of the process is read at a chunk's end, after the allocator has given back what is free.
@@ -20,7 +21,7 @@ import platform
 import warnings
 import zlib
 from dataclasses import asdict
-from itertools import zip_longest
+from itertools import product, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,8 +48,12 @@ ENVS = (
     "PointMaze_Large-v3",
 )
 LEARNER = "learner"
-STEPS = {"hand": 50_000, "off": 5_000, "search": 1_000, LEARNER: 50_000}
-"""Control steps of a chunk, by the kind of driver; `off` is a hand-written one without the filter."""
+STEPS = {"hand": 50_000, "off": 5_000, "wrong": 5_000, "search": 1_000, LEARNER: 50_000}
+"""Control steps of a chunk, by the kind of driver; `off` is a hand-written one without the filter, `wrong` with a
+filter that has a wrong plant."""
+WRONG = "wrong plant"
+EXTRA = ("simulated", "simulated_violations", "off_steps", "off_violations")
+"""Counts of a row beside its tally: of the steps that searches simulated, and of those without the filter."""
 CARS_EVERY, SEARCHES_EVERY = 3, 10
 """Rounds: a car's step takes four times as long as a point's, and one of a search a hundred times."""
 TOGETHER = 16
@@ -65,6 +70,8 @@ class Chunk(NamedTuple):
     planned: int
     seed: int
     filtered: bool = True
+    mass: float = 1.0
+    damping: float = 1.0
 
 
 def hand_written(env: str) -> dict[str, Maker]:
@@ -99,6 +106,8 @@ def plan(steps: int) -> list[Chunk]:
                 driver, kind = pair
                 if seed == 0 and kind == "hand":
                     found.append(Chunk(env, driver, STEPS["off"], 0, filtered=False))
+                    corners = product((0.8, 1.2), repeat=2) if "PointGoal" in env else ()
+                    found += [Chunk(env, driver, STEPS["wrong"], 0, True, *wrong) for wrong in corners]
                 found.append(Chunk(env, driver, STEPS[kind], seed))
                 planned += STEPS[kind]
         seed += 1
@@ -107,7 +116,7 @@ def plan(steps: int) -> list[Chunk]:
 def run(chunk: Chunk) -> dict[str, Any]:
     """Attack, judge and count; then look at the process."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted
-    row = learn(chunk) if chunk.driver == LEARNER else attack(chunk)
+    row = dict.fromkeys(EXTRA, 0) | (learn(chunk) if chunk.driver == LEARNER else attack(chunk))
     process = f"{os.getpid()} of {Path('/proc/self/stat').read_text().split()[21]}"
     known = [f"{name} {importlib.metadata.version(name)}" for name in _VERSIONS]
     versions = ", ".join([f"Python {platform.python_version()}", *known])
@@ -133,19 +142,26 @@ def attack(chunk: Chunk) -> dict[str, Any]:
             found = counted(info, not missed <= 0.0)  # so that what is not a number counts
             tally = tally.plus(Tally(1, **found, smallest=info.get("cbf/margin")))
         ended = terminated | truncated
-    row = asdict(tally)
     envs.close()
-    for name in ("simulated", "simulated_violations"):
-        row[name] = sum(getattr(driver, name, 0) for driver in drivers)
-    return row
+    if not chunk.filtered:
+        return asdict(Tally()) | {"off_steps": tally.steps, "off_violations": tally.violations}
+    return asdict(tally) | {name: sum(getattr(driver, name, 0) for driver in drivers) for name in EXTRA[:2]}
 
 
 def attacked(chunk: Chunk) -> tuple[Any, list[Any]]:
     """The vector env of a chunk, reset, and the driver of each env; all of it follows from the seed."""
-    case, search = CASES[chunk.env], SEARCHES.get(chunk.driver)
-    n = 1 if search else TOGETHER
-    envs: Any = SyncVectorEnv([(lambda: case.protect(case.make())) if search else case.make] * n)
-    if chunk.filtered and not search:
+    case, search, wrong = CASES[chunk.env], SEARCHES.get(chunk.driver), is_wrong(chunk._asdict())
+
+    def single() -> Any:
+        if not wrong:
+            return case.protect(case.make()) if search else case.make()
+        plant = sw.MujocoPlant()
+        plant.perturb(mass=chunk.mass, damping=chunk.damping)
+        return sw.protect(case.make(), plant=plant, uncertainty=0.25)
+
+    n = 1 if search or wrong else TOGETHER
+    envs: Any = SyncVectorEnv([single] * n)
+    if chunk.filtered and not (search or wrong):
         envs = sw.protect(envs)
     own = zlib.crc32(f"{chunk.env} {chunk.driver}".encode())  # no driver starts where another does
     seeds = [int(seed) for seed in np.random.SeedSequence([chunk.seed, own]).generate_state(2 * n)]
@@ -155,6 +171,11 @@ def attacked(chunk: Chunk) -> tuple[Any, list[Any]]:
         return envs, [SearchingDriver(env, rng, search) for env, rng in zip(envs.envs, rngs, strict=True)]
     make = hand_written(chunk.env)[chunk.driver]
     return envs, [make(env.unwrapped, rng) for env, rng in zip(envs.unwrapped.envs, rngs, strict=True)]
+
+
+def is_wrong(row: dict[str, Any]) -> bool:
+    """Whether the filter's plant was: nothing is proved there."""
+    return bool(row["mass"] != 1.0 or row["damping"] != 1.0)
 
 
 def learn(chunk: Chunk) -> dict[str, Any]:
@@ -169,76 +190,50 @@ def learn(chunk: Chunk) -> dict[str, Any]:
     return asdict(tally) | {"off_steps": without["steps"], "off_violations": without["violations"]}
 
 
-def collected(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Sums per env and driver, and what memory did over the steps of each process."""
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row["env"], row["driver"]), []).append(row)
-    envs = list(dict.fromkeys(row["env"] for row in rows))
-    ordered = sorted(groups, key=lambda pair: envs.index(pair[0]))  # drivers as they came
-    return {
-        "drivers": [_pooled(groups[pair]) for pair in ordered],
-        "memory": [
-            m for process in dict.fromkeys(row["process"] for row in rows) if (m := memory(rows, process))
-        ],
-        "versions": sorted({row["versions"] for row in rows}),
-    }
-
-
-def _pooled(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    tally, off = Tally(), Tally()
-    extra = dict.fromkeys(("simulated", "simulated_violations"), 0)
-    for row in rows:
-        part = Tally(**{name: row[name] for name in Tally.__dataclass_fields__})
-        if not row["filtered"]:
-            off = off.plus(part)
-            continue
-        tally = tally.plus(part)
-        off = off.plus(Tally(row.get("off_steps", 0), row.get("off_violations", 0)))
-        for name in extra:
-            extra[name] += row.get(name, 0)
-    extra |= {"off_steps": off.steps, "off_violations": off.violations}
-    return {"env": rows[0]["env"], "driver": rows[0]["driver"], **asdict(tally), **extra}
-
-
-def memory(rows: list[dict[str, Any]], process: str) -> dict[str, Any] | None:
-    """What the memory of one process did after its first round, from a line through the ends of its chunks.
+def memory(rows: list[dict[str, Any]], process: str) -> list[str]:
+    """What the memory of one process did after its first round, by a line through the ends of its chunks.
 
     Counted are chunks of a kind that it has made before, over the filtered steps that it had made by then.
     """
     seen, warm, made = set(), [], 0
     for row in rows:
         if row["process"] == process:
-            made += row["steps"] * row["filtered"]
-            kind = row["env"], row["driver"], row["filtered"]
+            made += row["steps"]
+            kind = tuple(row[name] for name in ("env", "driver", "filtered", "mass", "damping"))
             if kind in seen:
                 warm.append((float(made), row["mb"]))
             seen.add(kind)
     if len(warm) < 3:
-        return None
+        return []
     steps, mb = np.array(warm).T
     span = steps[-1] - steps[0]
     growth = float(np.polyfit(steps, mb, 1)[0]) * span / float(mb.mean())
-    ends = {"least_mb": float(mb.min()), "most_mb": float(mb.max())}
-    return {"chunks": len(warm), "steps": int(span), "growth": growth, **ends}
+    return [
+        f"Memory of a process after its first round, over {span:,.0f} steps in {len(warm)} chunks: "
+        f"{mb.min():.0f} to {mb.max():.0f} MB; a line through them grows by {growth:.2%}."
+    ]
 
 
-def table(found: dict[str, Any]) -> str:
+def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: a line per env and driver, one per env, and what memory did."""
-    rows = [row for row in found["drivers"] if row["steps"]]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["env"], WRONG if is_wrong(row) else row["driver"]), []).append(row)
     lines, sums = [], []
-    for r in rows:
-        off = f"{1e3 * r['off_violations'] / r['off_steps']:.0f}" if r["off_steps"] else "-"
-        counts = [r["env"], r["driver"], f"{r['steps']:,}", f"{r['violations']:,}", off]
-        flags = [f"{r['intervened'] / r['steps']:.1%}", *(f"{r[name]:,}" for name in FLAGS[1:])]
-        lines.append([*counts, *flags, f"{1e3 * r['smallest']:.3f}", r["simulated"] or "-"])
-    for env in [*dict.fromkeys(r["env"] for r in rows), ""]:
-        part = [r for r in rows if env in ("", r["env"])]
+    for (env, driver), part in sorted(groups.items(), key=lambda group: ENVS.index(group[0][0])):
+        of = {name: total(part, name) for name in ("steps", "violations", *FLAGS, *EXTRA)}
+        if not of["steps"]:
+            continue
+        off = f"{1e3 * of['off_violations'] / of['off_steps']:.0f}" if of["off_steps"] else "-"
+        counts = [env, driver, f"{of['steps']:,}", f"{of['violations']:,}", off]
+        flags = [f"{of['intervened'] / of['steps']:.1%}", *(f"{of[name]:,}" for name in FLAGS[1:])]
+        lines.append([*counts, *flags, lowest_mm(part), f"{of['simulated']:,}" if of["simulated"] else "-"])
+    right = [row for row in rows if row["steps"] and not is_wrong(row)]
+    for env in [*dict.fromkeys(row["env"] for row in right), ""]:
+        part = [row for row in right if env in ("", row["env"])]
         steps, bad = total(part, "steps"), total(part, "violations")
         bound = f"{3.0 / steps:.1e} a step" if not bad else "-"
-        sums.append(
-            [env or "all", f"{steps:,}", f"{bad:,}", bound, f"{1e3 * min(r['smallest'] for r in part):.3f}"]
-        )
+        sums.append([env or "all", f"{steps:,}", f"{bad:,}", bound, lowest_mm(part)])
     head = (
         "env | driver | steps | violations | without the filter, of 1,000 | changed | infeasible | fallback"
     )
@@ -246,19 +241,22 @@ def table(found: dict[str, Any]) -> str:
     by_env = markdown("env | steps | violations | at most, at 95 % | lowest h (mm)", sums)
     simulated, bad = total(rows, "simulated"), total(rows, "simulated_violations")
     said = [f"Of {simulated:,} steps that searches simulated, {bad:,} were in violation.", ""]
-    for m in found["memory"]:
-        said.append(
-            f"Memory of a process after its first round, over {m['steps']:,} steps in {m['chunks']} chunks: "
-            f"{m['least_mb']:.0f} to {m['most_mb']:.0f} MB; a line through them grows by {m['growth']:.2%}."
-        )
-    return "\n".join([by_driver, "", by_env, "", *said, "", *found["versions"]])
+    for process in dict.fromkeys(row["process"] for row in rows):
+        said += memory(rows, process)
+    versions = sorted({row["versions"] for row in rows})
+    return "\n".join([by_driver, "", by_env, "", *said, "", *versions])
+
+
+def lowest_mm(rows: list[dict[str, Any]]) -> str:
+    """The least h of any step's start."""
+    return f"{1e3 * min(row['smallest'] for row in rows if row['smallest'] is not None):.3f}"
 
 
 def main() -> None:
     """Make the chunks that are missing, and the tables."""
     given = options(__doc__, steps=5_000_000, workers=1, folder=Path("runs/endurance"))
     rows = measured(given.folder / "endurance.jsonl", plan(given.steps), run, given.workers)
-    keep("endurance", table(collected(rows)))
+    keep("endurance", table(rows))
 
 
 def used_mb() -> float:
