@@ -68,7 +68,8 @@ def _type(annotation: Any) -> str:
     if get_origin(annotation) is Literal:
         return ", ".join(f"`{name}`" for name in get_args(annotation))
     if get_origin(annotation) is list:
-        return "list of integers"
+        of = _type(get_args(annotation)[0])
+        return f"list of {of}" + "s" * of.isalpha()
     if is_dataclass(annotation):
         return "text or mapping"
     return _TYPES[get_origin(annotation) or annotation]
