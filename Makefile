@@ -112,7 +112,7 @@ shelf: .venv/shelf
 table: .venv/sbx
 	$(BIN)/python -m benchmarks table
 
-# Attackers against the proved filters: hours on one core; goes on where it was stopped.
+# Attackers against the proved filters: an hour and a half of one core; goes on where it was stopped.
 endurance: .venv/installed
 	$(BIN)/python -m benchmarks endurance
 
@@ -124,7 +124,6 @@ COMPARED = pointgoal1_300k pointgoal1_learners velocity_experts halfcheetah_velo
 figures: .venv/installed
 	$(RUN) protected --steps 3000
 	for name in trained_adversary leases slip impact occlusion teleop kills training_time; do $(RUN) $$name || exit 1; done
-	$(RUN) kills --seeds 2 --workers 2 --name kills_together
 	for config in $(COMPARED); do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
 
 # The films of docs/gallery.md: about ten minutes. MUJOCO_GL=osmesa or egl where there is no window.

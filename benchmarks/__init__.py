@@ -1,1 +1,1 @@
-"""Measurements that the README and docs/results quote; each module runs by itself: `python -m benchmarks.<name>`."""
+"""Measurements that the README and docs/results quote; those with a `main` run by name."""

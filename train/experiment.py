@@ -41,7 +41,7 @@ def check_training(experiment: ExperimentConfig) -> None:
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
-    """Evaluates every trained run on the same episode seeds, filter off and on, and films two of them."""
+    """Evaluates every trained run on the same episode seeds, filter off and on, and films one of them."""
     for arm, _, folder in _runs(experiment):
         check_finished(arm, folder)
     how = experiment.evaluation, experiment.evaluation_filter

@@ -1,4 +1,4 @@
-"""For policies behind a filter: what they see and are paid for, how often they decide, and a way out where stuck."""
+"""For policies behind a filter: what they see and are paid for, how often they decide, and where it is stuck."""
 
 from collections import deque
 from collections.abc import Sequence

@@ -132,6 +132,9 @@ def test_files_and_overrides_as_people_write_them(tmp_path):
     assert read_config(path) == read
     settings = read_config(path, ["a.b=2", "a.d=[1, 2]", "c.e.f=none", "g=1e3", "g=2"])
     assert settings == {**read, "a": {"b": 2, "d": [1, 2]}, "c": {"e": {"f": "none"}}, "g": 2}
+    for short in ("none", "protect"):
+        path.write_text(f"filter: {short}")
+        assert read_config(path, ["filter.protect.margin=0.1"]) == {"filter": {"protect": {"margin": 0.1}}}
 
 
 @pytest.mark.parametrize(

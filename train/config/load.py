@@ -86,6 +86,8 @@ def set_value(settings: dict[str, Any], key: str, value: Any) -> None:
         inner = settings.get(name)
         if inner is None:  # `arms: {filtered:}` is an empty mapping in disguise
             inner = settings[name] = {}
+        if inner in ("none", "protect"):  # a filter in short
+            inner = settings[name] = {inner: {}} if inner == "protect" else {}
         if not isinstance(inner, dict):
             raise ConfigurationError(f"{key}: {name} is {inner!r}, with no keys inside.")
         settings = inner

@@ -195,7 +195,7 @@ class EvaluationConfig(Section):
     """As `filter` of an arm: what is put on, in the evaluation with the filter on, where an arm has no filter of
     its own. By default the first filtered arm's."""
     films: StrictBool = True
-    """Two of the episodes are filmed, in every arm and condition, where the task can draw frames."""
+    """One of the episodes is filmed, the same in every arm and condition, where the task can draw frames."""
 
 
 @dataclass(frozen=True)
