@@ -85,6 +85,7 @@ TASKS = (
     Task("SafeCarGoal2-v0", "goal_sac", 3, ("total_steps=50000", SBX, *SLOWER), "_sbx_8"),
     Task("SafeCarGoal2-v0", "goal_sac", 3, ("total_steps=125000", SBX, *SLOWER), "_sbx_8_1m"),
     Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5, ("total_steps=1000000", SBX), "_sbx_1m"),
+    Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5, ("total_steps=1000000", *NORMED), "_sbx_ln_1m"),
     Task("SafeHopperVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX), "_sbx_1m"),
     Task("SafeWalker2dVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX, HALF), "_sbx_1m"),
     Task("SafeAntVelocity-v0", "velocity_sac", 3, ("total_steps=1000000", SBX, HALF), "_sbx_1m"),
