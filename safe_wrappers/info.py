@@ -84,9 +84,9 @@ def _key(name: str, dtype: Any, **more: Any) -> str:
 CBF_INTERVENED: Final = _key("cbf/intervened", "bool", chunk="any", log="rate")
 """The executed action is not the (boxed) proposed one."""
 CBF_INFEASIBLE: Final = _key("cbf/infeasible", "bool", chunk="any", log="infeasible")
-"""No action inside the actuator box satisfied every row at this step."""
+"""No action that was tried is admitted by every constraint."""
 CBF_FALLBACK: Final = _key("cbf/fallback", "bool", chunk="any", log="fallback")
-"""The fallback chose the executed action (infeasible, failed solve, non-finite proposal or state)."""
+"""No admitted action was found (infeasible, failed solve, non-finite proposal or state), and the fallback acted."""
 CBF_NONFINITE: Final = _key("cbf/nonfinite", "bool", chunk="any")
 """The proposed action held a NaN or an infinity; it never reaches the env."""
 CBF_CORRECTION: Final = _key("cbf/correction", "float64", unit="action", chunk="max", log="correction")
@@ -203,7 +203,7 @@ BALANCE_PARTIAL: Final = _key("balance/partial", "bool", chunk="any")
 
 # OcclusionPenalty, every step: one entry per track, after the step ------------------------------------------------
 OCCLUSION_VISIBLE: Final = _key("occlusion/visible", "bool", shape="(tracks,)", log="seen")
-"""The track was measured at the end of this step (in sight, in range, and not dropped out)."""
+"""The track was measured at the end of this step (in sight and in range)."""
 OCCLUSION_SIGMA: Final = _key("occlusion/sigma", "float64", shape="(tracks,)", unit="m", log="sigma")
 """Standard deviation of the track's estimated position where it is largest."""
 OCCLUSION_EXPIRED: Final = _key("occlusion/expired", "bool", shape="(tracks,)", chunk="any", log="expired")

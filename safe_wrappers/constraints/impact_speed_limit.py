@@ -41,7 +41,8 @@ class ImpactSpeedLimit(RolloutConstraint):
 
     Best effort: along the held step of an executed control that is not flagged every first touch keeps the limit, for
     a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of geoms at a
-    time. Not counted are friction, other contacts, joint stops, and the obstacles' own way during the forecast. The
+    time. Not counted are friction, other contacts, joint stops, and the way of obstacles that the env
+    moves (mocap) during the forecast. The
     physics step should be at most a tenth of `control.contact.time_to_peak`.
 
     Args:

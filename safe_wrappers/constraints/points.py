@@ -46,8 +46,8 @@ class SpeedLimit(RolloutConstraint):
         horizon: Control steps to forecast; the actuated joints brake after the first.
         max_decrease: The most that the speed can rise within `horizon` control steps, m/s; states with more than that
             left need no forecast.
-        look_ahead_below: m/s; a control that leaves at least this much after its own control step is admitted without
-            a look at the others. None: always look.
+        look_ahead_below: m/s; where the present speed leaves at least this much, a control that leaves it too after
+            its own control step, margin taken off, is admitted without a look at the others. None: always look.
         euler_look_ahead: Look at the others by Euler steps where the model's own are Runge-Kutta's, at a quarter of
             the price. The first control step is always simulated by the model's own.
     """

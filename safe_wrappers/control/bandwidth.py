@@ -14,7 +14,7 @@ dynamics and singular perturbations".
 import math
 import warnings
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from safe_wrappers.errors import (
     non_negative,
     positive,
 )
+
+WARN_BELOW_DEG: Final = 30.0
+"""Of phase margin, at which a plant warns when it is bound."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,6 @@ class ControlLoop:
         phase_margin_deg: Of the design, degrees, below 180.
         compute_s: Fixed delay of the computation, s.
         bus_s: Fixed delay of the bus, s.
-        warn_below_deg: The plant warns when it is bound if less is left, degrees.
 
     Raises:
         ConfigurationError: A number outside its range, or a design that has no more margin than is asked for.
@@ -57,16 +59,14 @@ class ControlLoop:
     phase_margin_deg: float
     compute_s: float = 0.0
     bus_s: float = 0.0
-    warn_below_deg: float = 30.0
 
     def __post_init__(self) -> None:
         check_fields(self, positive, ["crossover"], "rad/s")
         check_fields(self, positive, ["phase_margin_deg"], "degrees")
         check_fields(self, non_negative, ["compute_s", "bus_s"], "s")
-        check_fields(self, non_negative, ["warn_below_deg"], "degrees")
-        if not self.warn_below_deg < self.phase_margin_deg < 180.0:
+        if not WARN_BELOW_DEG < self.phase_margin_deg < 180.0:
             raise ConfigurationError(
-                f"phase_margin_deg is below 180 degrees, and above warn_below_deg = {self.warn_below_deg:g}: hold "
+                f"phase_margin_deg is above {WARN_BELOW_DEG:g} degrees, and below 180: hold "
                 f"and delays only take away; got {self.phase_margin_deg:g}"
             )
 
@@ -88,13 +88,13 @@ class ControlLoop:
         return self.phase_margin_deg - math.degrees(self.crossover * late_s)
 
     def warn_if_short(self, control_dt: float, delay_s: float) -> None:
-        """Warn if less is left than `warn_below_deg`; raises as `margin_left_deg`."""
+        """Warn if less is left than `WARN_BELOW_DEG`; raises as `margin_left_deg`."""
         left = self.margin_left_deg(control_dt, delay_s)
-        if left < self.warn_below_deg:
-            most = (self.phase_margin_deg - self.warn_below_deg) / (self.phase_margin_deg - left)
+        if left < WARN_BELOW_DEG:
+            most = (self.phase_margin_deg - WARN_BELOW_DEG) / (self.phase_margin_deg - left)
             warnings.warn(
                 f"hold and delays leave {left:.1f} degrees of a phase margin of {self.phase_margin_deg:g}, less than "
-                f"{self.warn_below_deg:g}: design a loop of {self.crossover:g} rad/s for at most "
+                f"{WARN_BELOW_DEG:g}: design a loop of {self.crossover:g} rad/s for at most "
                 f"{most * self.crossover:.3g} rad/s, or shorten hold and delays",
                 PhaseMarginWarning,
                 stacklevel=3,

@@ -349,7 +349,8 @@ class DiscreteSearch(SafeActionSearch):
 
     def _search(self, proposal: Array, strict: Rows, last: Array) -> Decision:
         least = self.least_violation(self._fallback_control(None, last), strict)
-        return Decision(least, Stage.LEAST_VIOLATION, fallback=True, infeasible=True)
+        stage = Stage.LEAST_VIOLATION if self._fallback.brakes else Stage.FALLBACK
+        return Decision(least, stage, fallback=True, infeasible=True)
 
     def unreadable(self, last: Array) -> Decision:
         """The last action goes on, as there is no zero, unless the fallback is the user's own."""

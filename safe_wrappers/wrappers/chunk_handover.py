@@ -78,7 +78,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     Args:
         env: With a one-dimensional Box action space.
         chunk_size: H, entries of a chunk.
-        execution_horizon: s, control steps from one chunk's observation to the next; `d <= s <= H - d`.
+        execution_horizon: s, control steps from one chunk's observation to the next; `d <= s <= n - d`, where n are
+            the control steps of a chunk (H if an entry is for one).
         inference_delay: d, control steps; or [least, most], drawn anew for every chunk.
         blend_time: s, the least duration of a blend.
         rate_limit: Bound on |u[k+1] - u[k]| / control interval, for all components or one each, action units per s.

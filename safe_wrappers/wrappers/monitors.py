@@ -99,7 +99,7 @@ class ContactMonitor(StepMonitor):
     Raises:
         UnsupportedEnvError: No MuJoCo model.
         UnknownNameError: No body of that name; the message lists those there are.
-        ConfigurationError: Not a list of names, or a `ChunkHandover` inside, whose step is many control steps.
+        ConfigurationError: Not a list of names, or a `ChunkHandover` or `ActionRepeat` inside.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw

@@ -134,7 +134,8 @@ class ActionShield(CBFActionFilter):
     sb3-contrib's MaskablePPO reads it through `env_method`.
 
     What is guaranteed is what the constraints promise of a simulation. If no action is admitted, `cbf/infeasible` is
-    True, and the one that violates least is executed. Where an observation is not a number, the last action goes on.
+    True, and with "brake" the one that violates least is executed. Where an observation is not a number, the last
+    action goes on, unless the fallback is a function.
 
     Args:
         env: With a Discrete action space, of at most 1,024 actions.

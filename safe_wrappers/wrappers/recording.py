@@ -104,7 +104,7 @@ class RecordInterventions(LayerWrapper):
         env: The env to record.
 
     Raises:
-        ConfigurationError: A `ChunkHandover` inside.
+        ConfigurationError: A `ChunkHandover` or `ActionRepeat` inside.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw

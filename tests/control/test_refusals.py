@@ -25,8 +25,8 @@ REFUSED = [
     (convex_outline, (np.outer([0.0, 1.0, 2.0], [1.0, 1.0]),), "three points that are not on one line"),
     (ControlLoop(100.0, 60.0).margin_left_deg, (math.pi / 100.0,), "Nyquist"),
     (ControlLoop, (-1.0, 60.0), "crossover"),
-    (ControlLoop, (1.0, 180.0), "phase_margin_deg is below 180 degrees"),
-    (ControlLoop, (1.0, 30.0), "above warn_below_deg = 30"),
+    (ControlLoop, (1.0, 180.0), "phase_margin_deg is above 30 degrees, and below 180"),
+    (ControlLoop, (1.0, 30.0), "phase_margin_deg is above 30"),
 ]
 
 

@@ -8,9 +8,9 @@ from simulated_worlds import GRID, MOVES, Grid
 import safe_wrappers as sw
 
 
-def shielded(env=None, cost="cost", start=0, **options):
+def shielded(env=None, cost="cost", start=0, fallback="brake", **options):
     shield = sw.constraints.PredictiveShield(cost, 2, backup=[start + k for k in range(4)], **options)
-    env = sw.ActionShield(env or Grid(), [shield])
+    env = sw.ActionShield(env or Grid(), [shield], fallback=fallback)
     env.reset(seed=0)
     return env
 
@@ -53,6 +53,9 @@ def test_if_nothing_is_admitted_that_is_said_and_what_violates_least_is_left():
     assert env.action_masks().sum() == 1
     info = env.step(1)[4]
     assert info["cbf/infeasible"] and info["cbf/fallback"] and info["executed_action"][0] in (0.0, 2.0, 3.0)
+    assert info["cbf/stage"] == 8
+    info = shielded(cost=lambda o: -1.0 - o[0], fallback=lambda plant: [1.0]).step(3)[4]
+    assert info["cbf/infeasible"] and info["executed_action"] == [1.0] and info["cbf/stage"] == 7
 
 
 class Blind(Grid):

@@ -207,7 +207,7 @@ class RigidModelCheck(NamedTuple):
         )
 
 
-def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) -> RigidModelCheck:
+def rigid_model_check(env: gym.Env[Any, Any]) -> RigidModelCheck:
     """Whether a rigid model of a MuJoCo env is good enough, by its springs' vibrations at the present pose.
 
     A spring is a hinge or slide with stiffness that no actuator drives, with a driven joint before it on the way from
@@ -218,7 +218,6 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
 
     Args:
         env: Any with a MuJoCo model, after a reset or in the pose to be checked.
-        plant: A `MujocoPlant` that says where model and data are, bound to this env or to none; None: a new one.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or one that `MujocoPlant` does not handle.
@@ -228,7 +227,7 @@ def rigid_model_check(env: gym.Env[Any, Any], plant: MujocoPlant | None = None) 
         >>> print(sw.plants.rigid_model_check(gym.make("FlexJointReach-v0")))  # doctest: +ELLIPSIS
         rigid model is not good enough: 10.1 Hz (damping ratio ...
     """
-    plant = MujocoPlant() if plant is None else plant
+    plant = MujocoPlant()
     plant.bind(env)
     plant.observe()
     data, model = plant.forward(), plant.model
