@@ -86,7 +86,7 @@ CBF_INTERVENED: Final = _key("cbf/intervened", "bool", chunk="any", log="rate")
 CBF_INFEASIBLE: Final = _key("cbf/infeasible", "bool", chunk="any", log="infeasible")
 """No action that was tried is admitted by every constraint."""
 CBF_FALLBACK: Final = _key("cbf/fallback", "bool", chunk="any", log="fallback")
-"""No admitted action was found (infeasible, failed solve, non-finite proposal or state), and the fallback acted."""
+"""The fallback acted: nothing else was admitted, a failed solve, a non-finite proposal or state."""
 CBF_NONFINITE: Final = _key("cbf/nonfinite", "bool", chunk="any")
 """The proposed action held a NaN or an infinity; it never reaches the env."""
 CBF_CORRECTION: Final = _key("cbf/correction", "float64", unit="action", chunk="max", log="correction")

@@ -86,7 +86,7 @@ class Constraint:
     simulates: ClassVar[bool] = False
     """Whether it needs a plant that rolls out policies, `SimulatorPlant` by default."""
     look_ahead_below: float | None = None
-    """A control that leaves this much after its own control step is admitted without a look at the others."""
+    """If this is left now, a control that leaves it in its own step is admitted without a look at the others."""
     euler_look_ahead: bool = False
     """Whether those are looked at by Euler steps."""
 

@@ -67,7 +67,8 @@ class Decision:
         stage: What found it.
         infeasible: Nothing that was tried is admitted by every constraint.
         changed: It is not the proposal.
-        refused: Which constraints did not admit the proposal, shape (number of constraints,); None: none did.
+        refused: Which constraints did not admit the proposal, shape (number of constraints,); None: none did,
+            or there was none to judge.
         fallback: The fallback chose it.
     """
 

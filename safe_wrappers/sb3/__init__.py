@@ -1,4 +1,4 @@
-"""Stable-Baselines3 glue: what the filter did, in the log and the replay buffer. The only room that imports SB3."""
+"""Stable-Baselines3 glue: what the filter did, in the log and the replay buffer. It and `train` import SB3."""
 
 try:
     import stable_baselines3  # noqa: F401

@@ -14,7 +14,7 @@ class InterventionCallback(BaseCallback):
     The logger gets means since its last dump, of what the task and the layers of the stack report:
 
     - `interventions/step_<name>`: over all steps of all envs; `InfoKey.log` in `safe_wrappers.info` is the name of
-      each, such as `step_rate` or `step_cost`;
+      each, such as `rate` or `cost`, after `step_`;
     - `interventions/rate`, `correction_mean` and the other figures of `safe_wrappers.info.EPISODE`: over the episodes
       that ended, from `RecordInterventions`.
 

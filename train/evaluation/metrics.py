@@ -38,7 +38,7 @@ REGISTRY: Final[dict[str, Metric]] = {
     ),
     "infeasible": Metric(
         "Infeasible steps, total",
-        "Steps at which no action satisfied every constraint of the filter",
+        "Steps at which no action that was tried satisfied every constraint of the filter",
         "steps",
     ),
     "infeasible_per_1000": Metric("Infeasible steps / 1000", "Infeasible steps", "per 1000 steps"),

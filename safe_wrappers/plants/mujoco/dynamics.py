@@ -213,8 +213,8 @@ def rigid_model_check(env: gym.Env[Any, Any]) -> RigidModelCheck:
     A spring is a hinge or slide with stiffness that no actuator drives, with a driven joint before it on the way from
     the world. Inertia, stiffness and damping are linearised; servos on the motors count, gravity, contacts and joint
     limits do not.
-    The appendix: below the slowest vibration's time scale the rigid manifold holds; a vibration that is not gone when
-    the next command comes is excited again and again.
+    A rigid model is for motions that are much slower than the slowest vibration; one that is not gone when the next
+    command comes is excited again and again.
 
     Args:
         env: Any with a MuJoCo model, after a reset or in the pose to be checked.
