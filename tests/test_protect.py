@@ -174,7 +174,7 @@ def test_what_cannot_be_copied_is_simulated_by_forks():
 
 def test_other_vector_envs_are_told_how_to_protect_each_env():
     vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="async")
-    assert "gym.make_vec(..., wrappers=[sw.protect])" in refusal(vector)
+    assert "vectorization_mode='sync', wrappers=[sw.protect])" in refusal(vector)
     vector.close()
     discrete = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
     assert "discrete actions are shielded env by env" in refusal(discrete)

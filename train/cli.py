@@ -97,10 +97,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     takes = command in (*_OF_EXPERIMENTS, "init")
     words = [word for word in given[1:] if not takes or word not in overrides]
     options = make_parser(command).parse_intermixed_args(words)
-    from rich.console import Console
+    try:
+        from rich.console import Console
 
-    from .processes import Interrupted
-
+        from .processes import Interrupted
+    except ModuleNotFoundError as missing:
+        needs = f"{missing.name}: pip install 'safe-wrappers[train]'"
+        print(f"error: safe-wrappers {command} needs {needs}", file=sys.stderr)
+        return 1
     try:
         # Modules of one's own, last: a file called yaml.py must not take an installed module's place.
         sys.path += [str(at.resolve()) for at in (getattr(options, "config", Path()).parent, Path.cwd())]

@@ -161,9 +161,7 @@ def _by_name(made: Env, arguments: tuple[Any, ...], named: dict[str, Any]) -> di
         if parameter.kind is inspect.Parameter.VAR_KEYWORD:
             found |= found.pop(name)
         elif parameter.kind is inspect.Parameter.VAR_POSITIONAL and not found[name]:
-            del found[
-                name
-            ]  # what is left under its own name no constructor takes, so none is made by defaults
+            del found[name]  # a name of its own no constructor takes: none is made by defaults
     return {name: value for name, value in found.items() if name != "env"}
 
 
@@ -172,7 +170,7 @@ def refuse_vector_env(env: Any, name: str) -> None:
     if isinstance(env, gym.vector.VectorEnv):
         raise UnsupportedEnvError(
             f"{name} wraps single envs, got {env!r}; wrap each env of it: gym.make_vec(id, num_envs=...,"
-            f" vectorization_mode='sync', wrappers=[sw.protect, lambda env: sw.{name}(env, ...)])"
+            f" vectorization_mode='sync', wrappers=[lambda env: {name}(env, ...)])"
         )
 
 

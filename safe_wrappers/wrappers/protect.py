@@ -6,8 +6,10 @@ import textwrap
 from typing import Any, Final, overload
 
 import gymnasium as gym
+import mujoco
 
 from safe_wrappers.errors import UnknownNameError, UnsupportedEnvError
+from safe_wrappers.plants.env_checks import check_actions
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.presets import ActionShield
 from safe_wrappers.wrappers.recipes import EVERY, PLANTS, family_of, recipe_of
@@ -62,6 +64,8 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
         )
     family, name = family_of(single), recipe_of(single.spec.id) if single.spec is not None else None
     if name is None:
+        if not isinstance(single.action_space, gym.spaces.Discrete):
+            check_actions(single)  # no lines would protect it
         raise UnsupportedEnvError(_without_recipe(kind.__name__, single))
     recipe = EVERY[name]
     of_recipe, of_filter = ([*inspect.signature(takes).parameters] for takes in (recipe, CBFActionFilter))
@@ -80,7 +84,9 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
 
 def _without_recipe(kind: str, single: gym.Env[Any, Any]) -> str:
     """Lines that make a filter, of that kind, and the recipes of similar names."""
-    known = kind != ActionShield.__name__ and hasattr(single.unwrapped, "model")
+    known = kind != ActionShield.__name__ and isinstance(
+        getattr(single.unwrapped, "model", None), mujoco.MjModel
+    )
     what = "limit" if known else "shield"
     lines = f"import safe_wrappers as sw\n{what} = {_BY_HAND[what]}\nenv = sw.{kind}(env, [{what}])"
     near = difflib.get_close_matches(family_of(single), EVERY, n=3, cutoff=0.5)

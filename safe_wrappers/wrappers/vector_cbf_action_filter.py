@@ -20,7 +20,9 @@ else:
     _Wrapper = VectorWrapper  # no generic class in Gymnasium 1.1
 
 
-EACH: Final = "protect each env of it: gym.make_vec(..., wrappers=[sw.protect])"
+EACH: Final = (
+    "protect each env of it: gym.make_vec(id, num_envs=..., vectorization_mode='sync', wrappers=[sw.protect])"
+)
 
 
 class VectorCBFActionFilter(_Wrapper):

@@ -54,7 +54,7 @@ def test_there_are_wrappers_and_each_has_an_example():
 def test_a_vector_env_is_refused_with_the_line_to_write(name):
     envs = gym.make_vec(TASK, num_envs=2, vectorization_mode="sync")
     arguments = EXAMPLES[name][next(iter(EXAMPLES[name]))][1]()
-    with pytest.raises(UnsupportedEnvError, match=rf"{name} wraps single envs.*make_vec\(.*sw\.{name}\("):
+    with pytest.raises(UnsupportedEnvError, match=rf"{name} wraps single envs.*make_vec\(.*{name}\("):
         getattr(sw, name)(envs, **arguments)
 
 

@@ -289,3 +289,9 @@ def test_diagnose_prints_what_it_found_and_takes_the_policy_of_a_run_as_it_was_t
     assert "SafePointGoal1-v0: 40 steps\n" in out and "give a policy" not in out
     with pytest.raises(ConfigurationError, match="was trained on SafePointGoal1-v0, not on Swimmer-v5"):
         of_run(run, "Swimmer-v5")
+
+
+def test_without_its_extra_the_command_says_how_to_install_it(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rich.console", None)
+    assert main(["list"]) == 1
+    assert "pip install 'safe-wrappers[train]'" in capsys.readouterr().err

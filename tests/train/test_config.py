@@ -132,9 +132,14 @@ def test_files_and_overrides_as_people_write_them(tmp_path):
     assert read_config(path) == read
     settings = read_config(path, ["a.b=2", "a.d=[1, 2]", "c.e.f=none", "g=1e3", "g=2"])
     assert settings == {**read, "a": {"b": 2, "d": [1, 2]}, "c": {"e": {"f": "none"}}, "g": 2}
-    for short in ("none", "protect"):
-        path.write_text(f"filter: {short}")
-        assert read_config(path, ["filter.protect.margin=0.1"]) == {"filter": {"protect": {"margin": 0.1}}}
+    path.write_text("a: {filter: none}\nfilter: protect\nenv: E-v0\nlearner: naive")
+    margins = [f"{where}filter.protect.margin=0.1" for where in ("", "a.")]
+    found = read_config(path, [*margins, "env.judge=constraints", "learner.penalty=0.1"])
+    filtered = {"protect": {"margin": 0.1}}
+    assert found == {"a": {"filter": filtered}, "filter": filtered} | {
+        "env": {"id": "E-v0", "judge": "constraints"},
+        "learner": {"kind": "naive", "penalty": 0.1},
+    }
 
 
 @pytest.mark.parametrize(
@@ -230,6 +235,7 @@ UNSEEN = [
     (of_env("Pendulum-v1", kwargs={"no_such": 1}), "env: Pendulum-v1 with kwargs {'no_such': 1} cannot be made"),
     (of_env("CartPole-v1") | {"algorithm": "SAC"}, "arms.unfiltered: SAC needs actions of a Box, and CartPole"),
     ({"algorithm": "DQN"}, "arms.unfiltered: DQN needs actions of a Discrete, and InvertedPendulum-v5 has"),
+    ({"arms": {"a": {"filter": {"factory": "builtins:print"}}}}, "builtins:print must return the env, filtered"),
     (of_env("MountainCar-v0") | of_arm(filter="protect"), "no recipe for"),
     (of_arm(filter={"factory": "nowhere:shield"}), "filter.factory: cannot import 'nowhere:shield'"),
     (of_arm(filter={"factory": "fake_task:shield", "kwargs": {"no_such": 1}}), "kwargs: shield() got an unexpected"),

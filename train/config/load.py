@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
@@ -79,6 +79,13 @@ def _load(content: str | bytes, where: str) -> Any:
         raise ConfigurationError(f"{where}: not valid YAML, or no settings: {error}") from None
 
 
+_SHORT: Final[Mapping[str, Callable[[str], dict[str, Any]]]] = {
+    "env": lambda text: {"id": text},
+    "learner": lambda text: {"kind": text},
+    "filter": lambda text: {} if text == "none" else {text: {}},
+}
+
+
 def set_value(settings: dict[str, Any], key: str, value: Any) -> None:
     """Gives a setting another value, in place."""
     *outer, last = key.split(".")
@@ -86,8 +93,8 @@ def set_value(settings: dict[str, Any], key: str, value: Any) -> None:
         inner = settings.get(name)
         if inner is None:  # `arms: {filtered:}` is an empty mapping in disguise
             inner = settings[name] = {}
-        if inner in ("none", "protect"):  # a filter in short
-            inner = settings[name] = {inner: {}} if inner == "protect" else {}
+        if isinstance(inner, str) and name in _SHORT:  # a text that stands for a section
+            inner = settings[name] = _SHORT[name](inner)
         if not isinstance(inner, dict):
             raise ConfigurationError(f"{key}: {name} is {inner!r}, with no keys inside.")
         settings = inner

@@ -96,7 +96,8 @@ def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
     if arm.algorithm in DISCRETE:
         kind = spaces.Discrete
     if not isinstance(acts, kind):
-        others = OFF_POLICY if isinstance(acts, spaces.Box) else DISCRETE
+        fitting: tuple[str, ...] = DISCRETE if isinstance(acts, spaces.Discrete) else ()
+        others = OFF_POLICY if isinstance(acts, spaces.Box) else fitting
         raise ConfigurationError(
             f"{where} needs actions of a {kind.__name__}, and {arm.env.id} has {acts}."
             f" Other algorithms: {', '.join((*ON_POLICY, *others))}."

@@ -118,7 +118,12 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
                 ' filter: {factory: "module:function"}.'
             ) from None
     if action_filter.factory is not None:
-        return _called("filter.kwargs", _factory(action_filter.factory), task, action_filter.kwargs)
+        made = _called("filter.kwargs", _factory(action_filter.factory), task, action_filter.kwargs)
+        if not isinstance(made, gym.Env):
+            raise ConfigurationError(
+                f"filter.factory: {action_filter.factory} must return the env, filtered; got {made!r}"
+            )
+        return made
     return task
 
 
