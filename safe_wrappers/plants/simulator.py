@@ -151,8 +151,8 @@ class SimulatorPlant(Plant):
             self.lower, self.upper = space.low.astype(float), space.high.astype(float)
         else:
             raise UnsupportedEnvError(
-                f"expected bounded actions of shape (m,) in a Box, or Discrete ones, got {space}; give the env one "
-                "of these from gymnasium.spaces.flatten_space, and gymnasium.spaces.unflatten in its step"
+                f"expected bounded actions of shape (m,) in a Box, or Discrete ones, got {space}; give the env's "
+                "own action_space finite bounds, or flatten it (gymnasium.spaces.flatten_space and unflatten)"
             )
         if self._given_control_dt is not None or env.has_wrapper_attr("dt"):
             self._control_dt = check_timing(env, self._given_control_dt)
