@@ -23,7 +23,5 @@ class RolloutConstraint(Constraint):
         check_fields(self, positive, ("max_decrease",), self.unit)
 
     def setup(self, plant: Plant) -> None:
-        hint = (
-            "forecasts with a MuJoCo model; beside a PredictiveShield put it into its h, else use Barrier(h)"
-        )
+        hint = "forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h), beside a shield its h"
         super().setup(require_mujoco(plant, f"{type(self).__name__} {hint}"))
