@@ -52,6 +52,8 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         return made
 
     def __init__(self, env: Env) -> None:
+        # A subclass's `__new__` may pass on none; this name no constructor takes, so none is made by defaults.
+        vars(self).setdefault("_saved_kwargs", {"*arguments": []})
         refuse_vector_env(env, type(self).__name__)
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
