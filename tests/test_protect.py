@@ -166,6 +166,15 @@ def test_an_attacker_breaks_no_limit_of_another_packages_env_in_silence(case):
         assert on["violations"] == on["infeasible"] == 0 < min(on["changed"], off["violations"])
 
 
+def test_actions_that_no_lines_protect_are_refused_at_once_and_a_model_that_is_not_mujoco_s_is_simulated():
+    env = Slider()
+    env.model = "a network of its own"
+    assert "PredictiveShield(h, horizon, backup)" in refusal(env)
+    env.action_space = gym.spaces.MultiDiscrete([3, 3])
+    message = refusal(env)
+    assert "flatten_space" in message and "no recipe" not in message
+
+
 def test_what_cannot_be_copied_is_simulated_by_forks():
     pytest.importorskip("Box2D")
     with pytest.raises(UnsupportedEnvError, match="cannot be copied"):

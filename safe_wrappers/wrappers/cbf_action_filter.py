@@ -32,7 +32,7 @@ class CBFActionFilter(LayerWrapper):
 
     An action that every constraint admits is executed bit for bit; others are projected onto the rows of all
     constraints and the actuator box at once, and checked; if nothing admissible is found, the fallback acts
-    (with "brake": what violates least of all that was tried).
+    ("brake": where constraints forecast, what violates least of all that was tried).
 
     **What it guarantees.** No non-finite action, and none outside the action space, reaches the env. The executed
     action satisfies every constraint's rows (to 1e-8 of half the box) or, where a constraint predicts the held

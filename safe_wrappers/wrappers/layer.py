@@ -34,6 +34,8 @@ Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
 _WRAPPERS = __name__.rpartition(".")[0]
+_UNKNOWN: Final[dict[str, Any]] = {"*arguments": []}
+"""Recorded of a constructor whose arguments are not known: none takes it, so that `gym.make` takes no defaults."""
 
 
 class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -52,8 +54,7 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         return made
 
     def __init__(self, env: Env) -> None:
-        # A subclass's `__new__` may pass on none; this name no constructor takes, so none is made by defaults.
-        vars(self).setdefault("_saved_kwargs", {"*arguments": []})
+        vars(self).setdefault("_saved_kwargs", _UNKNOWN)  # a subclass's `__new__` may pass on none
         refuse_vector_env(env, type(self).__name__)
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
@@ -151,20 +152,23 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
 
 
 def _by_name(made: Env, arguments: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
-    """What a constructor is given, but for itself and the env."""
+    """What a constructor is given, but for the env; what has no name is under ``*name``, as in `_UNKNOWN`."""
     signature = inspect.signature(type(made).__init__)
     try:
         given = signature.bind(made, *arguments, **named)
     except TypeError:
-        return {}  # `__init__` raises it anew, and names the class
+        return _UNKNOWN  # `__init__` raises it anew, and names the class
     given.apply_defaults()
-    found = dict(list(given.arguments.items())[1:])
-    for name, parameter in signature.parameters.items():
-        if parameter.kind is inspect.Parameter.VAR_KEYWORD:
-            found |= found.pop(name)
-        elif parameter.kind is inspect.Parameter.VAR_POSITIONAL and not found[name]:
-            del found[name]  # a name of its own no constructor takes: none is made by defaults
-    return {name: value for name, value in found.items() if name != "env"}
+    found: dict[str, Any] = {}
+    for name, value in given.arguments.items():
+        kind = signature.parameters[name].kind
+        if kind is inspect.Parameter.VAR_KEYWORD:
+            found |= value
+        elif kind is not inspect.Parameter.VAR_POSITIONAL:
+            found[name] = value
+        elif nameless := [one for one in value if not isinstance(one, gym.Env)]:
+            found[f"*{name}"] = nameless
+    return {name: value for name, value in found.items() if name != "env" and value is not made}
 
 
 def refuse_vector_env(env: Any, name: str) -> None:

@@ -60,7 +60,7 @@ _NOT_TOGETHER: Final = {
     frozenset(
         {Layer.FILTER}
     ): "this env is filtered already; constraints compose in one projection, so pass all of "
-    "them to one filter: type(inner)(inner.env, [*inner.constraints, more])",
+    "them to one filter: CBFActionFilter(inner.env, [*inner.constraints, more]), with discrete actions ActionShield",
     frozenset({Layer.LEASE}): _BOTH_END_AUTHORITY,
     frozenset({Layer.LEASE, Layer.CHANNEL}): _BOTH_END_AUTHORITY,
     frozenset({Layer.CHANNEL}): "one network is between operator and machine; give one channel all the delay",

@@ -8,9 +8,11 @@ from gymnasium.spaces import Box, Dict, Discrete
 from running import episodes, evaluated, finish, killed_after, resumed, trained
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer, ExecutedActionReplayBuffer
 from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, algorithm_class
 from safe_wrappers.train.experiment import training_jobs
@@ -18,6 +20,8 @@ from safe_wrappers.train.files import read_rows
 from safe_wrappers.train.report.page import about
 from safe_wrappers.train.run import training as run_module
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.model import check_task, new_model
+from safe_wrappers.train.run.stack import make_training_env
 
 SMALL = "policy_kwargs: {net_arch: [8]}"
 REPLAY = f"learning_starts: 32, batch_size: 8, train_freq: 8, {SMALL}"
@@ -110,6 +114,25 @@ def one_arm(fake_experiment, algorithm, learner, *overrides):
         *env,
         *overrides,
     )
+
+
+@pytest.mark.parametrize("wrong", ["policy_kwargs: 3", "train_freq: [4]", "ent_coef: foo"])
+def test_what_only_the_algorithm_refuses_is_told_with_the_arm(fake_experiment, wrong):
+    (arm,) = one_arm(fake_experiment, "SAC", "naive", f"hyperparameters={{{wrong}}}").arms
+    with pytest.raises(ConfigurationError, match=r"arms\.a: SAC refuses its settings: "):
+        new_model(arm, 0, DummyVecEnv([lambda: make_training_env(arm)]))
+
+
+def test_algorithms_that_are_proposed_take_the_actions(fake_experiment):
+    (arm,) = one_arm(fake_experiment, "SAC", "naive").arms
+    env = make_training_env(arm)
+    for space, others in (
+        (gym.spaces.Discrete(3), "sbx.PPO, DQN, QRDQN"),
+        (gym.spaces.MultiDiscrete([3, 3]), "sbx.PPO"),
+    ):
+        env.action_space = space
+        with pytest.raises(ConfigurationError, match=rf"TRPO, {others}\.$"):
+            check_task(arm, env)
 
 
 @pytest.mark.parametrize("algorithm", [*map(slow_if_compiled, ALGORITHMS)])

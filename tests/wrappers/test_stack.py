@@ -174,10 +174,10 @@ def test_a_pair_is_right_in_its_numbers_or_refused_with_an_order_that_is(task_id
         return
     if nest := re.search(r"put it outside: (\w+)\((\w+)\(env, \.\.\.\), \.\.\.\)$", message):
         check_numbers(nested(nest[2], nest[1]))
-    elif message.endswith("to one filter: type(inner)(inner.env, [*inner.constraints, more])"):
+    elif "to one filter: CBFActionFilter(inner.env, [*inner.constraints, more])" in message:
         there = base(task_id, inner if inner in filters else filters[0]).env
         both = [*there.constraints, sw.constraints.SpeedLimit(50.0)]
-        check_numbers(Asked(sw.CBFActionFilter(base(task_id), both)))
+        check_numbers(Asked(sw.CBFActionFilter(there.env, both)))
     else:
         assert any(says in message and {outer, inner} <= of for says, of in ALONE.items()), message
         check_numbers(nested(inner))

@@ -32,7 +32,11 @@ _NOISE: Final = {"normal": NormalActionNoise, "ornstein_uhlenbeck": OrnsteinUhle
 
 
 def new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
-    """The arm's algorithm before its first step, around envs that are scaled as the arm says."""
+    """The arm's algorithm before its first step, around envs that are scaled as the arm says.
+
+    Raises:
+        ConfigurationError: Values that only the algorithm itself knows to be wrong.
+    """
     if arm.normalize.observation or arm.normalize.reward:
         envs = VecNormalize(
             envs,
@@ -40,8 +44,12 @@ def new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
             norm_reward=arm.normalize.reward,
             gamma=arm.hyperparameters.get("gamma", 0.99),
         )
-    settings = _constructor_arguments(arm, envs)
-    model: BaseAlgorithm = algorithm_class(arm.algorithm)(env=envs, seed=seed, device=arm.device, **settings)
+    model: BaseAlgorithm
+    try:
+        settings = _constructor_arguments(arm, envs)
+        model = algorithm_class(arm.algorithm)(env=envs, seed=seed, device=arm.device, **settings)
+    except (AssertionError, IndexError, NotImplementedError, TypeError, ValueError) as error:
+        raise ConfigurationError(f"arms.{arm.name}: {arm.algorithm} refuses its settings: {error}") from error
     return model
 
 
