@@ -60,8 +60,8 @@ def check_timing(env: gym.Env[Any, Any], control_dt: float | None = None) -> flo
     except (AttributeError, TypeError, ValueError):
         if control_dt is None:
             raise ConfigurationError(
-                f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): give it "
-                "one, in seconds, such as env.unwrapped.dt = 0.05, or a filter's plant control_dt=0.05"
+                f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass control_dt, in "
+                "seconds, to a filter's plant, or give the env one, such as env.unwrapped.dt = 0.05"
             ) from None
         return control_dt
     hold = positive("the env's dt", dt, "s") if control_dt is None else control_dt
